@@ -1,0 +1,302 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: `calib_ros identify | simulate | csv2bag | demo`.
+
+Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
+result is not accepted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+# Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+from calib_ros import __version__
+from calib_ros.errors import CalibrationError, InputError
+
+if TYPE_CHECKING:
+    from calib_ros.chain import Chain
+    from calib_ros.identification import Identification
+
+NOT_ACCEPTED = 3
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        status: int = options.run(options)
+    except CalibrationError as err:
+        print(f'calib_ros: {err}', file=sys.stderr)
+        return 1
+    return status
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog='calib_ros', description='Kinematic calibration of industrial arms.'
+    )
+    parser.add_argument('--version', action='version', version=f'calib_ros {__version__}')
+    commands = parser.add_subparsers(required=True, metavar='COMMAND')
+
+    def command(name: str, run: Callable[[Any], int], text: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(
+            name,
+            help=text,
+            description=text,
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        added.set_defaults(run=run)
+        return added
+
+    identify = command(
+        'identify', _identify, 'identify DH parameters from a bag or a table of measured poses'
+    )
+    identify.add_argument('bag', nargs='?', type=Path, help='rosbag2 folder, .mcap or .db3 file')
+    identify.add_argument('--csv', type=Path, help='table of measured poses instead of a bag')
+    identify.add_argument('--session', help='session of the table to use')
+    _add_chain(identify)
+    identify.add_argument('--joint-topic', help='needed only with several JointState topics')
+    identify.add_argument('--pose-topic', help='needed only with several pose topics')
+    identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
+    identify.add_argument('--force', action='store_true', help='overwrite files in --out')
+    identify.add_argument('--json', action='store_true', help='print the result as JSON')
+    _add_settings(identify)
+
+    simulate = command(
+        'simulate', _simulate, 'write the bag of a simulated robot cell, with the true chain'
+    )
+    simulate.add_argument('bag', type=Path, help='folder of the bag to write')
+    _add_chain(simulate)
+    _add_simulation(simulate)
+
+    csv2bag = command('csv2bag', _csv2bag, 'write a table of measured poses as a bag')
+    csv2bag.add_argument('csv', type=Path, help='the table')
+    csv2bag.add_argument('bag', type=Path, help='folder of the bag to write')
+    csv2bag.add_argument('--session', help='session of the table to use')
+    _add_chain(csv2bag)
+    _add_storage(csv2bag)
+
+    demo = command(
+        'demo', _demo, 'simulate an arm, identify it, and compare the result with the truth'
+    )
+    demo.add_argument('--out', type=Path, default=Path('demo'), help='folder for what it writes')
+    demo.add_argument('--chain', default='ur10e', help='chain file, or a robot by its name')
+    demo.add_argument('--force', action='store_true', help='overwrite an earlier demo')
+    _add_simulation(demo)
+    return parser
+
+
+def _add_chain(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--chain', required=True, help='chain file, or a robot by its name (ur10e, ...)'
+    )
+
+
+def _add_storage(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of the bag'
+    )
+
+
+def _add_simulation(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--poses', type=int, default=60, help='configurations to measure')
+    parser.add_argument('--seed', type=int, default=0, help='of the random numbers')
+    _add_storage(parser)
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    from calib_ros.config import Settings
+
+    for item in fields(Settings):
+        many = isinstance(item.default, tuple)
+        parser.add_argument(
+            f'--{item.name.replace("_", "-")}',
+            type=str if many else type(item.default),
+            nargs='+' if many else None,
+            default=item.default,
+            help=item.metadata['text'],
+        )
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from calib_ros import report
+    from calib_ros.config import Settings, load_chain
+    from calib_ros.identification import Problem, identify
+
+    if (options.bag is None) == (options.csv is None):
+        raise InputError('give either a bag or --csv FILE')
+    chain = load_chain(options.chain)
+    given: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(Settings)}
+    for name in ('joint_names', 'fixed'):
+        given[name] = tuple(given[name])
+    settings = Settings(**given)
+    _refuse_overwriting(options)
+    warnings: tuple[str, ...] = ()
+    if options.csv is not None:
+        from calib_ros.tables import read_table
+
+        fitted, held_out = read_table(options.csv, len(chain.joints), options.session)
+        problem = Problem(
+            chain,
+            fitted,
+            held_out,
+            settings.sigma_position,
+            settings.sigma_orientation,
+            settings.fixed,
+            settings.folds,
+        )
+        result = identify(problem)
+        samples: dict[str, Any] = {'pairs': len(fitted), 'held_out': len(held_out)}
+    else:
+        from calib_ros.replay import replay
+        from calib_ros.session import CalibrationSession
+
+        session = CalibrationSession(chain, settings)
+        warnings = replay(options.bag, session, options.joint_topic, options.pose_topic)
+        result = session.identify()
+        samples = session.account().as_document()
+    for warning in warnings:
+        print(f'warning: {warning}', file=sys.stderr)
+    _write_result(options.out, result, samples, warnings)
+    if options.json:
+        document = report.as_document(result, samples) | {'warnings': list(warnings)}
+        print(json.dumps(document, indent=2))
+    else:
+        print(report.summary(result))
+    return 0 if result.accepted else NOT_ACCEPTED
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from calib_ros.config import load_chain
+
+    truth = _write_simulation(load_chain(options.chain), options)
+    print(f'wrote {options.bag} and the true chain {truth}')
+    return 0
+
+
+def _csv2bag(options: argparse.Namespace) -> int:
+    import numpy as np
+
+    from calib_ros.config import load_chain
+    from calib_ros.observations import Observations
+    from calib_ros.replay import Recording, write_bag
+    from calib_ros.tables import read_table
+
+    chain = load_chain(options.chain)
+    fitted, held_out = read_table(options.csv, len(chain.joints), options.session)
+    rows = Observations.from_arrays(
+        np.concatenate([fitted.joints, held_out.joints]),
+        np.concatenate([fitted.positions, held_out.positions]),
+        np.concatenate([fitted.rotations, held_out.rotations]) if fitted.oriented.all() else None,
+    )
+    judging = np.arange(len(rows)) >= len(fitted)
+    write_bag(options.bag, Recording.of_dwells(chain.joint_names, rows, judging), options.storage)
+    print(f'wrote {options.bag}: {len(fitted)} poses to fit, {len(held_out)} held out')
+    return 0
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from calib_ros import report
+    from calib_ros.config import Settings, load_chain
+    from calib_ros.replay import replay
+    from calib_ros.session import CalibrationSession
+
+    _refuse_overwriting(options)
+    options.bag = options.out / 'bag'
+    if options.force and options.bag.exists():
+        import shutil
+
+        shutil.rmtree(options.bag)
+    chain = load_chain(options.chain)
+    truth = _write_simulation(chain, options)
+    print(f'1. simulated: {options.bag}, an arm with known errors ({truth.name})')
+    session = CalibrationSession(chain, Settings())
+    replay(options.bag, session)
+    result = session.identify()
+    print(f'2. replayed: {session.account()}')
+    print(f'3. identified: {report.summary(result)}')
+    print('4. identified offsets against the true ones [mm, mrad]:')
+    print(report.against_truth(result, load_chain(truth)))
+    _write_result(options.out, result, session.account().as_document(), ())
+    print(f'5. wrote {options.out}/: {", ".join(RESULT_FILES)}')
+    return 0 if result.accepted else NOT_ACCEPTED
+
+
+def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
+    """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
+    import numpy as np
+
+    from calib_ros.config import dump_chain
+    from calib_ros.files import write_file
+    from calib_ros.replay import Recording, write_bag
+    from calib_ros.simulation import Cell, drive, faulty, measure
+
+    rng, cell = np.random.default_rng(options.seed), Cell()
+    true = faulty(chain, cell, rng)
+    configurations = chain.random_joints(options.poses, rng)
+    joint_stamps, joints, pose_stamps = drive(configurations, cell, 1_700_000_000_000_000_000)
+    standing = np.repeat(configurations, cell.poses_per_dwell, axis=0)
+    poses = measure(true, standing, rng, cell.noise_position, cell.noise_orientation)
+    recording = Recording(
+        chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
+    )
+    options.bag.parent.mkdir(parents=True, exist_ok=True)
+    write_bag(options.bag, recording, options.storage)
+    path: Path = options.bag.parent / f'{options.bag.name}_truth.yaml'
+    write_file(path, dump_chain(true), overwrite=True)
+    return path
+
+
+RESULT_FILES = ('calibration.yaml', 'result.json', 'report.md', 'before_after.png')
+
+
+def _refuse_overwriting(options: argparse.Namespace) -> None:
+    """Refuse before any work is done."""
+    if options.out is None or options.force:
+        return
+    there = [name for name in RESULT_FILES if (options.out / name).exists()]
+    if there:
+        raise InputError(
+            f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
+        )
+
+
+def _write_result(
+    out: Path | None, result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]
+) -> None:
+    """Write the files of a result; a chain only if it is accepted.
+
+    Files of an earlier result are in the way only with --force; `_refuse_overwriting` has seen
+    to it. A chain that was accepted earlier stays when this result is not.
+    """
+    if out is None:
+        return
+    from calib_ros import report
+    from calib_ros.files import write_file
+    from calib_ros.plots import before_after_png
+
+    out.mkdir(parents=True, exist_ok=True)
+    document = report.as_document(result, samples) | {'warnings': list(warnings)}
+    contents: dict[str, str | bytes] = {
+        'result.json': json.dumps(document, indent=2) + '\n',
+        'report.md': report.markdown(result, samples, warnings),
+        'before_after.png': before_after_png(result),
+    }
+    if result.accepted:
+        contents['calibration.yaml'] = report.calibration_yaml(result)
+    for name, content in contents.items():
+        write_file(out / name, content, overwrite=True)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

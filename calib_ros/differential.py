@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The differential model of the target's pose errors, one analytic column per parameter.
+
+Vacarescu et al. write the error of one link as dA_i = Delta_i A_i with a twist Delta_i in frame
+i - 1 (their eq. 3 and 4). Moved to the world, the link errors add up to the pose error:
+
+    dT T^-1 = sum_i T_{i-1} Delta_i T_{i-1}^-1        T_{i-1} = T_world_base A_1 ... A_{i-1}
+
+(eq. 6 as printed adds the Delta_i without moving them; `docs/model.md` lists the errata). Every
+Denavit-Hartenberg parameter is one elementary motion along or about one axis u through a point c,
+both met by `Chain.trace`. So the twist needs no table, for either convention:
+
+    translation (a, d)              dp = u              domega = 0
+    rotation (alpha, theta, beta)   dp = u x (p - c)    domega = u
+
+with p the target's position, all in world coordinates. For the standard convention this is the
+paper's eq. (4), and the row for beta that the paper does not print.
+
+Arrays are laid out (parameter, component, sample): each operation runs over many samples at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.chain import Chain
+from calib_ros.errors import UnknownNameError
+from calib_ros.se3 import FloatArray
+
+
+class ErrorModel:
+    """The pose and its derivatives with respect to named parameters of a chain.
+
+    Parameters
+    ----------
+    chain : Chain
+        The point of linearisation.
+    names : sequence of str
+        Parameters, one column each, in this order.
+
+    """
+
+    def __init__(self, chain: Chain, names: Sequence[str]) -> None:
+        self.chain = chain
+        self.names = tuple(names)
+        rotates: dict[str, bool] = {}
+        chain.trace(
+            np.zeros((len(chain.joints), 1)),
+            lambda name, rotation, axis, point: rotates.__setitem__(name, rotation),
+        )
+        for name in self.names:
+            if name not in rotates:
+                raise UnknownNameError('parameter', name, chain.parameter_names)
+        turning = [name for name in self.names if rotates[name]]
+        shifting = [name for name in self.names if not rotates[name]]
+        self.rotations = len(turning)
+        """Number of rotational parameters; they come first in the arrays of `linearise`."""
+        self._row = {name: row for row, name in enumerate(turning + shifting)}
+        self.order = np.array([self._row[name] for name in self.names], dtype=np.intp)
+        """Row of each named parameter in the arrays of `linearise`."""
+
+    def linearise(
+        self, q: FloatArray
+    ) -> tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]:
+        """Return pose and derivatives for one block of samples.
+
+        Parameters
+        ----------
+        q : (n, B)
+            Joint values [rad or m], a row per joint.
+
+        Returns
+        -------
+        axes : list of three (3, B)
+            The target's x, y and z axis.
+        origin : (3, B)
+            Its position [m].
+        shift : (P + 1, 3, B)
+            Derivative of the position, rotational parameters first. The last row is left free
+            for the caller, who can put the residual there.
+        turn : (P_rotational + 1, 3, B)
+            Derivative of the orientation as a rotation vector in the world. Likewise.
+
+        """
+        samples, rotations, row = q.shape[1], self.rotations, self._row
+        shift = np.empty((len(row) + 1, 3, samples))
+        turn = np.empty((rotations + 1, 3, samples))
+        arm = np.empty((rotations, 3, samples))
+
+        def record(name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
+            k = row.get(name)
+            if k is None:
+                return
+            if rotates:
+                turn[k] = axis
+                arm[k] = point
+            else:
+                shift[k] = axis
+
+        axes, origin = self.chain.trace(q, record)
+        np.subtract(origin, arm, out=arm)
+        cross(turn[:-1], arm, shift[:rotations])
+        return axes, origin, shift, turn
+
+    def jacobian(self, q: FloatArray) -> FloatArray:
+        """Return the Jacobian (N, 6, P) of position [m] and orientation [rad] at poses q (N, n).
+
+        Rows 0-2 are the target's position in the world. Rows 3-5 are its rotation as a vector
+        in world axes: the turned orientation is exp(J[3:] dx) R.
+        """
+        _, _, shift, turn = self.linearise(np.ascontiguousarray(np.asarray(q, dtype=float).T))
+        full = np.zeros((len(q), 6, len(self.names)))
+        full[:, :3] = shift[self.order].transpose(2, 1, 0)
+        rotational = self.order < self.rotations
+        full[:, 3:, rotational] = turn[self.order[rotational]].transpose(2, 1, 0)
+        return full
+
+
+def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:
+    """Write the cross product of (..., 3, B) arrays into `out`."""
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        np.multiply(first[..., i, :], second[..., j, :], out=out[..., k, :])
+        out[..., k, :] -= first[..., j, :] * second[..., i, :]
+
+
+def orientation_error(measured: FloatArray, axes: Sequence[FloatArray]) -> FloatArray:
+    """Return the rotation vector (3, B) in world axes that turns the model onto the measurement.
+
+    Parameters
+    ----------
+    measured : (3, 3, B)
+        Measured rotation matrices; the first index counts their columns.
+    axes : three (3, B)
+        Columns of the model's rotation matrices.
+
+    Notes
+    -----
+    E = R_measured R^T is summed from its columns; its vector is log E = angle / sin(angle) *
+    1/2 sum_k r_k x m_k, which is as long as log(R^T R_measured).
+
+    """
+    model = np.stack([np.broadcast_to(axis, measured.shape[1:]) for axis in axes])
+    parts = np.empty_like(model)
+    cross(model, measured, parts)
+    sine_vector = 0.5 * parts.sum(axis=0)
+    cosine = 0.5 * (np.einsum('kib,kib->b', model, measured) - 1.0)
+    sine = np.sqrt(np.einsum('ib,ib->b', sine_vector, sine_vector))
+    angle = np.arctan2(sine, cosine)
+    error: FloatArray = sine_vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
+    half_turn = np.flatnonzero(cosine < -0.99)  # the sine loses the axis near 180 degrees
+    if half_turn.size:
+        turned = np.einsum('kib,kjb->bij', measured[..., half_turn], model[..., half_turn])
+        error[:, half_turn] = se3.log_rotation(turned).T
+    return error

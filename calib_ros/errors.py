@@ -1,0 +1,45 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that say what was wrong, what was expected and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class CalibrationError(Exception):
+    """Base of every error that calib_ros raises on purpose."""
+
+
+class ConfigError(CalibrationError):
+    """A chain file, a setting or a command line that cannot be used."""
+
+
+class InputError(CalibrationError):
+    """A bag, a table or messages that cannot be used."""
+
+
+class UnknownNameError(ConfigError):
+    """A name that does not exist; keeps the name and the valid alternatives."""
+
+    def __init__(self, what: str, name: str, alternatives: Iterable[str]) -> None:
+        self.name = name
+        self.alternatives = tuple(alternatives)
+        near = difflib.get_close_matches(name, self.alternatives, n=1, cutoff=0.5)
+        hint = f'did you mean "{near[0]}"? ' if near else ''
+        super().__init__(
+            f'unknown {what} "{name}": {hint}valid are {", ".join(self.alternatives)}'
+        )
+
+
+class TooFewObservationsError(InputError):
+    """Not enough matched pairs for the parameters asked for."""
+
+    def __init__(self, configurations: int, needed: int, why: str) -> None:
+        self.configurations = configurations
+        self.needed = needed
+        super().__init__(
+            f'{configurations} measured configurations are too few, at least {needed} are '
+            f'needed: {why}; measure more poses or fix parameters'
+        )

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What can still be read of a damaged recording: cut off, or never closed by its recorder.
+
+An intact recording is read by its index. A damaged one has none, so its files are read from
+their beginning up to the damage.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+MCAP_MAGIC = b'\x89MCAP0\r\n'
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+
+
+@dataclass
+class Salvage:
+    """Topics with their types, serialised messages as (topic, data), and what was wrong."""
+
+    problem: str = 'the recording was not closed'
+    topics: dict[str, str] = field(default_factory=dict)
+    messages: list[tuple[str, bytes]] = field(default_factory=list)
+
+
+def salvage(path: Path) -> Salvage | None:
+    """Return what can be read of a bag folder or file; None when nothing can."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    found = Salvage()
+    for file in files:
+        if file.suffix == '.mcap':
+            _read_mcap(file, found)
+        elif file.suffix == '.db3':
+            _read_sqlite3(file, found)
+    return found if found.messages else None
+
+
+def _read_sqlite3(file: Path, found: Salvage) -> None:
+    connection = sqlite3.connect(f'file:{file}?mode=ro&immutable=1', uri=True)
+    try:
+        topics = {
+            key: (name, kind)
+            for key, name, kind in connection.execute('SELECT id, name, type FROM topics')
+        }
+        found.topics |= dict(topics.values())
+        for key, data in connection.execute('SELECT topic_id, data FROM messages ORDER BY id'):
+            found.messages.append((topics[key][0], data))
+    except sqlite3.Error as err:
+        found.problem = str(err)
+    finally:
+        connection.close()
+
+
+def _read_mcap(file: Path, found: Salvage) -> None:
+    content = file.read_bytes()
+    if not content.startswith(MCAP_MAGIC):
+        return
+    schemas: dict[int, str] = {}
+    channels: dict[int, str] = {}
+    try:
+        for kind, record in _records(content, len(MCAP_MAGIC)):
+            if kind == _SCHEMA:
+                (key,) = struct.unpack_from('<H', record)
+                schemas[key] = _string(record, 2)
+            elif kind == _CHANNEL:
+                key, schema = struct.unpack_from('<HH', record)
+                channels[key] = _string(record, 4)
+                found.topics[channels[key]] = schemas[schema]
+            elif kind == _MESSAGE:
+                (key,) = struct.unpack_from('<H', record)
+                found.messages.append((channels[key], record[22:]))
+    except (struct.error, IndexError, KeyError, ValueError, OSError, EOFError) as err:
+        found.problem = f'cut off or damaged: {err}'
+
+
+def _records(content: bytes, start: int) -> Iterator[tuple[int, bytes]]:
+    """Yield (kind, content) of the records of an mcap file, those inside chunks included."""
+    while start < len(content):
+        kind, size = struct.unpack_from('<BQ', content, start)
+        start += 9
+        if kind == _DATA_END:
+            return
+        record = content[start : start + size]
+        if kind == _CHUNK:
+            compression = _string(record, 28)
+            body = record[40 + len(compression) :]
+            yield from _records(_decompressor(compression)(body), 0)
+        elif len(record) == size:
+            yield kind, record
+        if len(record) < size:
+            raise EOFError(f'{size - len(record)} bytes are missing at the end')
+        start += size
+
+
+def _decompressor(name: str) -> Callable[[bytes], bytes]:
+    """Return what decompresses a chunk; the modules are those that rosbags brings."""
+    if not name:
+        return bytes
+    for module in {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd')}[name]:
+        try:
+            decompress: Callable[[bytes], bytes] = importlib.import_module(module).decompress
+        except ImportError:
+            continue
+        return decompress
+    raise OSError(f'no module to decompress {name}')
+
+
+def _string(record: bytes, start: int) -> str:
+    (size,) = struct.unpack_from('<I', record, start)
+    return record[start + 4 : start + 4 + size].decode()

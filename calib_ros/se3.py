@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations and rigid transforms, batched.
+
+Quaternions are ordered (x, y, z, w) as in ROS. A rotation vector is the axis times the angle in
+radians. Transforms are homogeneous 4 x 4 matrices.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+
+def transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Compose (..., 3, 3) rotations and (..., 3) translations [m] to (..., 4, 4) transforms."""
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    matrix = np.zeros((*shape, 4, 4))
+    matrix[..., :3, :3] = rotation
+    matrix[..., :3, 3] = translation
+    matrix[..., 3, 3] = 1.0
+    return matrix
+
+
+def invert(matrix: FloatArray) -> FloatArray:
+    """Invert (..., 4, 4) rigid transforms."""
+    rotation = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    return transform(rotation, -np.einsum('...ij,...j->...i', rotation, matrix[..., :3, 3]))
+
+
+def from_quat(quat_xyzw: FloatArray) -> FloatArray:
+    """Turn (..., 4) quaternions, normalised here, into (..., 3, 3) rotation matrices."""
+    flat = Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix()
+    return np.asarray(flat).reshape(*quat_xyzw.shape[:-1], 3, 3)
+
+
+def to_quat(rotation: FloatArray) -> FloatArray:
+    """Turn (..., 3, 3) rotation matrices into (..., 4) quaternions with w >= 0."""
+    quat = np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat())
+    quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
+    return quat.reshape(*rotation.shape[:-2], 4)
+
+
+def exp_rotation(vector: FloatArray) -> FloatArray:
+    """Turn (..., 3) rotation vectors [rad] into (..., 3, 3) rotation matrices."""
+    flat = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
+    return np.asarray(flat).reshape(*vector.shape[:-1], 3, 3)
+
+
+def log_rotation(rotation: FloatArray) -> FloatArray:
+    """Turn (..., 3, 3) rotation matrices into (..., 3) rotation vectors [rad]."""
+    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
+
+
+def nearest_rotation(matrix: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) that is nearest to a matrix (Schönemann 1966, Umeyama 1991)."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[:, -1] *= np.linalg.det(u @ vt)
+    return np.asarray(u @ vt)
