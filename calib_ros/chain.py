@@ -9,6 +9,8 @@
 
     revolute   theta = joint.theta + sign q        prismatic   d = joint.d + sign q
 
+The joint value q is the one reported plus the non-geometric effects of the chain (`effects.py`).
+
 A chain is a sequence of elementary motions, each along or about one axis of the moving frame.
 `Chain.trace` walks along it once: the end of the walk is the pose, and the axes met on the way
 are all that the error model (`differential.py`) needs.
@@ -19,13 +21,13 @@ at consecutive parallel revolute axes, where a tiny tilt moves the common normal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from calib_ros import se3
+from calib_ros import effects, se3
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.se3 import FloatArray
 
@@ -34,6 +36,7 @@ JointType: TypeAlias = Literal['revolute', 'prismatic']
 Recorder: TypeAlias = Callable[[str, bool, FloatArray, FloatArray], None]
 
 DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
+ANGLES = ('alpha', 'theta', 'beta')
 FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
@@ -59,7 +62,11 @@ _MOTIONS: dict[str, tuple[tuple[str, bool, int], ...]] = {
 
 @dataclass(frozen=True)
 class Joint:
-    """One row of the DH table: lengths in m, angles in rad, limits in rad or m."""
+    """One row of the DH table: lengths in m, angles in rad, limits in rad or m.
+
+    `mass` [kg] and `com` [m], its centre in the frame at the link's end, serve compliance only;
+    `gear_ratio` (motor turns per joint turn, 0 when unknown) serves gear harmonics.
+    """
 
     name: str
     type: JointType = 'revolute'
@@ -71,6 +78,9 @@ class Joint:
     sign: int = 1
     lower: float | None = None
     upper: float | None = None
+    mass: float = 0.0
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gear_ratio: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse a row that no robot has."""
@@ -131,6 +141,12 @@ class Chain:
         Found from the nominal table when None.
     base, tool : Frame, optional
         T_world_base and T_flange_target; None when nothing is known about them.
+    frames : tuple of (str, Frame or None)
+        Further bases (`base_...`) and tools (`tool_...`), for several sessions or targets.
+    effects : tuple of (str, float)
+        Non-geometric effects by name, with their values.
+    gravity : three floats
+        Acceleration of gravity [m/s^2] in the base frame, for compliance.
 
     """
 
@@ -140,10 +156,13 @@ class Chain:
     parallel: tuple[str, ...] | None = None
     base: Frame | None = None
     tool: Frame | None = None
+    frames: tuple[tuple[str, Frame | None], ...] = ()
+    effects: tuple[tuple[str, float], ...] = ()
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
     def __post_init__(self) -> None:
         """Check the names and find the parallel axes if they are not given."""
-        if self.convention not in _MOTIONS:
+        if str(self.convention) not in _MOTIONS:
             raise UnknownNameError('convention', self.convention, _MOTIONS)
         if not self.joints:
             raise ConfigError(f'chain "{self.name}" has no joints')
@@ -158,10 +177,14 @@ class Chain:
         for name in self.parallel or ():
             if name not in names:
                 raise UnknownNameError('joint in "parallel"', name, names)
+            if (self.parallel or ()).count(name) > 1:
+                raise ConfigError(f'"parallel" names joint "{name}" twice')
 
     def _find_parallel(self) -> tuple[str, ...]:
-        """Return the joints whose row joins two (nearly) parallel revolute axes.
+        """Return the joints whose row joins two (nearly) parallel axes, one at least revolute.
 
+        At a prismatic axis only the direction counts, but there, too, theta tilts a parallel axis
+        only to second order, and beta is needed for a complete model.
         Row i leads from axis i to axis i + 1 in the standard convention and from axis i - 1 to
         axis i in the modified one.
         """
@@ -171,7 +194,7 @@ class Chain:
             before, after = i + first, i + second
             if before < 0 or after >= len(self.joints):
                 continue
-            revolute = {self.joints[before].type, self.joints[after].type} == {'revolute'}
+            revolute = 'revolute' in (self.joints[before].type, self.joints[after].type)
             tilt = np.hypot(np.sin(joint.alpha), np.sin(joint.beta))
             if revolute and tilt < np.sin(PARALLEL_TOLERANCE):
                 found.append(joint.name)
@@ -188,11 +211,16 @@ class Chain:
 
         The model holds beta instead of d at the joints named in `parallel`.
         """
-        names = [f'{frame}.{kind}' for frame in ('base', 'tool') for kind in FRAME_KINDS]
+        names = [f'{frame}.{kind}' for frame in self.frame_names for kind in FRAME_KINDS]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
             names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
-        return tuple(names)
+        return (*names, *(name for name, _ in self.effects))
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Return the names of all base and tool frames."""
+        return ('base', 'tool', *(name for name, _ in self.frames))
 
     @property
     def table(self) -> FloatArray:
@@ -203,7 +231,7 @@ class Chain:
         """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
         owner, kind = self._split(name)
         if isinstance(owner, Joint):
-            return float(getattr(owner, kind))
+            return float(getattr(owner, kind)) if kind in DH_KINDS else dict(self.effects)[name]
         return float(owner.offsets()[FRAME_KINDS.index(kind)])
 
     def offset(self, name: str, nominal: Chain) -> float:
@@ -215,9 +243,34 @@ class Chain:
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
-        """Return the 'base' or the 'tool' frame, the identity when nothing is known."""
-        frame = self.base if name == 'base' else self.tool
+        """Return a base or tool frame by its name, the identity when nothing is known."""
+        frame = {'base': self.base, 'tool': self.tool, **dict(self.frames)}[name]
         return Frame() if frame is None else frame
+
+    def owns_frame(self, parameter: str) -> bool:
+        """Tell whether a parameter belongs to a base or tool frame."""
+        return parameter.partition('.')[0] in self.frame_names
+
+    def with_frame(self, name: str, frame: Frame) -> Chain:
+        """Return the chain with another base or tool frame, which may be a new one."""
+        if name == 'base':
+            return replace(self, base=frame)
+        if name == 'tool':
+            return replace(self, tool=frame)
+        return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
+
+    def with_effects(self, names: Sequence[str]) -> Chain:
+        """Return the chain with further effects, of no size yet."""
+        known = dict(self.effects)
+        added = tuple((name, 0.0) for name in dict.fromkeys(names) if name not in known)
+        chain = replace(self, effects=(*self.effects, *added))
+        for name, _ in added:
+            chain._split(name)
+        return chain
+
+    def with_effect_values(self, values: Mapping[str, float]) -> Chain:
+        """Return the chain with effects of given values."""
+        return self.with_effects(tuple(values)).with_offsets(values) if values else self
 
     def with_offsets(self, offsets: Mapping[str, float]) -> Chain:
         """Return the chain with offsets [m or rad] added to the named parameters.
@@ -228,47 +281,86 @@ class Chain:
         by_owner: dict[str, dict[str, float]] = {}
         for name, offset in offsets.items():
             self._split(name)
-            owner, _, kind = name.rpartition('.')
+            owner, _, kind = name.partition('.')
             by_owner.setdefault(owner, {})[kind] = float(offset)
         joints = []
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
-            values = {kind: getattr(joint, kind) + own[kind] for kind in own}
-            joints.append(replace(joint, **values) if own else joint)
+            values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in DH_KINDS}
+            joints.append(replace(joint, **values) if values else joint)
+        known = {'base': self.base, 'tool': self.tool, **dict(self.frames)}
         frames = {
-            key: self.frame(key).moved(by_owner[key]) if key in by_owner else getattr(self, key)
-            for key in ('base', 'tool')
+            key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
+            for key, frame in known.items()
         }
-        return replace(self, joints=tuple(joints), base=frames['base'], tool=frames['tool'])
+        return replace(
+            self,
+            joints=tuple(joints),
+            base=frames.pop('base'),
+            tool=frames.pop('tool'),
+            frames=tuple(frames.items()),
+            effects=tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
+        )
 
-    def forward(self, q: FloatArray) -> FloatArray:
-        """Return T_world_target (N, 4, 4) for joint values (N, n) [rad or m]."""
+    def forward(
+        self,
+        q: FloatArray,
+        approach: FloatArray | None = None,
+        base: str = 'base',
+        tool: str = 'tool',
+    ) -> FloatArray:
+        """Return T_world_target (N, 4, 4) for joint values (N, n) [rad or m].
+
+        `approach` (N, n) holds the signs of the velocities before, for backlash; `base` and `tool`
+        choose among the frames.
+        """
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2 or q.shape[1] != len(self.joints):
             raise ConfigError(
                 f'joint values must have the shape (N, {len(self.joints)}) for chain '
                 f'"{self.name}", not {q.shape}'
             )
-        axes, origin = self.trace(np.ascontiguousarray(q.T))
+        rows = np.ascontiguousarray(q.T)
+        came = None if approach is None else np.ascontiguousarray(approach.T)
+        axes, origin = self.trace(self.effective(rows, came), base=base, tool=tool)
         rotation = np.empty((len(q), 3, 3))
         for k in range(3):
             rotation[:, :, k] = axes[k].T
         return se3.transform(rotation, np.broadcast_to(origin.T, (len(q), 3)))
 
+    def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
+        """Return the joint values (n, B) that the effects make of those reported (n, B)."""
+        if not self.effects:
+            return q
+        phi = effects.basis(self, [name for name, _ in self.effects], q, approach)
+        q = q.copy()
+        for (name, value), row in zip(self.effects, phi, strict=True):
+            q[self.joint_names.index(name.partition('.')[0])] += value * row
+        return q
+
     def trace(
-        self, q: FloatArray, record: Recorder | None = None
+        self,
+        q: FloatArray,
+        record: Recorder | None = None,
+        base: str = 'base',
+        tool: str = 'tool',
+        links: list[tuple[list[FloatArray], FloatArray]] | None = None,
     ) -> tuple[list[FloatArray], FloatArray]:
         """Walk along the chain, reporting the axis of every parameter.
 
         Parameters
         ----------
         q : (n, B)
-            Joint values, a row per joint.
+            Effective joint values, a row per joint.
         record : callable, optional
             Called as record(name, rotates, axis, point), once per parameter. Raising the
             parameter by epsilon shifts everything behind it by epsilon along the axis, or turns
             it by epsilon about the axis through the point. Arrays are (3, B) or (3, 1), in world
             coordinates, and are not modified afterwards.
+        base, tool : str
+            Frames at the ends of the chain.
+        links : list, optional
+            Gets the axes and the origin of the frame at the end of every link.
 
         Returns
         -------
@@ -279,13 +371,13 @@ class Chain:
 
         """
         report: Recorder = record or (lambda name, rotates, axis, point: None)
-        base, tool = self.frame('base').matrix, self.frame('tool').matrix
-        axes = [base[:3, k : k + 1] for k in range(3)]
-        origin = base[:3, 3:]
+        start, end = self.frame(base).matrix, self.frame(tool).matrix
+        axes = [start[:3, k : k + 1] for k in range(3)]
+        origin = start[:3, 3:]
         for k in range(3):
             unit = np.eye(3)[:, k : k + 1]
-            report(f'base.{FRAME_KINDS[k]}', False, unit, origin)
-            report(f'base.{FRAME_KINDS[k + 3]}', True, unit, origin)
+            report(f'{base}.{FRAME_KINDS[k]}', False, unit, origin)
+            report(f'{base}.{FRAME_KINDS[k + 3]}', True, unit, origin)
         for joint, values in zip(self.joints, q, strict=True):
             driven = 'theta' if joint.type == 'revolute' else 'd'
             for kind, rotates, k in _MOTIONS[self.convention]:
@@ -304,13 +396,15 @@ class Chain:
                     )
                 else:
                     origin = origin + value * axes[k]
+            if links is not None:
+                links.append((list(axes), origin))
         flange = list(axes)
         for i in range(3):
-            report(f'tool.{FRAME_KINDS[i]}', False, flange[i], origin)
-            axes[i] = sum(tool[k, i] * flange[k] for k in range(3))
-        origin = origin + sum(tool[k, 3] * flange[k] for k in range(3))
+            report(f'{tool}.{FRAME_KINDS[i]}', False, flange[i], origin)
+            axes[i] = sum(end[k, i] * flange[k] for k in range(3))
+        origin = origin + sum(end[k, 3] * flange[k] for k in range(3))
         for i in range(3):
-            report(f'tool.{FRAME_KINDS[i + 3]}', True, flange[i], origin)
+            report(f'{tool}.{FRAME_KINDS[i + 3]}', True, flange[i], origin)
         return axes, origin
 
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
@@ -318,21 +412,23 @@ class Chain:
         limits = []
         for joint in self.joints:
             reach = np.pi if joint.type == 'revolute' else 0.5
-            limits.append(
-                (
-                    -reach if joint.lower is None else joint.lower,
-                    reach if joint.upper is None else joint.upper,
-                )
-            )
-        lower, upper = np.array(limits).T
-        return rng.uniform(lower, upper, (count, len(self.joints)))
+            lower, upper = joint.lower, joint.upper
+            if lower is None:
+                lower = -reach if upper is None else min(-reach, upper - 2.0 * reach)
+            if upper is None:
+                upper = max(reach, lower + 2.0 * reach)
+            limits.append((lower, upper))
+        bounds = np.array(limits)
+        return rng.uniform(bounds[:, 0], bounds[:, 1], (count, len(self.joints)))
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
-        owner, _, kind = name.rpartition('.')
-        if owner in ('base', 'tool') and kind in FRAME_KINDS:
+        owner, _, kind = name.partition('.')
+        if owner in self.frame_names and kind in FRAME_KINDS:
             return self.frame(owner), kind
         for joint in self.joints:
-            if joint.name == owner and kind in DH_KINDS:
+            if joint.name == owner and (kind in DH_KINDS or name in dict(self.effects)):
+                if kind not in DH_KINDS:
+                    effects.check(name, self.joint_names)
                 return joint, kind
         raise UnknownNameError('parameter', name, self.parameter_names)

@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         status: int = options.run(options)
-    except CalibrationError as err:
+    except (CalibrationError, OSError) as err:
         print(f'calib_ros: {err}', file=sys.stderr)
         return 1
     return status
@@ -63,7 +63,18 @@ def _parser() -> argparse.ArgumentParser:
     )
     identify.add_argument('bag', nargs='?', type=Path, help='rosbag2 folder, .mcap or .db3 file')
     identify.add_argument('--csv', type=Path, help='table of measured poses instead of a bag')
-    identify.add_argument('--session', help='session of the table to use')
+    identify.add_argument('--session', help='session of the table; several joined by commas')
+    identify.add_argument(
+        '--eye-in-hand',
+        action='store_true',
+        help='the poses are those of a fixed target in a camera on the flange',
+    )
+    identify.add_argument(
+        '--socket-distance',
+        type=float,
+        metavar='M',
+        help='between two sockets of a place, 0.05 if not given',
+    )
     _add_chain(identify)
     identify.add_argument('--joint-topic', help='needed only with several JointState topics')
     identify.add_argument('--pose-topic', help='needed only with several pose topics')
@@ -122,8 +133,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(
             f'--{item.name.replace("_", "-")}',
             type=str if many else type(item.default),
-            nargs='+' if many else None,
-            default=item.default,
+            action='append' if many else 'store',
+            default=[] if many else item.default,
             help=item.metadata['text'],
         )
 
@@ -131,32 +142,51 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 def _identify(options: argparse.Namespace) -> int:
     from calib_ros import report
     from calib_ros.config import Settings, load_chain
-    from calib_ros.identification import Problem, identify
+    from calib_ros.problem import Problem
+    from calib_ros.selection import identify_model
 
     if (options.bag is None) == (options.csv is None):
         raise InputError('give either a bag or --csv FILE')
+    source = 'table' if options.csv else 'bag'
+    useless = (
+        ('joint_topic', 'pose_topic', 'joint_names')
+        if options.csv
+        else ('session', 'eye_in_hand', 'socket_distance')
+    )
+    for name in useless:
+        if getattr(options, name):
+            raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
     given: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(Settings)}
-    for name in ('joint_names', 'fixed'):
-        given[name] = tuple(given[name])
+    for name in ('joint_names', 'fixed', 'priors'):
+        given[name] = tuple(part for text in given[name] for part in text.split(','))
     settings = Settings(**given)
     _refuse_overwriting(options)
     warnings: tuple[str, ...] = ()
     if options.csv is not None:
         from calib_ros.tables import read_table
 
-        fitted, held_out = read_table(options.csv, len(chain.joints), options.session)
+        table = read_table(
+            options.csv,
+            len(chain.joints),
+            _sessions(options),
+            (settings.sigma_position, settings.sigma_orientation) if options.eye_in_hand else None,
+        )
+        sockets = 0.05 if options.socket_distance is None else options.socket_distance
         problem = Problem(
             chain,
-            fitted,
-            held_out,
-            settings.sigma_position,
-            settings.sigma_orientation,
-            settings.fixed,
-            settings.folds,
+            table.fitted[0],
+            table.held_out,
+            more=table.fitted[1:],
+            separations=tuple((*pair, sockets) for pair in table.pairs),
+            **settings.for_problem(),
         )
-        result = identify(problem)
-        samples: dict[str, Any] = {'pairs': len(fitted), 'held_out': len(held_out)}
+        result = identify_model(problem, settings.model)
+        samples: dict[str, Any] = {
+            'pairs': sum(map(len, table.fitted)),
+            'held_out': sum(map(len, table.held_out)),
+            'sets': len(table.fitted),
+        }
     else:
         from calib_ros.replay import replay
         from calib_ros.session import CalibrationSession
@@ -176,6 +206,10 @@ def _identify(options: argparse.Namespace) -> int:
     return 0 if result.accepted else NOT_ACCEPTED
 
 
+def _sessions(options: argparse.Namespace) -> tuple[str, ...]:
+    return tuple(options.session.split(',')) if options.session else ()
+
+
 def _simulate(options: argparse.Namespace) -> int:
     from calib_ros.config import load_chain
 
@@ -193,11 +227,16 @@ def _csv2bag(options: argparse.Namespace) -> int:
     from calib_ros.tables import read_table
 
     chain = load_chain(options.chain)
-    fitted, held_out = read_table(options.csv, len(chain.joints), options.session)
+    table = read_table(options.csv, len(chain.joints), _sessions(options))
+    if len(table.fitted) != 1 or table.fitted[0].distances is not None or table.pairs:
+        raise InputError('a bag holds poses or positions of one session and one target')
+    (fitted,) = table.fitted
+    held_out = table.held_out[0] if table.held_out else fitted.select(np.zeros(0, int))
+    oriented = bool(fitted.oriented.any() or held_out.oriented.any())
     rows = Observations.from_arrays(
         np.concatenate([fitted.joints, held_out.joints]),
         np.concatenate([fitted.positions, held_out.positions]),
-        np.concatenate([fitted.rotations, held_out.rotations]) if fitted.oriented.all() else None,
+        np.concatenate([fitted.rotations, held_out.rotations]) if oriented else None,
     )
     judging = np.arange(len(rows)) >= len(fitted)
     write_bag(options.bag, Recording.of_dwells(chain.joint_names, rows, judging), options.storage)
@@ -241,6 +280,11 @@ def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
     from calib_ros.replay import Recording, write_bag
     from calib_ros.simulation import Cell, drive, faulty, measure
 
+    if options.poses < 1 or options.seed < 0:
+        raise InputError(
+            f'--poses must be at least 1 and --seed at least 0, not {options.poses} and '
+            f'{options.seed}'
+        )
     rng, cell = np.random.default_rng(options.seed), Cell()
     true = faulty(chain, cell, rng)
     configurations = chain.random_joints(options.poses, rng)
@@ -277,7 +321,7 @@ def _write_result(
     """Write the files of a result; a chain only if it is accepted.
 
     Files of an earlier result are in the way only with --force; `_refuse_overwriting` has seen
-    to it. A chain that was accepted earlier stays when this result is not.
+    to it. A chain that was accepted earlier is kept under another name when this result is not.
     """
     if out is None:
         return
@@ -292,8 +336,11 @@ def _write_result(
         'report.md': report.markdown(result, samples, warnings),
         'before_after.png': before_after_png(result),
     }
+    earlier = out / 'calibration.yaml'
     if result.accepted:
         contents['calibration.yaml'] = report.calibration_yaml(result)
+    elif earlier.exists():  # it does not belong to the files beside it any more
+        earlier.replace(out / 'calibration.previous.yaml')
     for name, content in contents.items():
         write_file(out / name, content, overwrite=True)
 

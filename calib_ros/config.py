@@ -22,9 +22,12 @@ from calib_ros import se3
 from calib_ros.chain import DH_KINDS, Chain, Frame, Joint
 from calib_ros.errors import ConfigError, UnknownNameError
 
-CHAIN_KEYS = ('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'calibration')
+CHAIN_KEYS = (
+    *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
+    'calibration',
+)
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed')
-JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper')
+JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
 
@@ -56,6 +59,26 @@ class Settings:
     )
     pose_buffer: int = _setting(50_000, 'poses kept; new ones are dropped when it is full', 1)
     folds: int = _setting(5, 'parts of the cross-validation', 2)
+    largest_length: float = _setting(
+        0.05, 'a corrected length further from nominal is not accepted: wrong robot? [m]', 0.0
+    )
+    largest_angle: float = _setting(
+        0.1, 'a corrected angle further from nominal is not accepted: wrong robot? [rad]', 0.0
+    )
+    largest_error: float = _setting(
+        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 0.0
+    )
+    loss: str = _setting(
+        'redescending', 'how gross errors are kept from the fit: redescending, huber or none'
+    )
+    priors: tuple[str, ...] = _setting(
+        (), 'standard deviations about nominal as NAME=SIGMA [m, rad], for example *.a=0.001'
+    )
+    model: str = _setting(
+        'geometric',
+        'errors to fit: geometric; auto (adds the non-geometric effects that pay for themselves); '
+        'or groups of effects joined by +, for example ratio+eccentricity',
+    )
     joint_names: tuple[str, ...] = _setting(
         (), "names of the chain's joints in JointState, in its order; default: those of the chain"
     )
@@ -63,21 +86,35 @@ class Settings:
         (), 'parameters held at their nominal values, for example joint_2.a or *.alpha'
     )
 
+    def for_problem(self) -> dict[str, Any]:
+        """Return what an identification needs to know, by the names of `Problem`."""
+        priors = {}
+        for text in self.priors:
+            name, _, sigma = text.partition('=')
+            priors[name] = _number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
+        names = ['sigma_position', 'sigma_orientation', 'fixed', 'folds', 'largest_length']
+        names += ['largest_angle', 'largest_error', 'loss']
+        named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
+        chosen = {name: getattr(self, name) for name in names}
+        return chosen | {'priors': priors, 'effects': named}
+
     def __post_init__(self) -> None:
         """Refuse values out of range."""
         for item in fields(self):
             lower = item.metadata.get('lower')
             value = getattr(self, item.name)
-            if lower is not None and not (lower <= value < math.inf):
+            if lower is not None and not math.isfinite(value):
+                raise ConfigError(f'{item.name} must be a finite number, not {value}')
+            if lower is not None and value < lower:
                 raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
 
 
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     """Read a chain file, or a robot that calib_ros ships by its name, for example "ur10e"."""
     path = Path(name_or_path)
-    if not path.suffix and not path.exists():
+    if not path.suffix and not path.is_file():
         robots = shipped_robots()
-        if path.name not in robots:
+        if str(name_or_path) not in robots:
             raise UnknownNameError('robot', str(name_or_path), robots)
         path = robots[path.name]
     try:
@@ -106,10 +143,20 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     """Turn the text of a chain file into a chain; `where` names it in errors."""
     import yaml
 
+    class Loader(yaml.SafeLoader):
+        """Refuses a key that comes twice, of which YAML silently keeps the last."""
+
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
+            for key in keys:
+                if keys.count(key) > 1:
+                    raise ConfigError(f'{where}: key "{key}" comes twice')
+            return super().construct_mapping(node, deep)
+
     try:
-        document = yaml.safe_load(text)
-    except yaml.YAMLError as err:
-        raise ConfigError(f'{where} is not valid YAML: {err}') from err
+        document = yaml.load(text, Loader)
+    except (yaml.YAMLError, ValueError) as err:
+        raise ConfigError(f'{where} is not valid YAML: {" ".join(str(err).split())}') from err
     content = _mapping(document, CHAIN_KEYS, where)
     for key in ('convention', 'joints'):
         if key not in content:
@@ -130,10 +177,24 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
             parallel=None if parallel is None else tuple(parallel),
             base=_frame(content.get('base'), f'{where}: base'),
             tool=_frame(content.get('tool'), f'{where}: tool'),
+            frames=tuple(
+                (name, _frame(frame, f'{where}: frames.{name}'))
+                for name, frame in _dictionary(content.get('frames'), f'{where}: frames').items()
+            ),
+            **_gravity(content, where),
+        ).with_effect_values(
+            {
+                name: _number(value, f'{where}: effects: {name}')
+                for name, value in _dictionary(content.get('effects'), f'{where}: effects').items()
+            }
         )
     except ConfigError as err:
         if str(err).startswith(where):
             raise
+        if isinstance(err, UnknownNameError):
+            if where in err.what:
+                raise
+            raise UnknownNameError(f'{where}: {err.what}', err.name, err.alternatives) from err
         raise ConfigError(f'{where}: {err}') from err
 
 
@@ -144,7 +205,13 @@ def chain_document(chain: Chain) -> dict[str, Any]:
         row: dict[str, Any] = {'name': joint.name, 'type': joint.type}
         row |= {kind: float(getattr(joint, kind)) for kind in DH_KINDS}
         row['sign'] = joint.sign
-        row |= {k: getattr(joint, k) for k in ('lower', 'upper') if getattr(joint, k) is not None}
+        for key in ('lower', 'upper'):
+            if getattr(joint, key) is not None:
+                row[key] = float(getattr(joint, key))
+        if joint.mass or any(joint.com):
+            row |= {'mass': float(joint.mass), 'com': [float(part) for part in joint.com]}
+        if joint.gear_ratio:
+            row['gear_ratio'] = float(joint.gear_ratio)
         joints.append(row)
     document: dict[str, Any] = {
         'name': chain.name,
@@ -152,15 +219,27 @@ def chain_document(chain: Chain) -> dict[str, Any]:
         'joints': joints,
         'parallel': list(chain.parallel or ()),
     }
-    for key in ('base', 'tool'):
-        frame = getattr(chain, key)
-        if frame is not None:
-            document[key] = {
-                'xyz': frame.matrix[:3, 3].tolist(),
-                'quat_xyzw': se3.to_quat(frame.matrix[:3, :3]).tolist(),
-                'fixed': frame.fixed,
-            }
+    document |= {
+        key: _frame_document(frame)
+        for key, frame in (('base', chain.base), ('tool', chain.tool))
+        if frame is not None
+    }
+    others = {name: _frame_document(frame) for name, frame in chain.frames if frame is not None}
+    if others:
+        document['frames'] = others
+    if chain.effects:
+        document['effects'] = {name: float(value) for name, value in chain.effects}
+    if chain.gravity != Chain.gravity:
+        document['gravity'] = [float(part) for part in chain.gravity]
     return document
+
+
+def _frame_document(frame: Frame) -> dict[str, Any]:
+    return {
+        'xyz': frame.matrix[:3, 3].tolist(),
+        'quat_xyzw': se3.to_quat(frame.matrix[:3, :3]).tolist(),
+        'fixed': frame.fixed,
+    }
 
 
 def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
@@ -185,7 +264,7 @@ def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]
 def _number(value: object, where: str) -> float:
     try:  # YAML 1.1 reads 1e-3, without a dot, as a string
         number = float(value) if isinstance(value, int | float | str) else math.nan
-    except ValueError:
+    except (ValueError, OverflowError):
         number = math.nan
     if isinstance(value, bool) or not math.isfinite(number):
         raise ConfigError(f'{where} must be a finite number, not {value!r}')
@@ -198,6 +277,21 @@ def _numbers(value: object, count: int, where: str) -> np.ndarray[Any, np.dtype[
     return np.array([_number(item, where) for item in value])
 
 
+def _dictionary(value: object, where: str) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise ConfigError(f'{where} must be a mapping of names, not {value!r}')
+    return value
+
+
+def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
+    if content.get('gravity') is None:
+        return {}
+    x, y, z = _numbers(content['gravity'], 3, f'{where}: gravity').tolist()
+    return {'gravity': (x, y, z)}
+
+
 def _joint(row: object, where: str) -> Joint:
     content = _mapping(row, JOINT_KEYS, where)
     for key in ('name', 'a', 'alpha', 'd', 'theta'):
@@ -205,16 +299,18 @@ def _joint(row: object, where: str) -> Joint:
             raise ConfigError(f'{where}: key "{key}" is missing')
     numbers = {
         key: _number(content[key], f'{where}: {key}')
-        for key in (*DH_KINDS, 'sign', 'lower', 'upper')
+        for key in (*DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'gear_ratio')
         if content.get(key) is not None
     }
     sign = numbers.pop('sign', 1.0)
+    centre = _numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
     if sign not in (1.0, -1.0):
         raise ConfigError(f'{where}: sign must be 1 or -1, not {sign:g}')
     return Joint(
         name=str(content['name']),
         type=content.get('type', 'revolute'),
         sign=int(sign),
+        com=(centre[0], centre[1], centre[2]),
         **numbers,
     )
 

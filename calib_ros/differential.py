@@ -26,8 +26,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib_ros import se3
-from calib_ros.chain import Chain
+from calib_ros import effects, se3
+from calib_ros.chain import ANGLES, DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.errors import UnknownNameError
 from calib_ros.se3 import FloatArray
 
@@ -40,18 +40,33 @@ class ErrorModel:
     chain : Chain
         The point of linearisation.
     names : sequence of str
-        Parameters, one column each, in this order.
+        Parameters, one column each, in this order. Frames other than `base` and `tool` may be
+        among them; their columns are zero.
+    base, tool : str
+        Frames at the ends of the chain.
 
     """
 
-    def __init__(self, chain: Chain, names: Sequence[str]) -> None:
+    def __init__(
+        self, chain: Chain, names: Sequence[str], base: str = 'base', tool: str = 'tool'
+    ) -> None:
         self.chain = chain
         self.names = tuple(names)
+        self._ends = (base, tool)
         rotates: dict[str, bool] = {}
-        chain.trace(
-            np.zeros((len(chain.joints), 1)),
-            lambda name, rotation, axis, point: rotates.__setitem__(name, rotation),
-        )
+        for frame in chain.frame_names:
+            rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
+        for joint in chain.joints:
+            rotates |= {f'{joint.name}.{kind}': kind in ANGLES for kind in DH_KINDS}
+        self._effects = [name for name, _ in chain.effects if name in self.names]
+        self._driven: dict[str, list[str]] = {}
+        for name in self._effects:
+            joint_name = name.partition('.')[0]
+            joint = chain.joints[chain.joint_names.index(joint_name)]
+            rotates[name] = joint.type == 'revolute'
+            driven = f'{joint_name}.{"theta" if rotates[name] else "d"}'
+            self._driven.setdefault(driven, []).append(name)
+        self._signs = {joint.name: joint.sign for joint in chain.joints}
         for name in self.names:
             if name not in rotates:
                 raise UnknownNameError('parameter', name, chain.parameter_names)
@@ -64,7 +79,7 @@ class ErrorModel:
         """Row of each named parameter in the arrays of `linearise`."""
 
     def linearise(
-        self, q: FloatArray
+        self, q: FloatArray, approach: FloatArray | None = None
     ) -> tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]:
         """Return pose and derivatives for one block of samples.
 
@@ -72,6 +87,8 @@ class ErrorModel:
         ----------
         q : (n, B)
             Joint values [rad or m], a row per joint.
+        approach : (n, B), optional
+            Signs of the velocities before, for backlash.
 
         Returns
         -------
@@ -90,29 +107,51 @@ class ErrorModel:
         shift = np.empty((len(row) + 1, 3, samples))
         turn = np.empty((rotations + 1, 3, samples))
         arm = np.empty((rotations, 3, samples))
+        for name in row:
+            frame = name.partition('.')[0]
+            if frame in self.chain.frame_names and frame not in self._ends:
+                k = row[name]
+                (turn if k < rotations else shift)[k] = 0.0
+                if k < rotations:
+                    arm[k] = 0.0
+        phi = dict(
+            zip(
+                self._effects,
+                effects.basis(self.chain, self._effects, q, approach) if self._effects else (),
+                strict=True,
+            )
+        )
 
-        def record(name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-            k = row.get(name)
-            if k is None:
-                return
+        def put(k: int, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
             if rotates:
                 turn[k] = axis
                 arm[k] = point
             else:
                 shift[k] = axis
 
-        axes, origin = self.chain.trace(q, record)
+        def record(name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
+            k = row.get(name)
+            if k is not None:
+                put(k, rotates, axis, point)
+            for effect in self._driven.get(name, ()):
+                sign = self._signs[effect.partition('.')[0]]
+                put(row[effect], rotates, axis * (sign * phi[effect]), point)
+
+        effective = self.chain.effective(q, approach)
+        axes, origin = self.chain.trace(effective, record, *self._ends)
         np.subtract(origin, arm, out=arm)
         cross(turn[:-1], arm, shift[:rotations])
         return axes, origin, shift, turn
 
-    def jacobian(self, q: FloatArray) -> FloatArray:
+    def jacobian(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the Jacobian (N, 6, P) of position [m] and orientation [rad] at poses q (N, n).
 
         Rows 0-2 are the target's position in the world. Rows 3-5 are its rotation as a vector
         in world axes: the turned orientation is exp(J[3:] dx) R.
         """
-        _, _, shift, turn = self.linearise(np.ascontiguousarray(np.asarray(q, dtype=float).T))
+        rows = np.ascontiguousarray(np.asarray(q, dtype=float).T)
+        came = None if approach is None else np.ascontiguousarray(approach.T)
+        _, _, shift, turn = self.linearise(rows, came)
         full = np.zeros((len(q), 6, len(self.names)))
         full[:, :3] = shift[self.order].transpose(2, 1, 0)
         rotational = self.order < self.rotations

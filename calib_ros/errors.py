@@ -24,9 +24,10 @@ class UnknownNameError(ConfigError):
     """A name that does not exist; keeps the name and the valid alternatives."""
 
     def __init__(self, what: str, name: str, alternatives: Iterable[str]) -> None:
+        self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)
-        near = difflib.get_close_matches(name, self.alternatives, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(str(name), self.alternatives, n=1, cutoff=0.5)
         hint = f'did you mean "{near[0]}"? ' if near else ''
         super().__init__(
             f'unknown {what} "{name}": {hint}valid are {", ".join(self.alternatives)}'

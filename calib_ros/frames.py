@@ -15,7 +15,7 @@ are tried as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.chain import FRAME_KINDS, Chain, Frame
-from calib_ros.leastsquares import Samples, minimise
+from calib_ros.leastsquares import Samples, System, minimise
 from calib_ros.observations import Observations
+from calib_ros.robust import robust_fit
 from calib_ros.se3 import FloatArray
 
 SUBSET = 200
@@ -32,48 +33,117 @@ CONVINCING = 0.03
 """A start is taken without a search when its RMS error is below this share of the spread."""
 
 
-def free_frame_parameters(chain: Chain, oriented: bool) -> tuple[str, ...]:
-    """Return the parameters of the frames that are not fixed.
+def start_frames(
+    chain: Chain,
+    sets: Sequence[Observations],
+    sigma_position: float,
+    sigma_orientation: float,
+    loss: str,
+) -> Chain:
+    """Return the chain with base and tool frames that bring it close to the measurements.
 
-    A tool's rotation is left out when no orientation was measured: no position depends on it.
+    Sets are taken one after the other; frames that an earlier set has found are kept for later
+    ones.
     """
-    return tuple(
+    found: set[str] = set()
+    for observations in sets:
+        ends = {'base': observations.base, 'tool': observations.tool}
+        frames = {}
+        for key, name in ends.items():
+            frames[key] = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}[name]
+            if name in found:
+                frames[key] = replace(chain.frame(name), fixed=True)
+        view = replace(chain, base=frames['base'], tool=frames['tool'])
+        alone = replace(observations, base='base', tool='tool')
+        view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
+        for key, name in ends.items():
+            frame = replace(view.frame(key), fixed=chain.frame(name).fixed)
+            chain = chain.with_frame(name, frame)
+        found |= set(ends.values())
+    return chain
+
+
+def _start_one(
+    chain: Chain,
+    observations: Observations,
+    sigma_position: float,
+    sigma_orientation: float,
+    loss: str,
+) -> Chain:
+    """Return the chain with frames for one set of observations."""
+    oriented = bool(observations.oriented.any()) and observations.distances is None
+    names = [
         f'{key}.{kind}'
         for key in ('base', 'tool')
         if not chain.frame(key).fixed
         for kind in FRAME_KINDS
         if oriented or key == 'base' or not kind.startswith('r')
-    )
-
-
-def start_frames(
-    chain: Chain, observations: Observations, sigma_position: float, sigma_orientation: float
-) -> Chain:
-    """Return the chain with base and tool frames that bring it close to the measurements."""
-    names = free_frame_parameters(chain, bool(observations.oriented.any()))
+    ]
     if not names:
         return chain
+    if not observations.positions.any() and observations.distances is None:
+        return _in_socket(chain, observations)
     index = np.unique(np.linspace(0, len(observations) - 1, SUBSET).round().astype(int))
     subset = observations.select(index)
-    samples = Samples(subset, sigma_position, sigma_orientation)
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints)
+    system = System((Samples(subset, sigma_position, sigma_orientation),))
+    arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
+    if subset.distances is not None:
+        return minimise(_trilaterated(chain, arm, subset), names, system, tolerance=1e-3).chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     best, best_error = chain, np.inf
     for candidates in (_closed_form(chain, arm, subset), _search()):
         for rotation in candidates:
             start = _complete(chain, arm, subset, rotation)
-            fitted = minimise(start, names, samples, tolerance=1e-3).chain
-            error = _position_rms(fitted, subset)
+            fitted = minimise(start, names, system, tolerance=1e-3).chain
+            error = _typical_error(fitted, subset)
             if error < best_error:
                 best, best_error = fitted, error
         if best_error <= CONVINCING * spread:
             break
-    return best
+    return robust_fit(best, names, system, loss).fit.chain
 
 
-def _position_rms(chain: Chain, observations: Observations) -> float:
-    difference = observations.positions - chain.forward(observations.joints)[:, :3, 3]
-    return float(np.sqrt((difference**2).sum(axis=1).mean()))
+def _in_socket(chain: Chain, observations: Observations) -> Chain:
+    """Return the chain with its base moved, not turned, so that the tool stays at the origin.
+
+    0 = b + p_K + R_K t is linear in b and the tool's offset t.
+    """
+    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
+    tool, base = chain.frame('tool'), chain.frame('base')
+    tool_matrix, base_matrix = tool.matrix.copy(), np.eye(4)
+    if not tool.fixed:
+        columns = np.concatenate(
+            [np.broadcast_to(np.eye(3), (len(arm), 3, 3)), arm[:, :3, :3]], axis=2
+        )
+        wanted = -arm[:, :3, 3].ravel()
+        tool_matrix[:3, 3] = np.linalg.lstsq(columns.reshape(-1, 6), wanted, rcond=None)[0][3:]
+    base_matrix[:3, 3] = -(arm @ tool_matrix)[:, :3, 3].mean(axis=0)
+    return replace(
+        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
+    )
+
+
+def _typical_error(chain: Chain, observations: Observations) -> float:
+    """Return the median distance [m], which gross errors do not touch."""
+    predicted = chain.forward(observations.joints, observations.approach)[:, :3, 3]
+    return float(np.median(np.linalg.norm(observations.positions - predicted, axis=1)))
+
+
+def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
+    """Return the chain placed by distances from the world's origin.
+
+    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
+    world, because no distance from its origin tells.
+    """
+    if chain.frame('base').fixed:
+        return chain
+    assert observations.distances is not None
+    points = arm[:, :3, 3] + arm[:, :3, :3] @ chain.frame('tool').matrix[:3, 3]
+    columns = np.column_stack([2.0 * points, np.ones(len(points))])
+    wanted = observations.distances**2 - (points**2).sum(axis=1)
+    matrix = np.eye(4)
+    matrix[:3, 3] = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
+    return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
 
 
 def _closed_form(

@@ -2,18 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which parameters a set of poses determines, and how well.
 
-Works on the triangular factor R of the weighted Jacobian (R^T R = J^T W J), never on the normal
+Works on the triangular factor R of the weighted Jacobian (R^T R = J^T W J), not on the normal
 matrix, which squares the condition number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
 
-from calib_ros.chain import FRAME_KINDS, Chain
+from calib_ros.chain import Chain
 from calib_ros.differential import ErrorModel
 from calib_ros.se3 import FloatArray
 
@@ -47,37 +48,131 @@ def independent(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(kept)
 
 
+@dataclass(frozen=True)
+class Kind:
+    """What a set of observations measures, and between which frames."""
+
+    oriented: bool = True
+    distance: bool = False
+    base: str = 'base'
+    tool: str = 'tool'
+
+
 def structurally_independent(
-    chain: Chain, names: Sequence[str], oriented: bool
+    chain: Chain,
+    names: Sequence[str],
+    kinds: Sequence[Kind] = (Kind(),),
+    extra: Callable[[Chain, Sequence[str]], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[str, ...]:
     """Return the parameters that a large number of arbitrary poses would determine.
 
     What is left out is a gauge freedom of the chain, not a lack of measurements. Frames that are
     not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
-    by full pose (Everett, Driels and Mooring 1987).
+    by full pose (Everett, Driels and Mooring 1987). `extra` returns further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
+    frames = [name for name in names if chain.owns_frame(name)]
     anywhere = chain.with_offsets(
-        {
-            f'{key}.{kind}': rng.uniform(0.1, 0.5)
-            for key in ('base', 'tool')
-            if not chain.frame(key).fixed
-            for kind in FRAME_KINDS
-        }
+        dict(zip(frames, rng.uniform(0.1, 0.5, len(frames)), strict=True))
     )
-    jacobian = ErrorModel(anywhere, names).jacobian(joints)
-    rows: FloatArray = jacobian[:, : 6 if oriented else 3].reshape(-1, len(names))
+    approach = rng.choice([-1.0, 1.0], joints.shape)
+    rows = np.zeros((0, len(names)))
+    if extra is not None:
+        rows = extra(anywhere, names)[0]
+    for kind in kinds:
+        model = ErrorModel(anywhere, names, kind.base, kind.tool)
+        jacobian = model.jacobian(joints, approach)
+        if kind.distance:
+            line = anywhere.forward(joints, approach, kind.base, kind.tool)[:, :3, 3]
+            line /= np.linalg.norm(line, axis=1, keepdims=True)
+            jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
+        elif not kind.oriented:
+            jacobian = jacobian[:, :3]
+        rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
 
 
-def covariance(factor: FloatArray) -> FloatArray:
+def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:
     """Return the covariance (P, P) of the parameters from R, for weights in units of sigma.
 
-    For Gaussian noise this is the Cramer-Rao bound.
+    For Gaussian noise of those sigmas (R^T R)^-1 is the Cramer-Rao bound. With noise of another
+    size it is (R^T R)^-1 M (R^T R)^-1, where `middle` M (P, P) is the normal matrix with every
+    equation weighted by its true variance (in units of the one assumed).
     """
     scale = 1.0 / np.linalg.norm(factor, axis=0)
-    inverse = linalg.solve_triangular(factor * scale, np.eye(len(factor)))
-    return np.asarray(np.outer(scale, scale) * (inverse @ inverse.T))
+    inverse = scale[:, np.newaxis] * linalg.solve_triangular(factor * scale, np.eye(len(factor)))
+    if middle is None:
+        return np.asarray(inverse @ inverse.T)
+    sizes, directions = np.linalg.eigh(inverse.T @ middle @ inverse)
+    root = inverse @ (directions * np.sqrt(np.maximum(sizes, 0.0)))  # no rounding below zero
+    return np.asarray(root @ root.T)
+
+
+TRADE = 1e-4
+"""Least share of a parameter in a trade to be named."""
+
+
+def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
+    """Return, for each parameter that was left out, the fitted ones that it trades against.
+
+    Moving the one, and the others by the right amounts, leaves every measured pose as it is.
+    """
+    columns = dict(zip(names, factor.T, strict=True))
+    scales = {name: float(np.linalg.norm(column)) for name, column in columns.items()}
+    basis = np.array([columns[name] / (scales[name] or 1.0) for name in kept]).T
+    partners: dict[str, list[str]] = {}
+    for name in names:
+        if name in kept:
+            continue
+        if scales[name] == 0.0:
+            partners[name] = []
+            continue
+        shares = np.linalg.lstsq(basis, columns[name] / scales[name], rcond=None)[0]
+        strong = np.abs(shares) > TRADE * np.abs(shares).max()
+        partners[name] = [other for other, yes in zip(kept, strong, strict=True) if yes]
+    return partners
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Observability indices of a set of poses from the singular values of the scaled Jacobian.
+
+    O1 Borm and Menq 1991, O2 Driels and Pathre 1990, O3 and O4 Nahvi et al. 1994 and 1996,
+    O5 Sun and Hollerbach 2008. Columns are in sigma of the measurement per metre or radian.
+    """
+
+    o1: float
+    o2: float
+    o3: float
+    o4: float
+    o5: float
+
+
+def observability(factor: FloatArray, poses: int) -> Observability:
+    """Return the indices from R (P, P) of the weighted Jacobian of a number of poses."""
+    singular = np.linalg.svd(factor, compute_uv=False)
+    smallest, largest = float(singular[-1]), float(singular[0])
+    return Observability(
+        o1=float(np.exp(np.mean(np.log(np.maximum(singular, 1e-300)))) / np.sqrt(poses)),
+        o2=smallest / largest,
+        o3=smallest,
+        o4=smallest**2 / largest,
+        o5=float(1.0 / np.sum(1.0 / np.maximum(singular, 1e-300))),
+    )
+
+
+def correlated(
+    matrix: FloatArray, names: Sequence[str], threshold: float
+) -> tuple[tuple[str, str, float], ...]:
+    """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
+    std = np.sqrt(np.diag(matrix))
+    correlation = matrix / np.outer(std, std)
+    rows, columns = np.nonzero(np.triu(np.abs(correlation) > threshold, 1))
+    pairs = [
+        (names[i], names[j], float(correlation[i, j]))
+        for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
+    ]
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))

@@ -10,163 +10,55 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from calib_ros import identifiability
-from calib_ros.chain import Chain
-from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError
-from calib_ros.frames import free_frame_parameters, start_frames
-from calib_ros.leastsquares import Fit, Samples, minimise, triangular_factor
+from calib_ros import effects, identifiability
+from calib_ros.chain import FRAME_KINDS, Chain
+from calib_ros.differential import ErrorModel
+from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.frames import start_frames
+from calib_ros.leastsquares import Fit, System, minimise, triangular_factor
 from calib_ros.observations import Observations
-from calib_ros.se3 import FloatArray, log_rotation
+from calib_ros.problem import Problem
+from calib_ros.robust import OUTLIER, Robust, robust_fit
+from calib_ros.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.validation import Comparison, Parameter, compare, refusals, residuals, validate
 
-CONFIDENCE = 0.95
-"""One-sided confidence that a gain on held-out poses must have to be claimed."""
-FOLD_TOLERANCE = 1e-3
-"""Step [sigma] at which the fits of a cross-validation stop; their figures need no more."""
+__all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """What is known before an identification.
-
-    Parameters
-    ----------
-    chain : Chain
-        The nominal chain. Frames that it does not fix are fitted.
-    observations : Observations
-        Pairs to fit.
-    held_out : Observations, optional
-        Pairs that are never fitted and judge the result. Without them the result is judged by
-        cross-validation over whole configurations.
-    sigma_position, sigma_orientation : float
-        Standard deviations [m, rad] of measurements without a covariance of their own. Their
-        ratio weighs position against orientation; the size of the noise is estimated.
-    fixed : sequence of str
-        Parameters to hold at their nominal values; `*` and `?` match as in file names.
-    folds : int
-        Parts of the cross-validation.
-
-    """
-
-    chain: Chain
-    observations: Observations
-    held_out: Observations | None = None
-    sigma_position: float = 1e-4
-    sigma_orientation: float = 1e-4 / 0.3
-    fixed: Sequence[str] = ()
-    folds: int = 5
-
-    def __post_init__(self) -> None:
-        """Check what does not depend on the measured values."""
-        for name in ('sigma_position', 'sigma_orientation'):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
-        joints = len(self.chain.joints)
-        for observations in (self.observations, self.held_out):
-            if observations is not None and observations.joints.shape[1:] != (joints,):
-                raise InputError(
-                    f'observations have {observations.joints.shape[1:]} joint values, chain '
-                    f'"{self.chain.name}" has {joints} joints'
-                )
-
-        names = self.chain.parameter_names
-        for pattern in self.fixed:
-            if not fnmatch.filter(names, pattern):
-                raise UnknownNameError('parameter to fix', pattern, names)
-            if pattern.startswith(('base', 'tool')):
-                raise ConfigError(
-                    f'a frame is held as a whole: give it in the chain file with "fixed: true", '
-                    f'instead of fixing "{pattern}"'
-                )
-        if not self.free:
-            raise ConfigError('every parameter is fixed: nothing is left to identify')
-
-    @property
-    def oriented(self) -> bool:
-        """Tell whether any orientation was measured."""
-        return bool(self.observations.oriented.any())
-
-    @property
-    def free(self) -> tuple[str, ...]:
-        """Return the parameters that may be fitted, in the order of their priority."""
-        held = [f'{key}.*' for key in ('base', 'tool') if self.chain.frame(key).fixed]
-        return tuple(
-            name
-            for name in self.chain.parameter_names
-            if not any(fnmatch.fnmatchcase(name, pattern) for pattern in (*self.fixed, *held))
-        )
+SHARED = 1.2
+"""Ratio from which the errors of one configuration's pairs are taken to be correlated."""
+SOME = 500
+"""Pairs that are enough for a first fit."""
+SIGMA_TEST = 0.999
+"""Confidence at which the chi-squared test of the sigmas given lets them pass."""
 
 
 @dataclass(frozen=True)
-class Parameter:
-    """One parameter of the model: m for lengths, rad for angles.
+class Noise:
+    """Size of the residuals in units of the sigma given, for position and orientation.
 
-    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
-    do not determine it) or 'fixed'; all but the first keep the nominal value.
+    `consistent` tells whether a chi-squared test lets the sigmas pass; then they are taken as they
+    are for the standard deviations, else those found.
     """
 
-    name: str
-    value: float
-    offset: float
-    std: float | None
-    status: str
+    position: float
+    orientation: float | None
+    consistent: bool
 
 
 @dataclass(frozen=True)
-class ErrorFigures:
-    """Figures of the distance to the measurement over a set of poses."""
+class Outlier:
+    """A sample of gross error: where it is found, and its size in units of the usual error."""
 
-    count: int
-    rms_mm: float
-    mean_mm: float
-    max_mm: float
-    rms_mrad: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
-
-    Both in the world; the rotation is NaN where no orientation was measured. `configurations`
-    (N,) tells which pairs belong to one standing configuration.
-    """
-
-    position: FloatArray
-    orientation: FloatArray
-    configurations: NDArray[np.intp]
-
-    @property
-    def figures(self) -> ErrorFigures:
-        """Return RMS, mean and maximum."""
-        distance = 1e3 * np.linalg.norm(self.position, axis=1)
-        angle = 1e3 * np.linalg.norm(self.orientation, axis=1)
-        angle = angle[~np.isnan(angle)]
-        return ErrorFigures(
-            len(distance),
-            float(np.sqrt(np.mean(distance**2))),
-            float(distance.mean()),
-            float(distance.max()),
-            float(np.sqrt(np.mean(angle**2))) if angle.size else None,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Residuals of the same poses before and after.
-
-    Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's
-    and not the frames'.
-    """
-
-    before: Residuals
-    after: Residuals
+    set: int
+    sample: int
+    stamp_ns: int
+    size: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,18 +74,24 @@ class Identification:
     parameters : tuple of Parameter
         Every parameter of the model.
     names, covariance : tuple of str, (P, P)
-        Fitted parameters and their covariance, scaled to the noise found in the residuals.
+        Fitted parameters and their covariance for the noise found in the residuals.
     fitted, validation : Comparison
         Residuals on the fitted pairs and on pairs that were not fitted. The latter is None when
         there are too few configurations to hold any out.
     validated_by : str
         How the pairs of `validation` were held out.
-    noise : float
-        Size of the residuals in units of the sigma given.
+    noise : Noise
+    outliers : tuple of Outlier
+        Samples of gross error; they carry no or little weight in the fit.
+    gauges : dict
+        For each parameter that was left out, the fitted ones that it trades against.
+    observability : Observability
     rank, iterations : int
     converged : bool
     refusals : tuple of str
         Rules of acceptance that failed, in words; none when the result is accepted.
+    verdicts : tuple of Verdict
+        Where the model was chosen: what paid for itself and what did not.
 
     """
 
@@ -205,10 +103,16 @@ class Identification:
     fitted: Comparison
     validation: Comparison | None
     validated_by: str
-    noise: float
+    noise: Noise
+    outliers: tuple[Outlier, ...]
+    gauges: dict[str, list[str]]
+    observability: identifiability.Observability
+    priors: dict[str, float]
+    world_frame: str
     iterations: int
     converged: bool
     refusals: tuple[str, ...]
+    verdicts: tuple[effects.Verdict, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -225,6 +129,32 @@ class Identification:
         """Return the parameters that were free but could not be determined."""
         return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))
 
+    def pose_covariance(self, q: FloatArray) -> FloatArray:
+        """Return the covariance (N, 6, 6) [m, rad] of the predicted pose at q (N, n).
+
+        From the uncertainty of the parameters alone; position and rotation in world axes.
+        """
+        jacobian = ErrorModel(self.chain, self.names).jacobian(q)
+        return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
+
+    def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
+        """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position."""
+        values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
+        length = np.sqrt(stats.chi2.ppf(level, 3) * np.maximum(values, 0.0))
+        return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
+
+    def predicted_sigma(self, count: int = 300) -> FloatArray:
+        """Return standard deviations (count,) [m] of positions predicted all over the joint range.
+
+        The root of the trace of the position's covariance, at seeded random configurations.
+        """
+        q = self.chain.random_joints(count, np.random.default_rng(0))
+        return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
+
+    def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
+        """Return the pairs of parameters whose correlation exceeds a threshold."""
+        return identifiability.correlated(self.covariance, self.names, threshold)
+
     @property
     def not_excited(self) -> tuple[str, ...]:
         """Return those of them that other poses would determine."""
@@ -240,116 +170,143 @@ def identify(problem: Problem) -> Identification:
         With fewer equations than parameters.
 
     """
+    model = problem.model
+    system = problem.system(problem.sets)
     structural = identifiability.structurally_independent(
-        problem.chain, problem.free, problem.oriented
+        model, problem.free, problem.kinds, system.separation_rows
     )
-    _require_enough(problem, structural)
-    samples = Samples(problem.observations, problem.sigma_position, problem.sigma_orientation)
-    before = _fit_frames(problem, samples)
-    names = identifiability.independent(
-        triangular_factor(before.chain, structural, samples), structural
+    determined = [name for name in structural if name not in problem.prior_names]
+    _require_enough(problem, determined)
+    start = start_frames(
+        model, problem.sets, problem.sigma_position, problem.sigma_orientation, problem.loss
     )
-    fit = minimise(before.chain, names, samples)
-    noise = np.sqrt(fit.cost / max(samples.rows - len(names), 1))
-    covariance = noise**2 * identifiability.covariance(
-        triangular_factor(fit.chain, names, samples)
-    )
-    validation, validated_by = _validate(problem, before.chain, fit.chain, names)
+    wanted = [n for n in problem.free if n in structural or n in problem.prior_names]
+    few = problem.system([_some(each) for each in problem.sets])
+    names = identifiability.independent(triangular_factor(start, wanted, few), wanted)
+    if len(names) < len(wanted):  # more samples may determine more
+        names = identifiability.independent(triangular_factor(start, wanted, system), wanted)
+    rough = start
+    if few.count < system.count // 2:
+        rough = minimise(start, names, few, tolerance=1e-2).chain
+    robust = robust_fit(rough, names, system, problem.loss)
+    fit = robust.fit
+    before = minimise(start, [n for n in names if model.owns_frame(n)], system)
+    factor = fit.normal.factor()
+    if factor is None:
+        factor = triangular_factor(fit.chain, names, system)
+    noise, covariance = _noise(fit, names, system, factor)
+    validation, validated_by = validate(problem, before.chain, fit.chain, names, robust)
     parameters = _parameters(problem, fit.chain, structural, names, covariance)
+    converged = before.converged and fit.converged and robust.settled
     return Identification(
         chain=fit.chain,
         before=before.chain,
         parameters=parameters,
         names=names,
         covariance=covariance,
-        fitted=_compare(before.chain, fit.chain, problem.observations),
+        fitted=replace(compare(before.chain, fit.chain, problem.sets), judged=~robust.outliers),
         validation=validation,
         validated_by=validated_by,
-        noise=float(noise),
-        iterations=fit.iterations,
-        converged=before.converged and fit.converged,
-        refusals=_refusals(before.converged and fit.converged, parameters, validation),
+        noise=noise,
+        outliers=_outliers(problem, robust),
+        gauges=_gauges(problem, fit.chain, names),
+        observability=identifiability.observability(factor, system.count),
+        priors={} if system.prior is None else dict(system.prior.sigmas),
+        world_frame=problem.world_frame,
+        iterations=robust.iterations,
+        converged=converged,
+        refusals=refusals(problem, converged, parameters, validation),
     )
 
 
-def residuals(chain: Chain, observations: Observations) -> Residuals:
-    """Return measured minus predicted for every pair."""
-    predicted = chain.forward(observations.joints)
-    turned = observations.rotations @ np.swapaxes(predicted[:, :3, :3], 1, 2)
-    orientation = np.full((len(observations), 3), np.nan)
-    orientation[observations.oriented] = log_rotation(turned[observations.oriented])
-    return Residuals(
-        observations.positions - predicted[:, :3, 3], orientation, observations.configurations
+def _noise(
+    fit: Fit, names: Sequence[str], system: System, factor: FloatArray
+) -> tuple[Noise, FloatArray]:
+    """Return the noise found, and the covariance of the parameters that follows from it.
+
+    Each part (position, orientation) has as many degrees of freedom as equations, less its share
+    of the parameters, trace(H^-1 H_part).
+    """
+    chain, normal = fit.chain, fit.normal
+    plain = identifiability.covariance(factor)
+    sums, counts, joint_sums = np.zeros(2), np.zeros(2), np.zeros(2)
+    for samples in system.sets:
+        for k, part in enumerate(samples.whitened_residuals(chain)):
+            weights = np.ones(len(part)) if samples.weights is None else samples.weights**2
+            known = ~np.isnan(part[:, 0])
+            sums[k] += weights[known] @ (part[known] ** 2).sum(axis=1)
+            counts[k] += part.shape[1] * weights[known].sum()
+            groups = samples.observations.configurations[known]
+            together = np.zeros((int(groups.max(initial=-1)) + 1, part.shape[1]))
+            np.add.at(together, groups, np.sqrt(weights[known])[:, np.newaxis] * part[known])
+            joint_sums[k] += (together**2).sum()
+    if not normal.parts[1].any():  # whitened as a whole, or no orientation
+        sums, counts = np.array([sums.sum(), 0.0]), np.array([counts.sum(), 0.0])
+        joint_sums = np.array([joint_sums.sum(), 0.0])
+    freedom = counts - [float(np.sum(plain * part)) for part in normal.parts]
+    known = freedom > 1e-9
+    variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
+    low, high = stats.chi2.interval(SIGMA_TEST, np.where(known, freedom, 1.0))
+    consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
+    found = Noise(
+        float(np.sqrt(variances[0])),
+        float(np.sqrt(variances[1])) if known[1] else None,
+        consistent,
     )
+    # Pairs of one configuration share what the model lacks: they count for fewer.
+    shared = np.maximum(joint_sums / np.maximum(sums, 1e-300), 1.0)
+    if consistent and shared.max() < SHARED:
+        return found, plain
+    if not consistent:
+        shared *= variances
+    middle = sum(factor * part for factor, part in zip(shared, normal.parts, strict=True))
+    extra, _ = system.extra_rows(chain, names)
+    middle = middle + extra.T @ extra
+    return found, identifiability.covariance(factor, middle)
 
 
-def _compare(before: Chain, after: Chain, observations: Observations) -> Comparison:
-    return Comparison(residuals(before, observations), residuals(after, observations))
+def _some(observations: Observations) -> Observations:
+    """Return enough pairs, evenly spread, to come close to the result and to see its rank."""
+    return observations.select(np.arange(0, len(observations), 1 + len(observations) // SOME))
 
 
-def _fit_frames(problem: Problem, samples: Samples) -> Fit:
-    """Fit the frames of the nominal chain to all samples."""
-    start = start_frames(
-        problem.chain, problem.observations, problem.sigma_position, problem.sigma_orientation
-    )
-    names = free_frame_parameters(problem.chain, problem.oriented)
-    kept = identifiability.independent(triangular_factor(start, names, samples), names)
-    return minimise(start, kept, samples)
+def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, list[str]]:
+    """Return what each parameter that was left out trades against, seen on a part of the pairs."""
+    free = problem.free
+    if len(names) == len(free):
+        return {}
+    few = problem.system([_some(each) for each in problem.sets])
+    factor = triangular_factor(chain, free, few, priors=False)
+    return identifiability.trades(factor, free, names)
+
+
+def _outliers(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
+    if problem.loss == 'none':
+        return ()
+    found = []
+    for number, (each, distances) in enumerate(zip(problem.sets, robust.distances, strict=True)):
+        for sample in np.flatnonzero(distances > OUTLIER):
+            stamp = int(each.stamps_ns[sample])
+            found.append(Outlier(number, int(sample), stamp, float(distances[sample])))
+    return tuple(found)
 
 
 def _require_enough(problem: Problem, names: Sequence[str]) -> None:
-    rows = 6 if problem.oriented else 3
-    configurations = 0
-    if len(problem.observations):
-        configurations = int(problem.observations.configurations[-1]) + 1
-    if configurations * rows < len(names):
+    rows = configurations = 0
+    for each, kind in zip(problem.sets, problem.kinds, strict=True):
+        count = len(np.unique(each.configurations))
+        rows += count * (1 if kind.distance else 6 if kind.oriented else 3)
+        configurations += count
+    if not len(problem.observations):
+        raise InputError('there are no pairs to fit')
+    if rows < len(names):
+        kind = problem.kinds[0]
+        width = 1 if kind.distance else 6 if kind.oriented else 3
         raise TooFewObservationsError(
             configurations,
-            -(-len(names) // rows),
-            f'{rows} equations each for {len(names)} parameters',
+            -(-len(names) // width),
+            f'{width} equations each for {len(names)} parameters',
         )
-
-
-def _validate(
-    problem: Problem, before: Chain, after: Chain, names: Sequence[str]
-) -> tuple[Comparison | None, str]:
-    """Judge both chains on pairs that were not fitted."""
-    if problem.held_out is not None and len(problem.held_out):
-        count = len(problem.held_out)
-        return _compare(before, after, problem.held_out), f'{count} held-out pairs'
-    observations = problem.observations
-    groups = observations.configurations
-    folds = min(problem.folds, int(groups[-1]) + 1)
-    rows = 6 if problem.oriented else 3
-    if folds < 2 or (groups[-1] + 1) * (folds - 1) // folds * rows < len(names) + rows:
-        return None, 'nothing: too few configurations to hold any out'
-    frames = [name for name in names if name.partition('.')[0] in ('base', 'tool')]
-    order, parts = [], []
-    for fold in range(folds):
-        left_out = groups % folds == fold
-        samples = Samples(
-            observations.select(~left_out), problem.sigma_position, problem.sigma_orientation
-        )
-        chains = (
-            minimise(before, frames, samples, FOLD_TOLERANCE).chain,
-            minimise(after, names, samples, FOLD_TOLERANCE).chain,
-        )
-        parts.append(_compare(*chains, observations.select(left_out)))
-        order.append(np.flatnonzero(left_out))
-    index = np.argsort(np.concatenate(order))
-
-    def joined(which: str) -> Residuals:
-        pieces = [getattr(part, which) for part in parts]
-        return Residuals(
-            np.concatenate([piece.position for piece in pieces])[index],
-            np.concatenate([piece.orientation for piece in pieces])[index],
-            groups,
-        )
-
-    return (
-        Comparison(joined('before'), joined('after')),
-        f'{folds}-fold cross-validation over {groups[-1] + 1} configurations',
-    )
 
 
 def _parameters(
@@ -359,7 +316,8 @@ def _parameters(
     names: Sequence[str],
     covariance: FloatArray,
 ) -> tuple[Parameter, ...]:
-    std = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    of_values = _for_values(chain, names, covariance)
+    std = dict(zip(names, np.sqrt(np.diag(of_values)).tolist(), strict=True))
     free = set(problem.free)
     rows = []
     for name in chain.parameter_names:
@@ -369,61 +327,21 @@ def _parameters(
             status = 'not excited'
         else:
             status = 'gauge' if name in free else 'fixed'
-        offset = chain.offset(name, problem.chain)
+        offset = chain.offset(name, problem.model)
         rows.append(Parameter(name, chain.value(name), offset, std.get(name), status))
     return tuple(rows)
 
 
-def _refusals(
-    converged: bool, parameters: Sequence[Parameter], validation: Comparison | None
-) -> tuple[str, ...]:
-    """Return the rules of acceptance that fail.
+def _for_values(chain: Chain, names: Sequence[str], covariance: FloatArray) -> FloatArray:
+    """Return the covariance of the values: of rotation vectors, where frames were turned.
 
-    1. The fit has converged.
-    2. The rank is full after gauges: no parameter that other poses would determine is left out.
-    3. The RMS error on held-out poses is lower than before, by more than its uncertainty: the
-       mean of the squared position errors' decrease over configurations exceeds its one-sided
-       95 % limit (Student's t); the orientation must not get worse by the same measure.
+    A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
     """
-    failed = []
-    if not converged:
-        failed.append('the fit has not converged')
-    not_excited = [p.name for p in parameters if p.status == 'not excited']
-    if not_excited:
-        failed.append(
-            f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            'in more combinations, or fix these parameters'
-        )
-    if validation is None:
-        failed.append('there are too few configurations to judge the result on any held out')
-        return tuple(failed)
-    before, after = validation.before.figures, validation.after.figures
-    groups = validation.after.configurations
-    gain, limit = _gain(validation.before.position, validation.after.position, groups)
-    if not gain > limit:
-        failed.append(
-            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
-            f'before, {after.rms_mm:.3f} mm after)'
-        )
-    if after.rms_mrad is not None:
-        gain, limit = _gain(validation.before.orientation, validation.after.orientation, groups)
-        if gain < -limit:
-            failed.append(
-                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
-                f'before, {after.rms_mrad:.3f} mrad after)'
-            )
-    return tuple(failed)
-
-
-def _gain(
-    before: FloatArray, after: FloatArray, configurations: NDArray[np.intp]
-) -> tuple[float, float]:
-    """Return the mean decrease of the squared error (N, 3) per configuration, and its limit."""
-    decrease = (before**2).sum(axis=1) - (after**2).sum(axis=1)
-    known = ~np.isnan(decrease)
-    _, group = np.unique(configurations[known], return_inverse=True)
-    means = np.bincount(group, decrease[known]) / np.bincount(group)
-    if len(means) < 2:
-        return 0.0, np.inf
-    limit = stats.t.ppf(CONFIDENCE, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
-    return float(means.mean()), float(limit)
+    change = np.eye(len(names))
+    for frame in chain.frame_names:
+        turns = [f'{frame}.{kind}' for kind in FRAME_KINDS[3:]]
+        index = [names.index(name) for name in turns if name in names]
+        if len(index) == 3:
+            vector = chain.frame(frame).offsets()[3:]
+            change[np.ix_(index, index)] = left_jacobian_inverse(vector)
+    return np.asarray(change @ covariance @ change.T)

@@ -6,18 +6,20 @@ Residual of a sample: p_measured - p and the rotation vector from the model's or
 measured one, both in world axes, weighted by the inverse of the measurement's covariance. Its
 derivative with respect to the parameters is the error model's, with the sign reversed. The
 orientation part leaves out the Jacobian of the logarithm: with equal weights on the three axes
-the gradient does not change, because that Jacobian leaves the residual itself as it is.
+the gradient does not change, because that Jacobian leaves the residual itself as it is. A measured
+distance has the residual L - |p|, and its derivative is the position's along p.
 
 Samples are visited in blocks that fit the cache. A block adds to the normal matrix, which has
 the residual as its last row and column, so memory does not grow with the number of samples.
-Rank and covariance come from a triangular factor of the Jacobian itself (a QR decomposition,
-block by block), because the normal matrix squares its condition number.
+The rank comes from a triangular factor of the Jacobian itself (a QR decomposition, block by
+block), because the normal matrix squares its condition number; so does the covariance, unless
+that matrix is well conditioned.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import linalg
@@ -33,10 +35,16 @@ STEP_TOLERANCE = 1e-8
 larger, in RMS residuals)."""
 MAX_ITERATIONS = 50
 PATIENCE = 3
+WELL_CONDITIONED = 1e9
+"""Condition of the scaled normal matrix up to which a covariance from it has 6 digits or more."""
+SEPARATION_SIGMA = 1e-5
+"""Standard deviation [m] of a known distance between sockets."""
+SMALL_STEP = 1e-3
+"""Step [m or rad] whose second order, half its square, is a thousandth of a millimetre at most."""
 
 
 class Samples:
-    """Observations laid out for the solver: component first, sample last, weights at hand.
+    """One set of observations laid out for the solver: component first, sample last.
 
     Parameters
     ----------
@@ -49,17 +57,24 @@ class Samples:
     def __init__(
         self, observations: Observations, sigma_position: float, sigma_orientation: float
     ) -> None:
+        self.observations = observations
         self.count = len(observations)
         self.joints = np.ascontiguousarray(observations.joints.T)
         self.positions = np.ascontiguousarray(observations.positions.T)
         self.rotations = np.ascontiguousarray(observations.rotations.transpose(2, 1, 0))
-        self.oriented = bool(observations.oriented.any())
-        self.rows = 3 * self.count + 3 * int(observations.oriented.sum())
-        self.weights = (1.0 / sigma_position, 1.0 / sigma_orientation)
+        approach = observations.approach
+        self.approach = None if approach is None else np.ascontiguousarray(approach.T)
+        self.distances = observations.distances
+        self.oriented = bool(observations.oriented.any()) and self.distances is None
+        width = 3 if self.distances is None else 1
+        self.rows = width * self.count + 3 * int(observations.oriented.sum()) * self.oriented
+        self.sigmas = (sigma_position, sigma_orientation)
         self.whitening: FloatArray | None = None
         mixed = self.oriented and not observations.oriented.all()
-        if mixed or observations.covariance is not None:
+        if mixed or (observations.covariance is not None and self.distances is None):
             self.whitening = _whitening(observations, sigma_position, sigma_orientation)
+        self.weights: FloatArray | None = None
+        """Square roots of the weights (N,) of a robust loss; None where all count fully."""
 
     def blocks(
         self, chain: Chain, names: Sequence[str]
@@ -68,7 +83,7 @@ class Samples:
 
         Yields
         ------
-        shift : (P + 1, 3 B) or (P + 1, 6 B)
+        shift : (P + 1, rows)
             Weighted derivative of the residual, transposed; the last row is the residual.
         turn : (P_rotational + 1, 3 B) or (0, 0)
             The same of the orientation where it is kept apart: rotational parameters only.
@@ -76,22 +91,30 @@ class Samples:
             Knows the order of the parameters in the rows.
 
         """
-        model = ErrorModel(chain, names)
+        model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
+        nothing = np.zeros((0, 0))
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
-            axes, origin, shift, turn = model.linearise(self.joints[:, part])
-            np.subtract(self.positions[:, part], origin, out=shift[-1])
+            approach = None if self.approach is None else self.approach[:, part]
+            axes, origin, shift, turn = model.linearise(self.joints[:, part], approach)
+            if self.distances is not None:
+                shift = _along(origin, shift, self.distances[part])
+            else:
+                np.subtract(self.positions[:, part], origin, out=shift[-1])
             if self.oriented:
                 turn[-1] = orientation_error(self.rotations[:, :, part], axes)
+            if self.weights is not None:
+                shift *= self.weights[part]
+                turn *= self.weights[part]
             if self.whitening is not None:
-                yield self._whitened(shift, turn, part), np.zeros((0, 0)), model
+                yield self._whitened(shift, turn, part), nothing, model
                 continue
-            shift *= self.weights[0]
+            shift /= self.sigmas[0]
             flat = shift.reshape(len(shift), -1)
             if not self.oriented:
-                yield flat, np.zeros((0, 0)), model
+                yield flat, nothing, model
                 continue
-            turn *= self.weights[1]
+            turn /= self.sigmas[1]
             yield flat, turn.reshape(len(turn), -1), model
 
     def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
@@ -103,6 +126,46 @@ class Samples:
         full[-1, 3:] = turn[-1] if self.oriented else 0.0
         mixed = np.einsum('rsb,psb->prb', self.whitening[:, :, part], full, optimize=True)
         return np.ascontiguousarray(mixed).reshape(len(shift), -1)
+
+    def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals in sigma: position (N, 3 or 1), orientation (N, 3).
+
+        NaN where nothing was measured. Samples with covariances of their own are whitened as a
+        whole; their two parts are then only nearly those of position and orientation.
+        """
+        position, orientation = residual_arrays(chain, self.observations)
+        if self.whitening is not None:
+            both = np.concatenate([position, np.nan_to_num(orientation)], axis=1)
+            both = np.einsum('rsn,ns->nr', self.whitening, both)
+            position, turned = both[:, :3], both[:, 3:]
+            return position, np.where(self.observations.oriented[:, None], turned, np.nan)
+        return position / self.sigmas[0], orientation / self.sigmas[1]
+
+
+def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
+
+    Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
+    """
+    came = None if observations.approach is None else np.ascontiguousarray(observations.approach.T)
+    joints = chain.effective(np.ascontiguousarray(observations.joints.T), came)
+    axes, origin = chain.trace(joints, base=observations.base, tool=observations.tool)
+    if observations.distances is not None:
+        length = np.linalg.norm(origin, axis=0)
+        nothing = np.full((len(observations), 3), np.nan)
+        return (observations.distances - length)[:, np.newaxis], nothing
+    measured = np.ascontiguousarray(observations.rotations.transpose(2, 1, 0))
+    orientation = orientation_error(measured, axes).T
+    orientation[~observations.oriented] = np.nan
+    return observations.positions - origin.T, orientation
+
+
+def _along(origin: FloatArray, shift: FloatArray, distances: FloatArray) -> FloatArray:
+    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|."""
+    length = np.maximum(np.linalg.norm(origin, axis=0), 1e-12)
+    along = np.einsum('pcb,cb->pb', shift, origin / length)[:, np.newaxis]
+    along[-1, 0] = distances - length
+    return np.ascontiguousarray(along)
 
 
 def _whitening(
@@ -122,47 +185,132 @@ def _whitening(
     return np.ascontiguousarray(whitening.transpose(1, 2, 0))
 
 
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian priors: standard deviations [m or rad] of parameters about the nominal chain."""
+
+    nominal: Chain
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+
+    def rows(self, chain: Chain, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return 1 / sigma (P,), zero without a prior, and the residual in sigma (P,)."""
+        inverse = np.array([1.0 / self.sigmas[n] if n in self.sigmas else 0.0 for n in names])
+        offsets = np.array(
+            [chain.offset(n, self.nominal) if n in self.sigmas else 0.0 for n in names]
+        )
+        return inverse, -offsets * inverse
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """What is fitted: sets of samples, and priors if there are any."""
+
+    sets: tuple[Samples, ...]
+    prior: Prior | None = None
+    separations: tuple[tuple[str, str, float], ...] = ()
+
+    def extra_rows(self, chain: Chain, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return Jacobian (R, P) and residual (R,) in sigma of priors and known separations."""
+        rows, residual = self.separation_rows(chain, names)
+        if self.prior is not None:
+            inverse, offsets = self.prior.rows(chain, names)
+            rows, residual = np.vstack([np.diag(inverse), rows]), np.append(offsets, residual)
+        return rows, residual
+
+    def separation_rows(self, chain: Chain, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return Jacobian (S, P) and residual (S,) in sigma of the known separations."""
+        rows = np.zeros((len(self.separations), len(names)))
+        residual = np.zeros(len(self.separations))
+        column = {name: k for k, name in enumerate(names)}
+        for i, (first, second, distance) in enumerate(self.separations):
+            apart = chain.frame(second).matrix[:3, 3] - chain.frame(first).matrix[:3, 3]
+            length = max(float(np.linalg.norm(apart)), 1e-12)
+            residual[i] = (distance - length) / SEPARATION_SIGMA
+            for frame, sign in ((first, -1.0), (second, 1.0)):
+                for k, axis in enumerate('xyz'):
+                    if f'{frame}.{axis}' in column:
+                        rows[i, column[f'{frame}.{axis}']] = sign * apart[k] / length
+        return rows / SEPARATION_SIGMA, residual
+
+    @property
+    def count(self) -> int:
+        """Return the number of samples."""
+        return sum(samples.count for samples in self.sets)
+
+    @property
+    def rows(self) -> int:
+        """Return the number of measured equations."""
+        return sum(samples.rows for samples in self.sets)
+
+
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations H dx = g at one chain, and the sum of squared weighted residuals there."""
+    """Normal equations H dx = g at one chain, and the sum of squared weighted residuals there.
+
+    `parts` holds the shares of H by position and by orientation.
+    """
 
     matrix: FloatArray
     gradient: FloatArray
     cost: float
+    parts: tuple[FloatArray, FloatArray]
 
-    def rms(self, samples: Samples) -> float:
+    def factor(self) -> FloatArray | None:
+        """Return R (P, P) with R^T R = H; None where H has lost too many digits for it."""
+        scale = np.sqrt(np.diag(self.matrix))
+        scaled = self.matrix / np.outer(scale, scale)
+        if not np.linalg.cond(scaled) < WELL_CONDITIONED:
+            return None
+        return np.asarray(linalg.cholesky(scaled) * scale)
+
+    def rms(self, system: System) -> float:
         """Return the RMS of the weighted residuals, in sigma."""
-        return float(np.sqrt(self.cost / samples.rows))
+        return float(np.sqrt(self.cost / system.rows))
 
 
-def normal_equations(chain: Chain, names: Sequence[str], samples: Samples) -> Normal:
+def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Normal:
     """Return the normal equations (P, P), (P,) and the sum of squared weighted residuals."""
     size = len(names) + 1
-    total = np.zeros((size, size))
+    by_position, by_orientation = np.zeros((size, size)), np.zeros((size, size))
     order = np.arange(size)
-    for shift, turn, model in samples.blocks(chain, names):
-        total += shift @ shift.T
-        if len(turn):
-            inner = np.r_[: len(turn) - 1, size - 1]
-            total[np.ix_(inner, inner)] += turn @ turn.T
-        order = np.append(model.order, size - 1)
-    total = total[np.ix_(order, order)]
-    return Normal(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]))
+    for samples in system.sets:
+        for shift, turn, model in samples.blocks(chain, names):
+            by_position += shift @ shift.T
+            if len(turn):
+                inner = np.r_[: len(turn) - 1, size - 1]
+                by_orientation[np.ix_(inner, inner)] += turn @ turn.T
+            order = np.append(model.order, size - 1)
+    parts = tuple(part[np.ix_(order, order)] for part in (by_position, by_orientation))
+    total = parts[0] + parts[1]
+    extra, residual = system.extra_rows(chain, names)
+    if len(extra):
+        total[:-1, :-1] += extra.T @ extra
+        total[:-1, -1] += extra.T @ residual
+        total[-1, -1] += residual @ residual
+    return Normal(
+        total[:-1, :-1],
+        total[:-1, -1],
+        float(total[-1, -1]),
+        (parts[0][:-1, :-1], parts[1][:-1, :-1]),
+    )
 
 
-def triangular_factor(chain: Chain, names: Sequence[str], samples: Samples) -> FloatArray:
-    """Return R (P, P), upper triangular, with R^T R the normal matrix."""
+def triangular_factor(
+    chain: Chain, names: Sequence[str], system: System, priors: bool = True
+) -> FloatArray:
+    """Return R (P, P), upper triangular, with R^T R the normal matrix; without priors if asked."""
     size = len(names)
-    factor = np.zeros((0, size))
-    for shift, turn, model in samples.blocks(chain, names):
-        rows = [factor, shift[model.order].T]
-        if len(turn):
-            oriented = np.zeros((turn.shape[1], size))
-            rotational = model.order < model.rotations
-            oriented[:, rotational] = turn[model.order[rotational]].T
-            rows.append(oriented)
-        factor = np.asarray(linalg.qr(np.concatenate(rows), mode='r', check_finite=False)[0])
-        factor = factor[:size]
+    factor = system.extra_rows(chain, names)[0] if priors else np.zeros((0, size))
+    for samples in system.sets:
+        for shift, turn, model in samples.blocks(chain, names):
+            rows = [factor, shift[model.order].T]
+            if len(turn):
+                oriented = np.zeros((turn.shape[1], size))
+                rotational = model.order < model.rotations
+                oriented[:, rotational] = turn[model.order[rotational]].T
+                rows.append(oriented)
+            stacked = np.concatenate(rows)
+            factor = np.asarray(linalg.qr(stacked, mode='r', check_finite=False)[0])[:size]
     if len(factor) < size:
         factor = np.concatenate([factor, np.zeros((size - len(factor), size))])
     return factor
@@ -170,16 +318,20 @@ def triangular_factor(chain: Chain, names: Sequence[str], samples: Samples) -> F
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The chain at the minimum of the weighted squares."""
+    """The chain at the minimum of the weighted squares, and the last normal equations there."""
 
     chain: Chain
-    cost: float
+    normal: Normal
     iterations: int
     converged: bool
 
 
 def minimise(
-    chain: Chain, names: Sequence[str], samples: Samples, tolerance: float = STEP_TOLERANCE
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    tolerance: float = STEP_TOLERANCE,
+    iterations: int = MAX_ITERATIONS,
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 
@@ -188,20 +340,20 @@ def minimise(
     steps have not brought it below the best, the fit goes back there and steps are damped
     (Levenberg 1944, Marquardt 1963) until they lower it.
     """
-    normal = normal_equations(chain, names, samples)
+    normal = normal_equations(chain, names, system)
     if not names:
-        return Fit(chain, normal.cost, 0, True)
+        return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
     damping = 0.0
     patience = PATIENCE
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    for iteration in range(1, iterations + 1):
         step = _solve(normal, damping)
-        moved = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / samples.rows))
-        settled = damping == 0.0 and moved < tolerance * max(1.0, normal.rms(samples))
+        moved = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
+        settled = damping == 0.0 and moved < tolerance * max(1.0, normal.rms(system))
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
-            return Fit(chain, normal.cost, iteration, True)
-        normal = normal_equations(chain, names, samples)
+            return Fit(chain, normal, iteration, True)
+        normal = normal_equations(chain, names, system)
         if normal.cost <= best.cost * (1.0 + 1e-12):
             best, best_chain = normal, chain
             patience = PATIENCE if damping < 1e-9 else 0
@@ -213,7 +365,35 @@ def minimise(
         else:
             normal, chain = best, best_chain
             damping = max(10.0 * damping, 1e-6)
-    return Fit(best_chain, best.cost, iteration, False)
+    return Fit(best_chain, best, iteration, False)
+
+
+def without_each(
+    chain: Chain,
+    names: Sequence[str],
+    systems: Sequence[System],
+    others: Callable[[int], System],
+) -> Iterator[Chain]:
+    """Yield the chain fitted to all systems but one, for each one in turn.
+
+    `chain` is the fit to all of them. One Gauss-Newton step from there, with the normal equations
+    of all less those of the one, visits every sample only once. Where that step is too long to be
+    trusted, the fit is done on `others(k)`, all samples but those of system k.
+    """
+    if not names:
+        yield from [chain] * len(systems)
+        return
+    parts = [normal_equations(chain, names, System(system.sets)) for system in systems]
+    extra, residual = systems[0].extra_rows(chain, names)  # the same in every part
+    matrix = np.sum([part.matrix for part in parts], axis=0) + extra.T @ extra
+    gradient = np.sum([part.gradient for part in parts], axis=0) + extra.T @ residual
+    for k, part in enumerate(parts):
+        rest = Normal(matrix - part.matrix, gradient - part.gradient, 0.0, part.parts)
+        step = _solve(rest, 0.0)
+        if np.abs(step).max() > SMALL_STEP:
+            yield minimise(chain, names, others(k), tolerance=1e-3).chain
+        else:
+            yield chain.with_offsets(dict(zip(names, step, strict=True)))
 
 
 def _solve(normal: Normal, damping: float) -> FloatArray:

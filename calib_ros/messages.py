@@ -76,9 +76,10 @@ def point_stamped(message: Any) -> PoseReading:
 
 
 def transform_stamped(message: Any) -> PoseReading:
-    """Decode a geometry_msgs/TransformStamped."""
+    """Decode a geometry_msgs/TransformStamped; each child is a frame of its own."""
     transform = message.transform
-    return _pose(message.header, transform.translation, transform.rotation, None)
+    reading = _pose(message.header, transform.translation, transform.rotation, None)
+    return reading._replace(frame_id=f'{reading.frame_id} to {message.child_frame_id}')
 
 
 POSE_DECODERS: dict[str, Callable[[Any], PoseReading]] = {

@@ -32,6 +32,7 @@ from geometry_msgs.msg import (
     TransformStamped,
 )
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy._rclpy_pybind11 import RCLError  # has no public name in Jazzy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -51,10 +52,12 @@ from std_srvs.srv import SetBool, Trigger
 from calib_ros import report
 from calib_ros.chain import DH_KINDS
 from calib_ros.config import Settings, load_chain
-from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 from calib_ros.files import write_file
-from calib_ros.identification import Identification, Problem, identify
+from calib_ros.identification import Identification
+from calib_ros.problem import Problem
 from calib_ros.se3 import to_quat
+from calib_ros.selection import identify_model
 from calib_ros.session import CalibrationSession
 
 try:
@@ -83,6 +86,7 @@ class CalibrationNode(Node):
         settings = Settings(
             **{item.name: self._declare_setting(item) for item in fields(Settings)}
         )
+        self._refuse_unknown_parameters()
         if not chain_name:
             raise ConfigError(
                 'parameter "chain" is not set: give the chain file of the robot, for example '
@@ -90,7 +94,8 @@ class CalibrationNode(Node):
             )
         self.session = CalibrationSession(load_chain(chain_name), settings)
         self._last = 'nothing identified yet'
-        self._frame_id = ''
+        self._calibration_text = ''
+        self._dropped_before = 0
         self._joints: tuple[Any, Any] | None = None
         self._subscribe()
         latched = QoSProfile(
@@ -132,6 +137,8 @@ class CalibrationNode(Node):
         text, lower = item.metadata['text'], item.metadata.get('lower')
         if isinstance(item.default, tuple):  # an empty list has no type in ROS, [''] has one
             return tuple(name for name in self._declare(item.name, [''], text) or () if name)
+        if isinstance(item.default, str):
+            return self._declare(item.name, item.default, text)
         if isinstance(item.default, int):
             span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)
             return self._declare(item.name, item.default, text, integer_range=[span])
@@ -148,6 +155,13 @@ class CalibrationNode(Node):
         return self.declare_parameter(
             item.name, float(value), descriptor, ignore_override=True
         ).value
+
+    def _refuse_unknown_parameters(self) -> None:
+        """Refuse parameters that were set but do not exist; ROS ignores them."""
+        known = [*self._parameters]
+        for name in self._parameter_overrides:
+            if name not in known and not name.startswith(('qos_overrides.', 'use_sim_time')):
+                raise UnknownNameError('parameter', name, known)
 
     # Topics in
 
@@ -186,7 +200,6 @@ class CalibrationNode(Node):
         name = f'geometry_msgs/msg/{kind.__name__}'
 
         def take(message: Any) -> None:
-            self._frame_id = message.header.frame_id
             self.session.take_pose(name, message, held_out)
 
         return take
@@ -198,7 +211,7 @@ class CalibrationNode(Node):
 
     def _run(self, problem: Problem) -> tuple[bool, str]:
         """Identify, on a thread of its own; publish only what is accepted."""
-        result = identify(problem)
+        result = identify_model(problem, self.session.settings.model)
         self._last = report.summary(result)
         if result.accepted:
             self.session.adopt(result)
@@ -217,8 +230,7 @@ class CalibrationNode(Node):
         return True, 'recording' if request.data else 'not recording: messages are dropped'
 
     def _on_save(self, request: Any) -> tuple[bool, str]:
-        result = self.session.calibration
-        if result is None:
+        if not self._calibration_text:
             return False, 'there is no accepted calibration to save: call ~/identify first'
         if self._target:
             path = Path(self._target).expanduser()
@@ -227,7 +239,7 @@ class CalibrationNode(Node):
             moment = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
             path = home / 'calib_ros' / f'{self.session.chain.name}_{moment}.yaml'
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, report.calibration_yaml(result))
+        write_file(path, self._calibration_text)
         return True, f'saved to {path}'
 
     # Topics out
@@ -242,7 +254,8 @@ class CalibrationNode(Node):
         ]
         array.data = table.ravel().tolist()
         self._dh_parameters.publish(array)
-        self._calibration.publish(String(data=report.calibration_yaml(result)))
+        self._calibration_text = report.calibration_yaml(result)
+        self._calibration.publish(String(data=self._calibration_text))
 
     def _publish_corrected_pose(self) -> None:
         result = self.session.calibration
@@ -253,7 +266,7 @@ class CalibrationNode(Node):
         pose = result.chain.forward(values[np.newaxis])[0]
         message = PoseStamped()
         message.header.stamp = stamp
-        message.header.frame_id = self._frame_id
+        message.header.frame_id = result.world_frame
         point, turn = message.pose.position, message.pose.orientation
         point.x, point.y, point.z = pose[:3, 3].tolist()
         turn.x, turn.y, turn.z, turn.w = to_quat(pose[:3, :3]).tolist()
@@ -262,7 +275,10 @@ class CalibrationNode(Node):
     def _publish_diagnostics(self) -> None:
         account = self.session.account()
         status = DiagnosticStatus(name=f'{self.get_name()}: calibration', hardware_id='')
-        status.level = DiagnosticStatus.WARN if account.dropped else DiagnosticStatus.OK
+        dropped = sum(account.dropped.values())
+        fresh = dropped > self._dropped_before
+        self._dropped_before = dropped
+        status.level = DiagnosticStatus.WARN if fresh else DiagnosticStatus.OK
         status.message = str(account)
         values = {
             'robot': self.session.chain.name,
@@ -315,9 +331,10 @@ class CalibrationNode(Node):
 class DeferredTrigger:
     """A Trigger service whose work runs on a thread of its own.
 
-    The executor sends the answer through the service's public `send_response` right after the
-    callback; here the answer of an accepted call is held back until its work has ended. A call
-    that comes meanwhile is refused at once.
+    Jazzy's executors send the answer through the service's `send_response` right after the
+    callback, on the same thread. It is replaced here by one that holds the answer of an accepted
+    call back until its work has ended; an async callback would do, but the events executor takes
+    none. A call that comes meanwhile is refused at once.
 
     Parameters
     ----------
@@ -421,7 +438,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             executor.spin_once(timeout_sec=0.1)
     except ExternalShutdownException:
         pass
-    except (CalibrationError, ParameterException) as err:
+    except (CalibrationError, ParameterException, RCLError) as err:
         print(f'calibration_node: {err}', file=sys.stderr)
         status = 1
     finally:

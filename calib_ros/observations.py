@@ -12,16 +12,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from calib_ros import se3
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
 
+TURN = 2.0 * np.pi
 STILL = 1e-3
-"""Joint values that change by less [rad or m] from pair to pair are one configuration."""
+"""Joint values [rad or m] that differ by less are one configuration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +46,13 @@ class Observations:
     covariance : (N, 6, 6), optional
         Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
         PoseWithCovariance; NaN rows where the measurement brought none.
+    approach : (N, n), optional
+        Signs of the velocities with which the joints came to their values, for backlash.
+    distances : (N,), optional
+        Distances [m] from the origin of the world to the target, for draw-wires and ball-bars.
+        Positions and rotations count for nothing then.
+    base, tool : str
+        Frames of the chain that hold for these pairs.
 
     """
 
@@ -50,6 +62,10 @@ class Observations:
     rotations: FloatArray
     oriented: NDArray[np.bool_]
     covariance: FloatArray | None = None
+    approach: FloatArray | None = None
+    distances: FloatArray | None = None
+    base: str = 'base'
+    tool: str = 'tool'
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""
@@ -62,14 +78,18 @@ class Observations:
         }
         if self.covariance is not None:
             shapes['covariance'] = (count, 6, 6)
+        if self.approach is not None:
+            shapes['approach'] = self.joints.shape
+        if self.distances is not None:
+            shapes['distances'] = (count,)
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise InputError(
                     f'{name} of {count} observations must have the shape {shape}, not '
                     f'{getattr(self, name).shape}'
                 )
-        for name in ('joints', 'positions', 'rotations'):
-            if not np.isfinite(getattr(self, name)).all():
+        for name in ('joints', 'positions', 'rotations', 'approach', 'distances'):
+            if getattr(self, name) is not None and not np.isfinite(getattr(self, name)).all():
                 raise InputError(f'{name} of the observations hold NaN or infinite values')
 
     def __len__(self) -> int:
@@ -92,31 +112,76 @@ class Observations:
 
     def select(self, mask: NDArray[np.generic]) -> Observations:
         """Return the pairs chosen by a mask or by indices."""
-        return Observations(
-            self.stamps_ns[mask],
-            self.joints[mask],
-            self.positions[mask],
-            self.rotations[mask],
-            self.oriented[mask],
-            None if self.covariance is None else self.covariance[mask],
-        )
+        names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
+        optional = ('covariance', 'approach', 'distances')
+        present = [name for name in optional if getattr(self, name) is not None]
+        return replace(self, **{name: getattr(self, name)[mask] for name in (*names, *present)})
+
+    def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
+        """Return the poses the other way round: a camera on the flange sees a fixed target.
+
+        The measured pose of the target in the camera becomes that of the camera in the target's
+        frame, which takes the place of the world. Covariances go along; `sigmas` (position [m],
+        orientation [rad]) make them where the measurement brought none, because the inverse is
+        uncertain by the orientation's sigma times the distance.
+        """
+        if not self.oriented.all():
+            raise InputError(
+                'poses of a camera on the flange need their orientation (qx qy qz qw): without it '
+                'they cannot be turned round'
+            )
+        turned = np.swapaxes(self.rotations, 1, 2)
+        positions = -np.einsum('nij,nj->ni', turned, self.positions)
+        covariance = self.covariance
+        if covariance is None and sigmas is not None:
+            diagonal = np.diag(np.repeat(np.square(sigmas), 3))
+            covariance = np.tile(diagonal, (len(self), 1, 1))
+        if covariance is not None:
+            jacobian = np.zeros((len(self), 6, 6))
+            jacobian[:, :3, :3] = -turned
+            jacobian[:, :3, 3:] = -turned @ se3.skew(self.positions)
+            jacobian[:, 3:, 3:] = -turned
+            covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+        return replace(self, positions=positions, rotations=turned, covariance=covariance)
 
     def at(self, stamps_ns: NDArray[np.int64]) -> Observations:
         """Return the same pairs with other stamps (N,)."""
         return replace(self, stamps_ns=stamps_ns)
 
-    @property
+    @cached_property
     def configurations(self) -> NDArray[np.intp]:
         """Return (N,) the number of the standing configuration that each pair belongs to."""
         return configurations(self.joints)
 
 
-def configurations(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (N,) the number of the standing configuration of joint values (N, n) in sequence."""
+def stops(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) the number of the stop at which joint values (N, n) in sequence were taken."""
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    moved = np.abs(np.diff(joints, axis=0)).max(axis=1) > STILL
-    return np.concatenate([[0], np.cumsum(moved)]).astype(np.intp)
+    return np.concatenate([[0], np.cumsum(_moved(joints))]).astype(np.intp)
+
+
+def _moved(joints: FloatArray) -> NDArray[np.bool_]:
+    """Return (N - 1,) whether the arm moved from one row to the next; angles modulo a turn."""
+    change = np.abs(np.diff(joints, axis=0)) % TURN
+    return np.asarray(np.minimum(change, TURN - change).max(axis=1) > STILL)
+
+
+def configurations(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) the number of the configuration that joint values (N, n) belong to.
+
+    Values within STILL of each other are one configuration, whenever they were taken: a program
+    that runs in a loop visits it again, it does not measure another one. Angles count modulo a
+    full turn.
+    """
+    if len(joints) == 0:
+        return np.zeros(0, dtype=np.intp)
+    standing = joints[np.concatenate([[True], _moved(joints)])] % TURN  # one row a stop
+    tree = cKDTree(standing % TURN, boxsize=TURN)
+    near = tree.query_pairs(STILL, p=np.inf, output_type='ndarray')
+    links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(standing),) * 2)
+    _, label = connected_components(links, directed=False)
+    return np.asarray(label[stops(joints)], dtype=np.intp)
 
 
 class _Rows:
@@ -198,9 +263,11 @@ class Pairing:
         self._revolute = np.array(revolute, dtype=bool)
         self._max_gap_ns = round(max_gap * 1e9)
         self._joints = _Rows(len(revolute), joint_capacity)
-        self._poses = _Rows(_POSE.stop + len(revolute), pose_capacity)
+        self._poses = _Rows(_POSE.stop + 2 * len(revolute), pose_capacity)
         self._horizon_ns = 0  # joint samples before this stamp have been let go
         self.dropped: Counter[str] = Counter()
+        self.let_go = 0
+        """Joint samples that made room after the poses of their time were matched."""
 
     def add_joints(self, stamp_ns: int, values: FloatArray) -> None:
         """Take joint values (n,) [rad or m] in the order of the chain."""
@@ -229,7 +296,7 @@ class Pairing:
         if self._poses.full:
             self.dropped['poses: pose buffer full'] += 1
             return
-        row = np.full(_POSE.stop + len(self._revolute), np.nan)
+        row = np.full(_POSE.stop + 2 * len(self._revolute), np.nan)
         row[_POSITION] = position
         if quat_xyzw is not None:
             row[_QUAT] = quat_xyzw
@@ -248,18 +315,18 @@ class Pairing:
         return fitted, kept_out, dropped
 
     def tally(self) -> tuple[int, int, int, Counter[str]]:
-        """Return the numbers of pairs to fit, of held-out pairs and of configurations to fit.
+        """Return the numbers of pairs to fit, of held-out pairs and of stops to fit.
 
         Cheaper than `match`; the last item is what is dropped so far by cause.
         """
         _, rows, joints, dropped = self._matched()
         held_out = rows[:, _HELD_OUT] == 1.0
-        groups = configurations(joints[~held_out])
-        count = int(groups[-1]) + 1 if len(groups) else 0
+        numbers = stops(joints[~held_out, : len(self._revolute)])
+        count = int(numbers[-1]) + 1 if len(numbers) else 0
         return int((~held_out).sum()), int(held_out.sum()), count, dropped
 
     def _matched(self) -> tuple[NDArray[np.int64], FloatArray, FloatArray, Counter[str]]:
-        """Return stamps (N,), rows of the pose buffer and joint values (N, n) of all pairs."""
+        """Return stamps (N,), rows of the pose buffer, joint values and approach (N, 2 n)."""
         order = _unique_order(self._joints)
         dropped = self.dropped.copy()
         dropped['joints: same stamp twice'] += self._joints.count - len(order)
@@ -278,9 +345,12 @@ class Pairing:
     def _interpolate(
         self, order: NDArray[np.intp], stamps: NDArray[np.int64]
     ) -> tuple[FloatArray, NDArray[np.intp]]:
-        """Return joint values (N, n) at the stamps, and why there are none (index of _CAUSES)."""
+        """Return joint values and approach (N, 2 n) at the stamps, and why there are none.
+
+        The cause is an index of _CAUSES.
+        """
         known, values = self._joints.stamps[order], self._joints.values[order]
-        joints = np.full((len(stamps), values.shape[1]), np.nan)
+        joints = np.full((len(stamps), 2 * values.shape[1]), np.nan)
         cause = np.zeros(len(stamps), dtype=np.intp)
         if len(known) == 0:
             cause[:] = 1
@@ -300,7 +370,8 @@ class Pairing:
         step -= np.where(wrapped, 2.0 * np.pi * np.sign(step), 0.0)
         share = (stamps - known[first]) / np.maximum(gap, 1)
         good = cause == 0
-        joints[good] = (values[first] + share[:, None] * step)[good]
+        now = values[first] + share[:, None] * step
+        joints[good] = np.concatenate([now, _approach(values, first, now)], axis=1)[good]
         return joints, cause
 
     def _settle(self) -> None:
@@ -308,6 +379,7 @@ class Pairing:
         order = _unique_order(self._joints)
         self.dropped['joints: same stamp twice'] += self._joints.count - len(order)
         cut = len(order) // 2
+        self.let_go += cut
         self._horizon_ns = int(self._joints.stamps[order[cut]])
         old = np.flatnonzero(
             (self._poses.stamps < self._horizon_ns) & np.isnan(self._poses.values[:, -1])
@@ -320,6 +392,19 @@ class Pairing:
         lost[old[cause != 0]] = True
         self._poses.keep(np.flatnonzero(~lost))
         self._joints.keep(order[cut:])
+
+
+def _approach(values: FloatArray, first: NDArray[np.intp], now: FloatArray) -> FloatArray:
+    """Return the signs (N, n) of the last move of each joint before it stood as it does now.
+
+    Looked for further and further back among the samples (M, n) before index `first` (N,).
+    """
+    signs = np.zeros_like(now)
+    for back in (1, 4, 16, 64, 256, 1024, 4096):
+        change = now - values[np.maximum(first - back, 0)]
+        found = (signs == 0.0) & (np.abs(change) > STILL)
+        signs[found] = np.sign(change[found])
+    return signs
 
 
 _POSITION, _QUAT, _COVARIANCE = slice(0, 3), slice(3, 7), slice(7, 43)
@@ -340,11 +425,13 @@ def _observations(stamps: NDArray[np.int64], joints: FloatArray, rows: FloatArra
     if oriented.any():
         rotations[oriented] = se3.from_quat(rows[oriented, _QUAT])
     covariance = rows[:, _COVARIANCE].reshape(-1, 6, 6)
+    width = joints.shape[1] // 2
     return Observations(
         stamps,
-        joints,
+        joints[:, :width].copy(),
         rows[:, _POSITION].copy(),
         rotations,
         oriented,
         None if np.isnan(covariance).all() else covariance.copy(),
+        joints[:, width:].copy(),
     )

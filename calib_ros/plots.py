@@ -28,7 +28,7 @@ def draw_errors(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -> None
         axes.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
     axes.set(xlabel='pose', ylabel='position error [mm]', xlim=(0, len(before_mm)))
     axes.set_ylim(bottom=0.0)
-    axes.legend(loc='upper right', framealpha=0.9)
+    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
 
 
 def draw_distribution(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -> None:
@@ -43,10 +43,10 @@ def draw_distribution(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -
 
 def before_after_png(result: Identification) -> bytes:
     """Return the figure of position errors before and after, on poses that were not fitted."""
-    figures = result.validation or result.fitted
+    comparison = result.validation or result.fitted
     before, after = (
-        1e3 * np.linalg.norm(residuals.position, axis=1)
-        for residuals in (figures.before, figures.after)
+        1e3 * np.linalg.norm(residuals.position[comparison.judged], axis=1)
+        for residuals in (comparison.before, comparison.after)
     )
     figure = Figure(figsize=(10.0, 3.8), layout='constrained')
     FigureCanvasAgg(figure)

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from calib_ros.errors import InputError
 from calib_ros.messages import JOINT_STATE, POSE_DECODERS
 from calib_ros.observations import Observations
-from calib_ros.salvage import salvage
+from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
 
@@ -111,8 +111,8 @@ def replay(
     """
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
-    reader = Reader(path)
     try:
+        reader = Reader(path)
         reader.open()
     except Exception as err:  # a damaged file fails in many ways, in the library and below it
         found = salvage(path)
@@ -120,9 +120,13 @@ def replay(
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
         topics = Topics.choose(found.topics, joint_topic, pose_topic)
         count, problem = _feed(session, topics, iter(found.messages))
+        total = recorded(path if path.is_dir() else path.parent)
+        lost = 'how many are lost is not known'
+        if total is not None:
+            lost = f'{total - len(found.messages)} of {total} messages are lost'
         return (
             f'{path} is damaged ({problem or found.problem}): {count} messages could be read '
-            'and are used, what came after them is lost',
+            f'and are used, {lost}',
         )
     with closing(reader):
         available = {c.topic: c.msgtype for c in reader.connections}
@@ -131,6 +135,10 @@ def replay(
         expected = sum(c.msgcount for c in connections)
         raw = ((c.topic, data) for c, _, data in reader.messages(connections))
         count, problem = _feed(session, topics, raw)
+    if problem is not None and count == 0:
+        found = salvage(path)
+        if found is not None:
+            count, _ = _feed(session, topics, iter(found.messages))
     if problem is None:
         return ()
     return (f'{path} is damaged ({problem}): {expected - count} of {expected} messages are lost',)
@@ -139,17 +147,21 @@ def replay(
 def _feed(
     session: CalibrationSession, topics: Topics, raw: Iterator[tuple[str, bytes]]
 ) -> tuple[int, str | None]:
-    """Feed serialised messages; return how many, and why it stopped early if it did."""
-    count = 0
+    """Feed serialised messages; return how many, and what is wrong with the others if any."""
+    count, problem = 0, None
     while True:
         try:
             topic, data = next(raw)
-            kind = topics.all.get(topic)
-            message = None if kind is None else _TYPESTORE.deserialize_cdr(data, kind)
         except StopIteration:
-            return count, None
+            return count, problem
         except Exception as err:  # see `replay`
             return count, str(err) or type(err).__name__
+        kind = topics.all.get(topic)
+        try:
+            message = None if kind is None else _TYPESTORE.deserialize_cdr(data, kind)
+        except Exception as err:
+            problem = f'a message on {topic} cannot be decoded: {err!r}'
+            continue
         if topic == topics.joint_states:
             session.take_joints(message)
         elif kind is not None:

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.chain import Chain
+from calib_ros import effects
+from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.config import dump_chain
-from calib_ros.identification import ErrorFigures, Identification, Parameter
+from calib_ros.identification import Identification
+from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
 
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
@@ -22,12 +24,21 @@ WEAK = 0.01
 
 def summary(result: Identification) -> str:
     """Return the one line that an operator reads."""
-    figures = result.validation or result.fitted
-    before, after = figures.before.figures, figures.after.figures
-    text = f'{result.fitted.after.figures.count} pairs, RMS {before.rms_mm:.3f} -> '
+    before, after = (result.validation or result.fitted).figures
+    text = f'{len(result.fitted.judged)} pairs, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
+    if result.outliers:
+        text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+    if result.chain.effects:
+        groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
+        text += f'; with {len(result.chain.effects)} effects ({", ".join(groups)})'
+    if result.priors:
+        text += f'; priors on {len(result.priors)} parameters'
+    sigma = sigma_over_range(result)['max']
+    if sigma > before.rms_mm:
+        text += f'; trust it only near the measured poses, elsewhere sigma is up to {sigma:.1f} mm'
     weak = weakly_determined(result)
     if weak:
         text += f'; weakly determined: {", ".join(weak)}'
@@ -43,15 +54,17 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
 
 def provenance(result: Identification) -> dict[str, Any]:
     """Return where the numbers of a corrected chain come from, as plain values."""
-    figures = result.validation or result.fitted
+    before, after = (result.validation or result.fitted).figures
     return {
         'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
         'software': f'calib_ros {calib_ros.__version__}',
         'accepted': result.accepted,
-        'pairs': result.fitted.after.figures.count,
+        'world_frame': result.world_frame,
+        'pairs': len(result.fitted.judged),
+        'outliers': len(result.outliers),
         'validated_by': result.validated_by,
-        'rms_mm_before': round(figures.before.figures.rms_mm, 6),
-        'rms_mm_after': round(figures.after.figures.rms_mm, 6),
+        'rms_mm_before': round(before.rms_mm, 6),
+        'rms_mm_after': round(after.rms_mm, 6),
         'not_identifiable': list(result.unidentifiable),
     }
 
@@ -65,10 +78,17 @@ def calibration_yaml(result: Identification) -> str:
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
     """Return the result as one JSON document; `samples` is what became of the input."""
 
-    def comparison(which: Any) -> dict[str, Any] | None:
+    def comparison(which: Comparison | None) -> dict[str, Any] | None:
         if which is None:
             return None
-        return {'before': asdict(which.before.figures), 'after': asdict(which.after.figures)}
+        before, after = which.figures
+        with_outliers = which.figures_of_all[1]
+        return {
+            'before': asdict(before),
+            'after': asdict(after),
+            'outliers': which.outliers,
+            'after_with_outliers': asdict(with_outliers),
+        }
 
     validation = comparison(result.validation)
     return {
@@ -93,7 +113,15 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'fitted': comparison(result.fitted),
         'validation': None if validation is None else {'by': result.validated_by, **validation},
         'before_is': BEFORE,
-        'noise_in_sigma': result.noise,
+        'noise_in_sigma': asdict(result.noise),
+        'outliers': [asdict(outlier) for outlier in result.outliers],
+        'gauges': result.gauges,
+        'correlated': [list(pair) for pair in result.correlated()],
+        'observability': asdict(result.observability),
+        'predicted_sigma_mm': sigma_over_range(result),
+        'priors': result.priors,
+        'effects': dict(result.chain.effects),
+        'verdicts': [asdict(verdict) for verdict in result.verdicts],
         'samples': samples,
         'robot': result.chain.name,
         'versions': {
@@ -109,7 +137,10 @@ BEFORE = 'the nominal chain with its base and tool frames fitted to the same pai
 
 def unit(name: str) -> str:
     """Return the unit of a parameter."""
-    return 'm' if name.rpartition('.')[2] in ('a', 'd', 'x', 'y', 'z') else 'rad'
+    kind = name.partition('.')[2]
+    if kind in DH_KINDS or kind in FRAME_KINDS:
+        return 'm' if is_length(name) else 'rad'
+    return effects.unit(name)
 
 
 def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]) -> str:
@@ -119,20 +150,42 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
     lines += [f'- {key}: {value}' for key, value in samples.items() if value not in (0, {}, None)]
     lines += [
         f'- converged: {"yes" if result.converged else "no"}, {result.iterations} iterations',
-        f'- {result.rank} parameters fitted; residuals are {result.noise:.2f} times the sigma '
-        'that was given, and the standard deviations below are scaled to them',
+        f'- {result.rank} parameters fitted; {noise_in_words(result)}',
+        *(f'- {text}' for text in priors_in_words(result)),
         '',
         '## Accuracy',
         '',
         f'"Before" is {BEFORE}. Validated by {result.validated_by}.',
         '',
-        '| poses | | number | RMS [mm] | mean [mm] | max [mm] | RMS [mrad] |',
-        '|---|---|---|---|---|---|---|',
+        '| poses | | number | RMS [mm] | mean | max | mean + 3 sigma | RMS [mrad] |',
+        '|---|---|---|---|---|---|---|---|',
     ]
     for label, which in (('fitted', result.fitted), ('not fitted', result.validation)):
         if which is not None:
-            lines.append(_figures_row(label, 'before', which.before.figures))
-            lines.append(_figures_row(label, 'after', which.after.figures))
+            lines += map(_figures_row, (label, label), ('before', 'after'), which.figures)
+            if which.outliers:
+                lines.append(_figures_row(label, 'after, with outliers', which.figures_of_all[1]))
+    if result.outliers:
+        lines += ['', '## Outliers', '', 'They carry no or little weight. Size: in usual errors.']
+        lines += ['', '| set | sample | stamp [ns] | size |', '|---|---|---|---|']
+        lines += [
+            f'| {o.set} | {o.sample} | {o.stamp_ns} | {o.size:.1f} |' for o in result.outliers
+        ]
+    if result.verdicts:
+        lines += [
+            '',
+            '## Non-geometric effects',
+            '',
+            'RMS on configurations left out.',
+        ]
+        lines += ['', '| | before [mm] | with it [mm] | pays for itself |', '|---|---|---|---|']
+        lines += [
+            f'| {v.what} | {v.rms_mm_before:.4f} | {v.rms_mm_after:.4f} | '
+            f'{"yes" if v.pays else "no"} |'
+            for v in result.verdicts
+        ]
+    lines += ['', '## What the poses determine', '']
+    lines += [f'- {text}' for text in identifiability_in_words(result)]
     lines += ['', '## Parameters', '']
     lines += ['Offsets and standard deviations in mm and mrad.', '']
     lines += ['| parameter | value [m, rad] | offset | std | |', '|---|---|---|---|---|']
@@ -146,11 +199,70 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
     return '\n'.join(lines)
 
 
+def priors_in_words(result: Identification) -> list[str]:
+    """Return the priors, those of effects by group."""
+    known = dict(result.chain.effects)
+    lines = [
+        f'prior on {name}: {sigma:g} {unit(name)}'
+        for name, sigma in result.priors.items()
+        if name not in known
+    ]
+    groups: dict[str, list[str]] = {}
+    for name in known:
+        groups.setdefault(effects.group_of(name), []).append(name)
+    for group, names in groups.items():
+        sigma, of = result.priors[names[0]], unit(names[0])
+        lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
+    return lines
+
+
+def sigma_over_range(result: Identification) -> dict[str, float]:
+    """Return how well positions are predicted over the whole joint range [mm]."""
+    sigma = 1e3 * result.predicted_sigma()
+    return {'median': float(np.median(sigma)), 'max': float(sigma.max())}
+
+
+def noise_in_words(result: Identification) -> str:
+    """Return how large the residuals are against the sigmas given."""
+    noise = result.noise
+    text = f'residuals are {noise.position:.2f} times the sigma of position'
+    if noise.orientation is not None:
+        text += f' and {noise.orientation:.2f} times that of orientation'
+    if noise.consistent:
+        return f'{text}, which a chi-squared test lets pass'
+    return f'{text}; the sigmas given are wrong, standard deviations follow the residuals'
+
+
+def identifiability_in_words(result: Identification) -> list[str]:
+    """Return which parameters trade against which, which are weak, and the indices."""
+    lines = []
+    for name, partners in result.gauges.items():
+        if partners:
+            lines.append(f'{name} against {", ".join(partners)}: only their combination shows')
+        else:
+            lines.append(f'{name}: no measured pose depends on it')
+    weak = weakly_determined(result)
+    if weak:
+        lines.append(f'weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}')
+    for first, second, value in result.correlated():
+        lines.append(f'{first} and {second} are correlated by {value:+.3f}')
+    sigma = sigma_over_range(result)
+    lines.append(
+        f'one sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
+        f'(median), {sigma["max"]:.3f} mm at most'
+    )
+    o = result.observability
+    lines.append(
+        f'observability O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
+    )
+    return lines
+
+
 def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
     turn = '' if figures.rms_mrad is None else f'{figures.rms_mrad:.3f}'
     return (
         f'| {label} | {when} | {figures.count} | {figures.rms_mm:.3f} | {figures.mean_mm:.3f} | '
-        f'{figures.max_mm:.3f} | {turn} |'
+        f'{figures.max_mm:.3f} | {figures.mean_plus_3_sigma_mm:.3f} | {turn} |'
     )
 
 
@@ -163,13 +275,14 @@ def _parameter_row(p: Parameter) -> str:
 
 def against_truth(result: Identification, truth: Chain) -> str:
     """Return a table of the fitted joint parameters beside those of the true chain."""
-    rows = ['  parameter                 true   identified        std   deviation']
+    width = max(len(name) for name in result.names)
+    rows = [f'  {"parameter":{width}}     true   identified        std   deviation']
     for p in result.parameters:
         if p.std is None or p.name.partition('.')[0] in ('base', 'tool'):
             continue
         true = truth.value(p.name) - (p.value - p.offset)
         rows.append(
-            f'  {p.name:22} {1e3 * true:+8.3f}   {1e3 * p.offset:+10.3f}   {1e3 * p.std:8.4f}'
+            f'  {p.name:{width}} {1e3 * true:+8.3f}   {1e3 * p.offset:+10.3f}   {1e3 * p.std:8.4f}'
             f'   {(p.offset - true) / p.std:+6.1f} std'
         )
     return '\n'.join(rows)

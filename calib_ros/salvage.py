@@ -9,6 +9,7 @@ their beginning up to the damage.
 from __future__ import annotations
 
 import importlib
+import re
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
@@ -17,6 +18,16 @@ from pathlib import Path
 
 MCAP_MAGIC = b'\x89MCAP0\r\n'
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+
+
+def recorded(path: Path) -> int | None:
+    """Return how many messages the recorder says it has written; None when it does not."""
+    try:
+        text = (path / 'metadata.yaml').read_text(encoding='utf-8')
+    except OSError:
+        return None
+    found = re.search(r'^  message_count: (\d+)', text, re.MULTILINE)
+    return None if found is None else int(found.group(1))
 
 
 @dataclass
@@ -41,8 +52,9 @@ def salvage(path: Path) -> Salvage | None:
 
 
 def _read_sqlite3(file: Path, found: Salvage) -> None:
-    connection = sqlite3.connect(f'file:{file}?mode=ro&immutable=1', uri=True)
+    connection = sqlite3.connect(f'{file.resolve().as_uri()}?mode=ro&immutable=1', uri=True)
     try:
+        connection.execute('PRAGMA writable_schema=ON')
         topics = {
             key: (name, kind)
             for key, name, kind in connection.execute('SELECT id, name, type FROM topics')
@@ -50,7 +62,11 @@ def _read_sqlite3(file: Path, found: Salvage) -> None:
         found.topics |= dict(topics.values())
         for key, data in connection.execute('SELECT topic_id, data FROM messages ORDER BY id'):
             found.messages.append((topics[key][0], data))
-    except sqlite3.Error as err:
+        (pages,) = connection.execute('PRAGMA page_count').fetchone()
+        (size,) = connection.execute('PRAGMA page_size').fetchone()
+        if pages * size > file.stat().st_size:
+            found.problem = 'the file is cut off'
+    except (sqlite3.Error, KeyError) as err:
         found.problem = str(err)
     finally:
         connection.close()
@@ -74,7 +90,7 @@ def _read_mcap(file: Path, found: Salvage) -> None:
             elif kind == _MESSAGE:
                 (key,) = struct.unpack_from('<H', record)
                 found.messages.append((channels[key], record[22:]))
-    except (struct.error, IndexError, KeyError, ValueError, OSError, EOFError) as err:
+    except Exception as err:  # decompressors have errors of their own
         found.problem = f'cut off or damaged: {err}'
 
 

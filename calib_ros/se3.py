@@ -35,27 +35,48 @@ def invert(matrix: FloatArray) -> FloatArray:
 
 def from_quat(quat_xyzw: FloatArray) -> FloatArray:
     """Turn (..., 4) quaternions, normalised here, into (..., 3, 3) rotation matrices."""
-    flat = Rotation.from_quat(quat_xyzw.reshape(-1, 4)).as_matrix()
+    flat = Rotation.from_quat(_own(quat_xyzw, 4)).as_matrix()
     return np.asarray(flat).reshape(*quat_xyzw.shape[:-1], 3, 3)
 
 
 def to_quat(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 4) quaternions with w >= 0."""
-    quat = np.asarray(Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat())
+    quat = np.asarray(Rotation.from_matrix(_own(rotation, 3, 3)).as_quat())
     quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
     return quat.reshape(*rotation.shape[:-2], 4)
 
 
 def exp_rotation(vector: FloatArray) -> FloatArray:
     """Turn (..., 3) rotation vectors [rad] into (..., 3, 3) rotation matrices."""
-    flat = Rotation.from_rotvec(vector.reshape(-1, 3)).as_matrix()
+    flat = Rotation.from_rotvec(_own(vector, 3)).as_matrix()
     return np.asarray(flat).reshape(*vector.shape[:-1], 3, 3)
 
 
 def log_rotation(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 3) rotation vectors [rad]."""
-    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    flat = Rotation.from_matrix(_own(rotation, 3, 3)).as_rotvec()
     return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
+
+
+def skew(vector: FloatArray) -> FloatArray:
+    """Return the matrices (..., 3, 3) of the cross product with (..., 3) vectors."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def left_jacobian_inverse(vector: FloatArray) -> FloatArray:
+    """Return J_l(v)^-1 (3, 3) (Chirikjian 2012).
+
+    For small w, log(exp(w) exp(v)) = v + J_l(v)^-1 w.
+    """
+    angle = float(np.linalg.norm(vector))
+    cross = skew(vector)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) - 0.5 * cross)
+    factor = 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
+    return np.asarray(np.eye(3) - 0.5 * cross + factor * cross @ cross)
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
@@ -63,3 +84,8 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
     u, _, vt = np.linalg.svd(matrix)
     u[:, -1] *= np.linalg.det(u @ vt)
     return np.asarray(u @ vt)
+
+
+def _own(array: FloatArray, *shape: int) -> FloatArray:
+    """Return a copy (N, *shape): scipy of Ubuntu 24.04 takes no read-only arrays."""
+    return np.array(array, dtype=np.float64).reshape(-1, *shape)

@@ -14,9 +14,14 @@ from calib_ros import messages
 from calib_ros.chain import Chain
 from calib_ros.config import Settings
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
-from calib_ros.identification import Identification, Problem, identify
+from calib_ros.identification import Identification
 from calib_ros.observations import Pairing
+from calib_ros.problem import Problem
 from calib_ros.se3 import FloatArray
+from calib_ros.selection import identify_model
+
+MOST_FRAMES = 10
+"""Frames of measurements that are told apart."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +35,7 @@ class Account:
     configurations: int
     dropped: dict[str, int]
     notes: dict[str, int]
+    foreign_names: tuple[str, ...]
 
     def as_document(self) -> dict[str, Any]:
         """Return the account as plain values."""
@@ -45,6 +51,11 @@ class Account:
             if counts:
                 parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
                 text += f'; {label}: {parts}'
+        if self.foreign_names:
+            text += (
+                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints of '
+                'the chain by other names, set joint_names (--joint-names)'
+            )
         return text
 
 
@@ -63,9 +74,10 @@ class CalibrationSession:
         self.chain = chain
         self.settings = settings or Settings()
         self.joint_names = self.settings.joint_names or chain.joint_names
-        if len(set(self.joint_names)) != len(chain.joints):
+        count = len(chain.joints)
+        if len(self.joint_names) != count or len(set(self.joint_names)) != count:
             raise ConfigError(
-                f'joint_names must be {len(chain.joints)} different names, one for each of '
+                f'joint_names must be {count} different names, one for each of '
                 f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
             )
         self.recording = True
@@ -81,17 +93,19 @@ class CalibrationSession:
             joint_capacity=self.settings.joint_buffer,
             pose_capacity=self.settings.pose_buffer,
         )
-        self._received: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
+        """Messages that came so far, by stream."""
         self._dropped: Counter[str] = Counter()
         self._notes: Counter[str] = Counter()
         self._newest = {'joints': 0, 'poses': 0}
-        self._frame_ids: set[str] = set()
-        self._names: list[str] = []
+        self._frame_ids: list[str] = []
+        self._names: list[str] | None = None
+        self._foreign_names: list[str] = []
         self._index: list[int] = []
 
     def take_joints(self, message: Any) -> FloatArray | None:
         """Take a JointState; return its values (n,) in the order of the chain if it is usable."""
-        self._received['joints'] += 1
+        self.received['joints'] += 1
         try:
             reading = messages.joint_state(message)
             values = self._ordered(reading)
@@ -107,7 +121,7 @@ class CalibrationSession:
 
     def take_pose(self, msgtype: str, message: Any, held_out: bool = False) -> None:
         """Take a measurement of the type named; a held-out one judges and is never fitted."""
-        self._received['poses'] += 1
+        self.received['poses'] += 1
         if not self.recording:
             self._dropped['poses: not recording'] += 1
             return
@@ -117,7 +131,8 @@ class CalibrationSession:
             self._dropped[f'poses: {err}'] += 1
             return
         self._watch_order('poses', reading.stamp_ns)
-        self._frame_ids.add(reading.frame_id)
+        if reading.frame_id not in self._frame_ids and len(self._frame_ids) < MOST_FRAMES:
+            self._frame_ids.append(reading.frame_id)
         self._pairing.add_pose(
             reading.stamp_ns, reading.position, reading.quat_xyzw, reading.covariance, held_out
         )
@@ -125,14 +140,17 @@ class CalibrationSession:
     def account(self) -> Account:
         """Return what became of the messages so far."""
         pairs, held_out, configurations, dropped = self._pairing.tally()
+        notes = self._notes.copy()
+        notes['joint samples let go after use, the joint buffer was full'] = self._pairing.let_go
         return Account(
-            self._received['joints'],
-            self._received['poses'],
+            self.received['joints'],
+            self.received['poses'],
             pairs,
             held_out,
             configurations,
             dict(sorted((self._dropped + dropped).items())),
-            dict(sorted(self._notes.items())),
+            dict(sorted((+notes).items())),
+            tuple(self._foreign_names),
         )
 
     def problem(self) -> Problem:
@@ -157,17 +175,15 @@ class CalibrationSession:
             self.chain,
             fitted,
             held_out,
-            self.settings.sigma_position,
-            self.settings.sigma_orientation,
-            self.settings.fixed,
-            self.settings.folds,
+            world_frame=self._frame_ids[0],
+            **self.settings.for_problem(),
         )
 
     def identify(self) -> Identification:
         """Identify on the pairs so far and keep the result if it is accepted."""
         problem = self.problem()
         try:
-            result = identify(problem)
+            result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
             raise InputError(f'{err} ({self.account()})') from err
         self.adopt(result)
@@ -184,11 +200,8 @@ class CalibrationSession:
             index = []
             for name in self.joint_names:
                 if name not in reading.names:
-                    raise messages.MessageError(
-                        f'joint "{name}" not in the message, which names '
-                        f'{", ".join(reading.names) or "none"} (set joint_names if they are '
-                        "the chain's joints by other names)"
-                    )
+                    self._foreign_names = list(reading.names)
+                    raise messages.MessageError(f'joint "{name}" not in the message')
                 index.append(reading.names.index(name))
             self._names, self._index = list(reading.names), index
         values = reading.values[self._index]

@@ -39,7 +39,7 @@ def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
     """
     names = [
         name
-        for name in structurally_independent(chain, chain.parameter_names, True)
+        for name in structurally_independent(chain, chain.parameter_names)
         if name.partition('.')[0] not in ('base', 'tool')
     ]
     sizes = [

@@ -1,16 +1,21 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of measured configurations: CSV with q1 ... qn, x y z and, if measured, qx qy qz qw.
+"""Tables of measured configurations (CSV), described in docs/formats.md.
 
-Optional columns: `session` (one is chosen), `split` (rows marked `test` are never fitted).
-Columns that are not known are left alone.
+Joint values are in q1 ... qn; s1 ... sn, if present, hold the signs of the joints' last moves.
+What was measured shows in the other columns: a pose (x y z and qx qy qz qw), a position (x y z), a
+distance to a fixed point (distance), or that a ball sat in a socket (location, socket), whose
+place is not known.
 """
 
 from __future__ import annotations
 
 import csv
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,12 +25,40 @@ from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.observations import Observations
 
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
+Rows: TypeAlias = list[tuple[int, dict[str, str]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Sets of observations to fit, each with frames of its own, and of those held out.
+
+    `pairs` names the frames of the two sockets of each location.
+    """
+
+    fitted: tuple[Observations, ...]
+    held_out: tuple[Observations, ...]
+    pairs: tuple[tuple[str, str], ...] = ()
 
 
 def read_table(
-    path: Path, joints: int, session: str | None = None
-) -> tuple[Observations, Observations]:
-    """Read a CSV; return the observations to fit and those held out.
+    path: Path,
+    joints: int,
+    sessions: Sequence[str] = (),
+    eye_in_hand: tuple[float, float] | None = None,
+) -> Table:
+    """Read a CSV.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    joints : int
+        Number of joints.
+    sessions : sequence of str
+        Sessions to read; each but the first gets a base and a tool frame of its own.
+    eye_in_hand : (float, float), optional
+        The poses are those of a fixed target in a camera on the flange, measured with these
+        sigmas [m, rad].
 
     Raises
     ------
@@ -34,6 +67,61 @@ def read_table(
         message names the line.
 
     """
+    header, rows = _read(path)
+    columns = _columns(path, joints, header)
+    fitted: list[Observations] = []
+    held_out: list[Observations] = []
+    pairs = []
+    for number, (session, part) in enumerate(_by_session(path, header, rows, sessions)):
+        suffix = '' if number == 0 else f'_{_plain(session)}'
+        for line, row in part:
+            if (row.get('split') or '') not in ('', 'train', 'test'):
+                raise InputError(
+                    f'{path}, line {line}: split must be train or test, not {row["split"]!r}'
+                )
+        if 'socket' in columns:
+            places = _by(part, ('location', 'socket'))
+            names = {place: f'base{suffix}_{_plain("_".join(place))}' for place in places}
+            locations = dict.fromkeys(location for location, _ in places)
+            for location in locations:
+                ends = [names[place] for place in places if place[0] == location]
+                if len(ends) == 2:
+                    pairs.append((ends[0], ends[1]))
+            groups = [(names[place], f'tool{suffix}', each) for place, each in places.items()]
+        else:
+            targets = _by(part, ('target',)) if 'target' in header else {('',): part}
+            ends = [f'_{_plain(name)}' if k else '' for k, (name,) in enumerate(targets)]
+            groups = [
+                (f'base{suffix}{end}', f'tool{suffix}', each)
+                if eye_in_hand
+                else (f'base{suffix}', f'tool{suffix}{end}', each)
+                for end, each in zip(ends, targets.values(), strict=True)
+            ]
+        for base, tool, each in groups:
+            observations = _observations(path, joints, each, columns)
+            if f's{joints}' in header:
+                signs = [f's{k + 1}' for k in range(joints)]
+                approach = np.array([_numbers(path, line, row, signs) for line, row in each])
+                observations = replace(observations, approach=np.sign(approach))
+            if eye_in_hand:
+                observations = observations.inverted(eye_in_hand)
+            observations = replace(observations, base=base, tool=tool)
+            test = np.array([row.get('split') == 'test' for _, row in each])
+            if not test.all():
+                fitted.append(observations.select(~test))
+            if test.any():
+                held_out.append(observations.select(test))
+        if not any(len(each) for each in fitted):
+            raise InputError(f'{path} has no rows to fit, only such that are marked test')
+    return Table(tuple(fitted), tuple(held_out), tuple(pairs))
+
+
+def _plain(name: str) -> str:
+    """Return a name as part of a frame's, which holds no dots."""
+    return name.replace('.', '-')
+
+
+def _read(path: Path) -> tuple[Sequence[str], Rows]:
     try:
         with path.open(newline='', encoding='utf-8-sig') as file:
             reader = csv.DictReader(file)
@@ -41,26 +129,86 @@ def read_table(
             header = reader.fieldnames or []
     except (OSError, UnicodeDecodeError, csv.Error) as err:
         raise InputError(f'cannot read {path}: {err}') from err
-    values = (*(f'q{k + 1}' for k in range(joints)), *POSITION)
-    missing = [name for name in values if name not in header]
-    oriented = [name for name in QUATERNION if name in header]
-    if oriented:
-        missing += [name for name in QUATERNION if name not in header]
-    if missing:
+    return header, rows
+
+
+def _columns(path: Path, joints: int, header: Sequence[str]) -> list[str]:
+    """Return the columns to read: joint values, and what was measured."""
+    values = [f'q{k + 1}' for k in range(joints)]
+    measured = list(POSITION)
+    if not set(POSITION) & set(header):
+        if 'distance' in header:
+            measured = ['distance']
+        elif 'socket' in header:
+            measured = ['location', 'socket']
+    elif 'distance' in header:
         raise InputError(
-            f'{path} has no column {", ".join(missing)}; expected {", ".join(values)} and, with '
-            f'orientation, {", ".join(QUATERNION)}; found {", ".join(header)}'
+            f'{path} has both x y z and distance: put them into tables of their own, or remove one'
         )
-    if 'session' in header:
-        rows = _one_session(path, rows, session)
-    elif session is not None:
-        raise InputError(f'{path} has no column "session" to choose "{session}" from')
+    elif set(QUATERNION) & set(header):
+        measured += QUATERNION
+    missing = [name for name in (*values, *measured) if name not in header]
+    if missing:
+        expected = ', '.join([*values, *POSITION])
+        raise InputError(
+            f'{path} has no column {", ".join(missing)}; expected {expected} '
+            f'and, with orientation, {", ".join(QUATERNION)} as well (or '
+            f'distance, or location and socket); found {", ".join(header) or "nothing"}'
+        )
+    return values + measured
+
+
+def _by_session(
+    path: Path, header: Sequence[str], rows: Rows, sessions: Sequence[str]
+) -> list[tuple[str, Rows]]:
+    """Return the rows of each session that is asked for."""
     if not rows:
         raise InputError(f'{path} has no rows')
-    columns = (*values, *oriented)
-    numbers = np.array([_numbers(path, line, row, columns) for line, row in rows])
+    if 'session' not in header:
+        if sessions:
+            raise InputError(
+                f'{path} has no column "session" to choose "{", ".join(sessions)}" from'
+            )
+        return [('', rows)]
+    for line, row in rows:
+        if row['session'] is None:
+            raise InputError(f'{path}, line {line}: session is missing')
+    known = {name: part for (name,), part in _by(rows, ('session',)).items()}
+    if not sessions:
+        if len(known) > 1:
+            raise InputError(
+                f'{path} holds several sessions, choose one of {", ".join(known)} (or several, '
+                'joined by commas, to fit them together)'
+            )
+        return list(known.items())
+    for name in sessions:
+        if list(sessions).count(name) > 1:
+            raise InputError(f'session "{name}" is named twice')
+        if name not in known:
+            raise UnknownNameError(f'session in {path}', name, known)
+    return [(name, known[name]) for name in sessions]
+
+
+def _by(rows: Rows, keys: Sequence[str]) -> dict[tuple[str, ...], Rows]:
+    """Return the rows grouped by some columns, in the order in which the groups appear."""
+    groups: dict[tuple[str, ...], Rows] = {}
+    for line, row in rows:
+        groups.setdefault(tuple(row[key] for key in keys), []).append((line, row))
+    return groups
+
+
+def _observations(path: Path, joints: int, rows: Rows, columns: Sequence[str]) -> Observations:
+    kind = columns[joints]
+    numeric = columns[:joints] if kind == 'location' else columns
+    numbers = np.array([_numbers(path, line, row, numeric) for line, row in rows])
+    q = numbers[:, :joints]
+    if kind == 'location':
+        return Observations.from_arrays(q, np.zeros((len(rows), 3)))
+    if kind == 'distance':
+        at_origin = Observations.from_arrays(q, np.zeros((len(rows), 3)))
+        return replace(at_origin, distances=numbers[:, joints])
     rotations = None
-    if oriented:
+    if 'qx' in columns:
         quat = numbers[:, -4:]
         length = np.linalg.norm(quat, axis=1)
         wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
@@ -70,28 +218,10 @@ def read_table(
                 f'{length[wrong[0]]:.6g}, expected 1'
             )
         rotations = se3.from_quat(quat)
-    observations = Observations.from_arrays(
-        numbers[:, :joints], numbers[:, joints : joints + 3], rotations
-    )
-    test = np.array([row.get('split') == 'test' for _, row in rows])
-    return observations.select(~test), observations.select(test)
+    return Observations.from_arrays(q, numbers[:, joints : joints + 3], rotations)
 
 
-def _one_session(
-    path: Path, rows: list[tuple[int, dict[str, str]]], session: str | None
-) -> list[tuple[int, dict[str, str]]]:
-    """Return the rows of one session: base and tool frames differ between sessions."""
-    names = list(dict.fromkeys(row['session'] for _, row in rows))
-    if session is None:
-        if len(names) > 1:
-            raise InputError(f'{path} holds several sessions, choose one of {", ".join(names)}')
-        return rows
-    if session not in names:
-        raise UnknownNameError(f'session in {path}', session, names)
-    return [(line, row) for line, row in rows if row['session'] == session]
-
-
-def _numbers(path: Path, line: int, row: dict[str, str], columns: tuple[str, ...]) -> list[float]:
+def _numbers(path: Path, line: int, row: dict[str, str], columns: Sequence[str]) -> list[float]:
     numbers = []
     for name in columns:
         try:
@@ -99,6 +229,7 @@ def _numbers(path: Path, line: int, row: dict[str, str], columns: tuple[str, ...
         except (TypeError, ValueError):
             number = math.nan
         if not math.isfinite(number):
-            raise InputError(f'{path}, line {line}: {name} must be a number, not {row[name]!r}')
+            found = 'the row ends before it' if row[name] is None else f'not {row[name]!r}'
+            raise InputError(f'{path}, line {line}: {name} must be a number, {found}')
         numbers.append(number)
     return numbers

@@ -1,0 +1,347 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Judging a result on poses that were not fitted, and the rules of acceptance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from calib_ros.chain import DH_KINDS, Chain
+from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
+from calib_ros.observations import Observations
+from calib_ros.problem import Problem
+from calib_ros.robust import OUTLIER, Robust, distances_of, robust_fit, weights_of
+from calib_ros.se3 import FloatArray
+
+CONFIDENCE = 0.95
+"""One-sided confidence that a gain on held-out poses must have to be claimed."""
+MOST_OUTLIERS = 0.35
+"""Share of outliers beyond which nothing is accepted."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of the model: m for lengths, rad for angles.
+
+    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
+    do not determine it) or 'fixed'; all but the first keep the nominal value.
+    """
+
+    name: str
+    value: float
+    offset: float
+    std: float | None
+    status: str
+
+
+@dataclass(frozen=True)
+class ErrorFigures:
+    """Figures of the distance to the measurement over a set of poses, as ISO 9283 has them."""
+
+    count: int
+    rms_mm: float
+    mean_mm: float
+    max_mm: float
+    mean_plus_3_sigma_mm: float
+    rms_mrad: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
+
+    Both in the world; the rotation is NaN where no orientation was measured. `configurations`
+    (N,) tells which pairs belong to one standing configuration.
+    """
+
+    position: FloatArray
+    orientation: FloatArray
+    configurations: NDArray[np.intp]
+
+    def figures(self, which: NDArray[np.bool_]) -> ErrorFigures:
+        """Return RMS, mean and maximum over the pairs of a mask (N,)."""
+        distance = 1e3 * np.linalg.norm(self.position[which], axis=1)
+        angle = 1e3 * np.linalg.norm(self.orientation[which], axis=1)
+        angle = angle[~np.isnan(angle)]
+        return ErrorFigures(
+            len(distance),
+            float(np.sqrt(np.mean(distance**2))),
+            float(distance.mean()),
+            float(distance.max()),
+            float(distance.mean() + 3.0 * distance.std()),
+            float(np.sqrt(np.mean(angle**2))) if angle.size else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Residuals of the same poses before and after.
+
+    Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's
+    and not the frames'. `judged` (N,) is False for outliers.
+    """
+
+    before: Residuals
+    after: Residuals
+    judged: NDArray[np.bool_]
+
+    @property
+    def outliers(self) -> int:
+        """Return how many pairs are named as outliers and left out of the figures."""
+        return int((~self.judged).sum())
+
+    @property
+    def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
+        """Return the figures before and after, without outliers."""
+        return self.before.figures(self.judged), self.after.figures(self.judged)
+
+    @property
+    def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
+        """Return the figures before and after with outliers."""
+        everything = np.ones_like(self.judged)
+        return self.before.figures(everything), self.after.figures(everything)
+
+
+def residuals(chain: Chain, observations: Observations) -> Residuals:
+    """Return measured minus predicted for every pair."""
+    position, orientation = residual_arrays(chain, observations)
+    if position.shape[1] == 1:  # a distance
+        position = np.pad(position, ((0, 0), (0, 2)))
+    return Residuals(position, orientation, observations.configurations)
+
+
+def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
+    """Return the residuals of all sets, one after the other, by both chains."""
+    parts = [(residuals(before, each), residuals(after, each)) for each in sets]
+    groups, first = [], 0
+    for part, _ in parts:
+        groups.append(part.configurations + first)
+        first += int(part.configurations.max(initial=-1)) + 1
+    joined = [
+        Residuals(
+            np.concatenate([part[k].position for part in parts]),
+            np.concatenate([part[k].orientation for part in parts]),
+            np.concatenate(groups),
+        )
+        for k in (0, 1)
+    ]
+    return Comparison(joined[0], joined[1], np.ones(len(joined[0].position), dtype=bool))
+
+
+def is_length(name: str) -> bool:
+    """Tell whether a parameter is a length [m]; the others are angles [rad]."""
+    return name.partition('.')[2] in ('a', 'd', 'x', 'y', 'z')
+
+
+def validate(
+    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust
+) -> tuple[Comparison | None, str]:
+    """Judge both chains on pairs that were not fitted.
+
+    Configurations are dealt out to the folds one by one, so that none is on both sides.
+    Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
+    """
+    if problem.judging:
+        comparison = compare(before, after, problem.judging)
+        if problem.loss != 'none':
+            distances = distances_of(after, names, problem.system(problem.judging))
+            comparison = replace(comparison, judged=np.concatenate(distances) <= OUTLIER)
+        return comparison, f'{len(comparison.judged)} held-out pairs'
+    if len(problem.separations) > 1:
+        return _leave_one_place_out(problem, before, after, names, robust)
+    groups = [each.configurations for each in problem.sets]
+    counts = [len(np.unique(group)) for group in groups]
+    folds = min(problem.folds, sum(counts))
+    rows = sum(
+        count * (1 if kind.distance else 6 if kind.oriented else 3)
+        for count, kind in zip(counts, problem.kinds, strict=True)
+    )
+    if folds < 2 or rows * (folds - 1) // folds < len(names) + 6:
+        return None, 'nothing: too few configurations to hold any out'
+    frames = [name for name in names if before.owns_frame(name)]
+    firsts = np.cumsum([0, *(len(each) for each in problem.sets)])
+
+    def part(fold: int, inside: bool) -> tuple[list[NDArray[np.intp]], System]:
+        chosen = [np.flatnonzero((group % folds == fold) == inside) for group in groups]
+        sets = [each.select(index) for each, index in zip(problem.sets, chosen, strict=True)]
+        system = problem.system(sets)
+        for samples, index, distance in zip(system.sets, chosen, robust.distances, strict=True):
+            samples.weights = np.sqrt(weights_of(distance[index], problem.loss))
+        return chosen, system
+
+    def training(fold: int) -> System:
+        return part(fold, inside=False)[1]
+
+    order, judging, systems = [], [], []
+    for fold in range(folds):
+        left_out, system = part(fold, inside=True)
+        systems.append(system)
+        judging.append([samples.observations for samples in system.sets])
+        order += [out + first for out, first in zip(left_out, firsts[:-1], strict=True)]
+    parts = [
+        compare(first, second, sets)
+        for first, second, sets in zip(
+            without_each(before, frames, systems, training),
+            without_each(after, names, systems, training),
+            judging,
+            strict=True,
+        )
+    ]
+    index = np.argsort(np.concatenate(order))
+    whole = compare(before, after, problem.sets).before.configurations
+
+    def joined(which: str) -> Residuals:
+        pieces = [getattr(part, which) for part in parts]
+        return Residuals(
+            np.concatenate([piece.position for piece in pieces])[index],
+            np.concatenate([piece.orientation for piece in pieces])[index],
+            whole,
+        )
+
+    return (
+        Comparison(joined('before'), joined('after'), ~robust.outliers),
+        f'{folds}-fold cross-validation over {sum(counts)} distinct configurations',
+    )
+
+
+def _leave_one_place_out(
+    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust
+) -> tuple[Comparison, str]:
+    """Judge both chains on places of sockets that were not fitted.
+
+    Where the sockets of a place are is unknown; it is fitted to the place's own pairs, by arm and
+    tool of the others.
+    """
+    frames = [name for name in names if before.owns_frame(name)]
+    chains: list[list[Chain]] = [[], []]
+    for *place, _ in problem.separations:
+        inside = [each for each in problem.sets if each.base in place]
+        others = problem.system([each for each in problem.sets if each.base not in place])
+        own = [name for name in names if name.partition('.')[0] in place]
+        for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
+            elsewhere = [name for name in fitted if name not in own]
+            trained = robust_fit(chain, elsewhere, others, problem.loss).fit.chain
+            found.append(minimise(trained, own, problem.system(inside)).chain)
+    number = {frame: k for k, pair in enumerate(problem.separations) for frame in pair[:2]}
+    parts = [
+        compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])
+        for each in problem.sets
+    ]
+    groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
+    joined = [
+        Residuals(
+            np.concatenate([getattr(part, which).position for part in parts]),
+            np.concatenate([getattr(part, which).orientation for part in parts]),
+            groups,
+        )
+        for which in ('before', 'after')
+    ]
+    return (
+        Comparison(joined[0], joined[1], ~robust.outliers),
+        f'leaving out one of {len(problem.separations)} places at a time',
+    )
+
+
+def refusals(
+    problem: Problem,
+    converged: bool,
+    parameters: Sequence[Parameter],
+    validation: Comparison | None,
+) -> tuple[str, ...]:
+    """Return the rules of acceptance that fail, in words.
+
+    1. The fit has converged.
+    2. The rank is full after gauges: no parameter that other poses would determine is left out.
+    3. The RMS position error on held-out poses is lower than before, by more than its
+       uncertainty (one-sided 95 %, Student's t over configurations; see `log_gain`). The
+       orientation must not get worse by the same measure.
+    4. No DH parameter is certainly (by three standard deviations) further from nominal than
+       `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
+       another robot, not a faulty one.
+    5. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
+    """
+    failed = []
+    if not converged:
+        failed.append('the fit has not converged')
+    not_excited = [p.name for p in parameters if p.status == 'not excited']
+    if not_excited:
+        failed.append(
+            f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
+            'in more combinations, or fix these parameters'
+        )
+    for p in parameters:
+        length = is_length(p.name)
+        limit = problem.largest_length if length else problem.largest_angle
+        joint, _, kind = p.name.partition('.')
+        if p.std is None or joint not in problem.chain.joint_names or kind not in DH_KINDS:
+            continue
+        if abs(p.offset) - 3.0 * p.std > limit:
+            failed.append(
+                f'{p.name} is off by {1e3 * p.offset:.0f} {"mm" if length else "mrad"}, '
+                'more than a faulty robot of this kind can be: is it the right chain file?'
+            )
+    if validation is None:
+        failed.append('there are too few configurations to judge the result on any held out')
+        return tuple(failed)
+    share = validation.outliers / len(validation.judged)
+    if share > MOST_OUTLIERS:
+        failed.append(
+            f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
+            'and what is predicted do not belong together'
+        )
+        return tuple(failed)
+    before, after = validation.figures
+    if after.rms_mm > 1e3 * problem.largest_error:
+        failed.append(
+            f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
+            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?'
+        )
+    judged = validation.judged
+    groups = validation.after.configurations[judged]
+    gain, limit = log_gain(
+        validation.before.position[judged], validation.after.position[judged], groups
+    )
+    if not gain > limit:
+        failed.append(
+            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
+            f'before, {after.rms_mm:.3f} mm after)'
+        )
+    if after.rms_mrad is not None:
+        gain, limit = log_gain(
+            validation.before.orientation[judged], validation.after.orientation[judged], groups
+        )
+        if gain < -limit:
+            failed.append(
+                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
+                f'before, {after.rms_mrad:.3f} mrad after)'
+            )
+    return tuple(failed)
+
+
+def log_gain(
+    before: FloatArray,
+    after: FloatArray,
+    configurations: NDArray[np.intp],
+    confidence: float = CONFIDENCE,
+) -> tuple[float, float]:
+    """Return the logarithm of RMS before / RMS after, and how large chance could make it.
+
+    Errors are (N, 3). The standard error is that of the difference of the two logarithms by the
+    delta method, from the spread over configurations, because pairs of one are not independent.
+    """
+    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
+    known = ~np.isnan(squares).any(axis=0)
+    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
+    count = len(sizes)
+    if count < 2:
+        return 0.0, np.inf
+    means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+    totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
+    deviation = np.diff(means / totals, axis=0).std(ddof=1)
+    limit = stats.t.ppf(confidence, count - 1) * deviation / np.sqrt(count)
+    return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)
