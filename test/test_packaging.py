@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The package as colcon builds it, and what its files promise each other."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import yaml
+
+import calib_ros
+from calib_ros.config import Settings
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize('arguments', [[], ['--symlink-install']])
+def test_colcon_build_puts_everything_where_ros2_looks(tmp_path, arguments):
+    environment = os.environ | {'AMENT_PREFIX_PATH': '', 'COLCON_LOG_PATH': str(tmp_path / 'log')}
+    colcon = Path(sys.executable).with_name('colcon')
+    bases = [part for name in ('build', 'install') for part in (f'--{name}-base', tmp_path / name)]
+    built = subprocess.run(
+        [sys.executable, colcon, 'build', '--base-paths', ROOT, *bases, *arguments],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    prefix = tmp_path / 'install' / 'calib_ros'
+    share = prefix / 'share' / 'calib_ros'
+    assert (prefix / 'share/ament_index/resource_index/packages/calib_ros').is_file()
+    for name in ('package.xml', 'launch/calibration.launch.py', 'config/calibration_node.yaml'):
+        assert (share / name).is_file()
+    robots = {path.name for path in (ROOT / 'config/robots').iterdir()}
+    assert {path.name for path in (share / 'config/robots').iterdir()} == robots
+    library = next(prefix.glob('lib/python*/site-packages'))
+    paths = [str(library)]
+    paths += [str(ROOT)] if arguments else []
+    for name in ('calib_ros', 'calibration_node'):
+        assert os.access(prefix / 'lib' / 'calib_ros' / name, os.X_OK)
+    shown = subprocess.run(
+        [prefix / 'lib/calib_ros/calib_ros', '--version'],
+        env=environment | {'PYTHONPATH': os.pathsep.join(paths)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert calib_ros.__version__ in shown.stdout
+
+
+def test_versions_agree():
+    package = ET.parse(ROOT / 'package.xml').getroot()
+    version = re.search(r"version='([^']+)'", (ROOT / 'setup.py').read_text()).group(1)
+    assert package.findtext('version') == version == calib_ros.__version__
+
+
+def test_package_xml_names_everything_that_is_imported():
+    package = ET.parse(ROOT / 'package.xml').getroot()
+    declared = {element.text for element in package.iter('exec_depend')}
+    keys = {'yaml': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+    keys |= {name: f'python3-{name}' for name in ('numpy', 'scipy', 'matplotlib')}
+    sources = [*(ROOT / 'calib_ros').glob('*.py'), *(ROOT / 'launch').glob('*.py')]
+    for source in sources:
+        for node in ast.walk(ast.parse(source.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) else []
+            for name in names:
+                top = name.partition('.')[0]
+                if top not in sys.stdlib_module_names and top != 'calib_ros':
+                    assert keys.get(top, top) in declared, f'{source.name} imports {top}'
+
+
+def test_the_parameter_file_states_the_defaults():
+    content = yaml.safe_load((ROOT / 'config/calibration_node.yaml').read_text())
+    stated = content['/**']['ros__parameters']
+    for item in fields(Settings):
+        if isinstance(item.default, tuple):
+            assert stated[item.name] == ['']
+        elif isinstance(item.default, str):
+            assert stated[item.name] == item.default
+        else:
+            assert stated[item.name] == pytest.approx(item.default, rel=1e-5)

@@ -1,0 +1,605 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import os
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros import simulation
+from calib_ros.chain import Chain, Joint
+from calib_ros.config import Settings
+from calib_ros.errors import InputError
+from calib_ros.messages import JOINT_STATE, POSE_DECODERS
+from calib_ros.observations import Pairing
+from calib_ros.replay import STORAGES, Recording, replay, write_bag
+from calib_ros.se3 import to_quat
+from calib_ros.session import CalibrationSession
+
+MS = 1_000_000
+TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = TYPESTORE.types
+ARM = Chain(
+    'arm',
+    'standard',
+    (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4), Joint('c', 'prismatic', a=0.1)),
+)
+storages = pytest.mark.parametrize('storage', sorted(STORAGES))
+
+
+def header(stamp_ns, frame_id='tracker'):
+    time = TYPES['builtin_interfaces/msg/Time'](*divmod(stamp_ns, 1_000_000_000))
+    return TYPES['std_msgs/msg/Header'](time, frame_id)
+
+
+def joint_state(stamp_ns, values=(0.1, 0.2, 0.3), names=('a', 'b', 'c')):
+    values, none = np.array(values, dtype=float), np.zeros(0)
+    return TYPES[JOINT_STATE](header(stamp_ns, ''), list(names), values, none, none)
+
+
+def pose(position=(1.0, 2.0, 3.0), quat=(0.0, 0.0, 0.0, 1.0)):
+    return TYPES['geometry_msgs/msg/Pose'](
+        TYPES['geometry_msgs/msg/Point'](*position),
+        TYPES['geometry_msgs/msg/Quaternion'](*quat),
+    )
+
+
+def pose_stamped(stamp_ns, position=(1.0, 2.0, 3.0), quat=(0.0, 0.0, 0.0, 1.0), frame='tracker'):
+    return TYPES['geometry_msgs/msg/PoseStamped'](header(stamp_ns, frame), pose(position, quat))
+
+
+def point_stamped(stamp_ns, position=(1.0, 2.0, 3.0)):
+    point = TYPES['geometry_msgs/msg/Point'](*position)
+    return TYPES['geometry_msgs/msg/PointStamped'](header(stamp_ns), point)
+
+
+def transform_stamped(stamp_ns, position=(1.0, 2.0, 3.0), quat=(0.0, 0.0, 0.0, 1.0)):
+    transform = TYPES['geometry_msgs/msg/Transform'](
+        TYPES['geometry_msgs/msg/Vector3'](*position),
+        TYPES['geometry_msgs/msg/Quaternion'](*quat),
+    )
+    kind = TYPES['geometry_msgs/msg/TransformStamped']
+    return kind(header(stamp_ns), 'target', transform)
+
+
+def pose_with_covariance(stamp_ns, covariance):
+    covariance = np.array(covariance, dtype=float).ravel()
+    with_covariance = TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(), covariance)
+    kind = TYPES['geometry_msgs/msg/PoseWithCovarianceStamped']
+    return kind(header(stamp_ns), with_covariance)
+
+
+def text_message(text='hello'):
+    return TYPES['std_msgs/msg/String'](text)
+
+
+def record(path, events, storage='mcap', silent=()):
+    """Write (topic, message) in the order given; `silent` topics (topic, type) get none."""
+    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
+            for topic, kind in dict(
+                [*silent, *((topic, message.__msgtype__) for topic, message in events)]
+            ).items()
+        }
+        for k, (topic, message) in enumerate(events):
+            data = TYPESTORE.serialize_cdr(message, message.__msgtype__)
+            writer.write(connections[topic], k + 1, data)
+    return path
+
+
+def standing(messages, topic='/pose'):
+    """Return joint samples every 10 ms from 10 ms to 1 s, and the messages after them."""
+    samples = [('/joint_states', joint_state(k * 10 * MS)) for k in range(1, 101)]
+    return [*samples, *((topic, message) for message in messages)]
+
+
+def session_of(path, *topics, **settings):
+    session = CalibrationSession(ARM, Settings(**settings))
+    warnings = replay(path, session, *topics)
+    return session, warnings
+
+
+def account_of(path, *topics, **settings):
+    return session_of(path, *topics, **settings)[0].account()
+
+
+def positions_of(path, *topics):
+    return session_of(path, *topics)[0].problem().observations.positions[:, 0].tolist()
+
+
+def recording(count=30, oriented=True, held_out=0, seed=3):
+    rng = np.random.default_rng(seed)
+    configurations = ARM.random_joints(count, rng)
+    stamps, joints, pose_stamps = simulation.drive(
+        configurations, simulation.Cell(move=0.2, dwell=0.1, poses_per_dwell=1), 10**18
+    )
+    measured = simulation.measure(ARM, configurations, rng, 1e-4, 1e-4, oriented)
+    judging = np.arange(count) % 5 < held_out
+    return Recording(ARM.joint_names, stamps, joints, measured.at(pose_stamps), judging)
+
+
+def assert_equal(found, expected):
+    for name in ('stamps_ns', 'joints', 'positions', 'oriented'):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    np.testing.assert_allclose(found.rotations, expected.rotations, atol=1e-14)
+    assert found.covariance is None
+    assert expected.covariance is None
+
+
+@storages
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('held_out', [0, 2])
+def test_a_bag_gives_what_its_arrays_give(tmp_path, storage, oriented, held_out):
+    made = recording(oriented=oriented, held_out=held_out)
+    write_bag(tmp_path / 'bag', made, storage)
+    session, warnings = session_of(tmp_path / 'bag')
+    pairing = Pairing(
+        [True, True, False], max_gap=0.1, joint_capacity=200_000, pose_capacity=50_000
+    )
+    for stamp_ns, values in zip(made.joint_stamps_ns.tolist(), made.joints, strict=True):
+        pairing.add_joints(stamp_ns, values)
+    quats = to_quat(made.poses.rotations) if oriented else [None] * len(made.poses)
+    for k, stamp_ns in enumerate(made.poses.stamps_ns.tolist()):
+        pairing.add_pose(
+            stamp_ns, made.poses.positions[k], quats[k], held_out=bool(made.held_out[k])
+        )
+    fitted, judging, dropped = pairing.match()
+    problem = session.problem()
+    assert warnings == ()
+    assert len(fitted) == 30 - 6 * held_out
+    assert len(judging) == 6 * held_out
+    assert dropped == {}
+    assert_equal(problem.observations, fitted)
+    assert_equal(problem.held_out, judging)
+    np.testing.assert_array_equal(fitted.positions, made.poses.positions[~made.held_out])
+
+
+@storages
+def test_a_file_of_a_bag_is_as_good_as_its_folder(tmp_path, storage):
+    write_bag(tmp_path / 'bag', recording(), storage)
+    (file,) = (path for path in (tmp_path / 'bag').iterdir() if path.suffix != '.yaml')
+    folder, _ = session_of(tmp_path / 'bag')
+    alone, warnings = session_of(file)
+    assert warnings == ()
+    assert_equal(alone.problem().observations, folder.problem().observations)
+
+
+@storages
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('held_out', [0, 2])
+def test_a_bag_holds_only_the_topics_it_needs(tmp_path, storage, oriented, held_out):
+    write_bag(tmp_path / 'bag', recording(10, oriented, held_out), storage)
+    noun, kind = ('pose', 'PoseStamped') if oriented else ('point', 'PointStamped')
+    expected = {'/joint_states': JOINT_STATE, f'/measured_{noun}': f'geometry_msgs/msg/{kind}'}
+    if held_out:
+        expected[f'/validation_{noun}'] = f'geometry_msgs/msg/{kind}'
+    with Reader(tmp_path / 'bag') as reader:
+        assert {c.topic: c.msgtype for c in reader.connections} == expected
+
+
+def test_a_bag_is_never_overwritten(tmp_path):
+    write_bag(tmp_path / 'bag', recording(5))
+    before = {path.name: path.read_bytes() for path in (tmp_path / 'bag').iterdir()}
+    with pytest.raises(InputError, match='exists already'):
+        write_bag(tmp_path / 'bag', recording(6))
+    assert {path.name: path.read_bytes() for path in (tmp_path / 'bag').iterdir()} == before
+
+
+def test_messages_in_any_order_give_the_same(tmp_path, rng):
+    events = standing([pose_stamped((k * 33 + 15) * MS, (k, 0.0, 0.0)) for k in range(25)])
+    shuffled = [events[k] for k in rng.permutation(len(events))]
+    first, _ = session_of(record(tmp_path / 'first', events))
+    second, _ = session_of(record(tmp_path / 'second', shuffled))
+    assert_equal(second.problem().observations, first.problem().observations)
+    assert second.account().pairs == 25
+    assert second.account().dropped == first.account().dropped == {}
+    assert first.account().notes == {}
+    assert set(second.account().notes) == {
+        'joints with a stamp older than the one before',
+        'poses with a stamp older than the one before',
+    }
+
+
+@pytest.mark.parametrize(
+    ('make', 'oriented'),
+    [
+        (pose_stamped, True),
+        (point_stamped, False),
+        (transform_stamped, True),
+        (lambda stamp_ns: pose_with_covariance(stamp_ns, np.zeros((6, 6))), True),
+    ],
+)
+def test_every_type_of_measurement_is_taken(tmp_path, make, oriented):
+    path = record(tmp_path / 'bag', standing([make(105 * MS), make(205 * MS)]))
+    observations = session_of(path)[0].problem().observations
+    np.testing.assert_array_equal(observations.positions, [[1.0, 2.0, 3.0]] * 2)
+    np.testing.assert_allclose(observations.joints, [[0.1, 0.2, 0.3]] * 2, atol=1e-15)
+    assert observations.oriented.tolist() == [oriented] * 2
+    assert observations.covariance is None
+
+
+def test_a_covariance_of_the_message_is_kept(tmp_path):
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
+    path = record(tmp_path / 'bag', standing([pose_with_covariance(105 * MS, covariance)]))
+    observations = session_of(path)[0].problem().observations
+    np.testing.assert_array_equal(observations.covariance, [covariance])
+
+
+def test_joints_are_taken_by_name(tmp_path):
+    events = [
+        ('/joint_states', joint_state(10 * MS, (3.0, 9.0, 1.0, 2.0), ('c', 'gripper', 'a', 'b'))),
+        ('/joint_states', joint_state(20 * MS, (1.0, 2.0, 3.0), ('a', 'b', 'c'))),
+        ('/joint_states', joint_state(30 * MS, (2.0, 1.0, 3.0), ('b', 'a', 'c'))),
+        *(('/pose', pose_stamped(ms * MS)) for ms in (10, 15, 20, 25, 30)),
+    ]
+    observations = session_of(record(tmp_path / 'bag', events))[0].problem().observations
+    np.testing.assert_array_equal(observations.joints, [[1.0, 2.0, 3.0]] * 5)
+
+
+def test_joints_by_other_names(tmp_path):
+    joints = [joint_state(k * MS, (3.0, 1.0, 2.0), ('r/c', 'r/a', 'r/b')) for k in (10, 20)]
+    events = [*(('/joint_states', message) for message in joints), ('/p', pose_stamped(15 * MS))]
+    path = record(tmp_path / 'bag', events)
+    session, _ = session_of(path, joint_names=('r/a', 'r/b', 'r/c'))
+    np.testing.assert_array_equal(session.problem().observations.joints, [[1.0, 2.0, 3.0]])
+    with pytest.raises(InputError, match=r'no matched pairs: .*2 x joints: .*"a".*r/c, r/a, r/b'):
+        session_of(path)[0].problem()
+
+
+def test_topics_of_other_types_are_left_alone(tmp_path):
+    extra = [('/chatter', text_message()), ('/tf_static', text_message('x' * 1000))]
+    events = standing([pose_stamped(105 * MS), pose_stamped(205 * MS)])
+    plain = account_of(record(tmp_path / 'plain', events))
+    mixed = account_of(record(tmp_path / 'mixed', [*extra, *events, *extra]))
+    assert mixed == plain
+    assert (mixed.joint_states, mixed.poses, mixed.pairs) == (100, 2, 2)
+
+
+def test_validation_topics_are_held_out(tmp_path):
+    events = standing([pose_stamped(105 * MS, (1, 0, 0)), pose_stamped(205 * MS, (2, 0, 0))])
+    for topic, ms in (('/validation_pose', 300), ('/cell/validation_2', 400)):
+        events.append((topic, pose_stamped(ms * MS, (ms, 0, 0))))
+    session, _ = session_of(record(tmp_path / 'bag', events))
+    problem = session.problem()
+    assert problem.observations.positions[:, 0].tolist() == [1, 2]
+    assert problem.held_out.positions[:, 0].tolist() == [300, 400]
+    assert '2 pairs to fit and 2 held out' in str(session.account())
+
+
+def test_only_validation_poses_are_not_guessed_to_be_fitted(tmp_path):
+    path = record(tmp_path / 'bag', standing([pose_stamped(105 * MS)], '/validation_pose'))
+    with pytest.raises(InputError, match='has no pose topic'):
+        session_of(path)
+
+
+def test_of_several_topics_one_must_be_chosen(tmp_path):
+    events = standing([pose_stamped(105 * MS, (1, 0, 0))], '/left')
+    events.append(('/right', point_stamped(105 * MS, (2, 0, 0))))
+    path = record(tmp_path / 'bag', events)
+    with pytest.raises(InputError, match=r'several pose topics, .*--pose-topic: /left, /right'):
+        session_of(path)
+    assert positions_of(path, None, '/left') == [1.0]
+    assert positions_of(path, None, '/right') == [2.0]
+
+
+def test_of_several_joint_topics_one_must_be_chosen(tmp_path):
+    events = standing([pose_stamped(105 * MS)])
+    events += [('/gripper', joint_state(ms * MS, (5.0, 6.0, 7.0))) for ms in (100, 110)]
+    path = record(tmp_path / 'bag', events)
+    with pytest.raises(InputError, match=r'several joint topics, .*--joint-topic: /gripper, /jo'):
+        session_of(path)
+    observations = session_of(path, '/gripper')[0].problem().observations
+    np.testing.assert_array_equal(observations.joints, [[5.0, 6.0, 7.0]])
+
+
+@pytest.mark.parametrize(
+    ('joint_topic', 'pose_topic', 'named'),
+    [('/joints', None, '/joints'), (None, '/poze', '/poze'), (None, '/joint_states', '/joint_s')],
+)
+def test_a_topic_that_is_not_there_lists_the_contents(tmp_path, joint_topic, pose_topic, named):
+    path = record(tmp_path / 'bag', [*standing([pose_stamped(105 * MS)]), ('/x', text_message())])
+    with pytest.raises(InputError, match=f'no topic "{named}') as caught:
+        session_of(path, joint_topic, pose_topic)
+    for content in ('/joint_states (sensor', '/pose (geometry_msgs/msg/PoseStamped)', '/x (std'):
+        assert content in str(caught.value)
+
+
+@storages
+@pytest.mark.parametrize(
+    ('events', 'missing'),
+    [
+        ([('/chatter', text_message())], 'pose topic'),
+        ([('/joint_states', joint_state(10 * MS))], 'pose topic'),
+        ([('/pose', pose_stamped(10 * MS))], 'joint topic'),
+    ],
+)
+def test_a_bag_without_the_topics_is_refused(tmp_path, storage, events, missing):
+    path = record(tmp_path / 'bag', events, storage)
+    with pytest.raises(InputError, match=f'has no {missing}') as caught:
+        session_of(path)
+    assert events[0][0] in str(caught.value)
+
+
+@storages
+def test_topics_without_messages_make_no_pairs(tmp_path, storage):
+    kinds = [('/joint_states', JOINT_STATE), ('/pose', 'geometry_msgs/msg/PoseStamped')]
+    path = record(tmp_path / 'bag', [('/chatter', text_message())], storage, silent=kinds)
+    session, _ = session_of(path)
+    with pytest.raises(InputError, match='no matched pairs: 0 joint states and 0 poses'):
+        session.problem()
+
+
+def test_poses_in_different_frames_are_refused(tmp_path):
+    poses = [pose_stamped(105 * MS), pose_stamped(205 * MS, frame='other')]
+    session, _ = session_of(record(tmp_path / 'bag', standing(poses)))
+    with pytest.raises(InputError, match=r'different frames \(other, tracker\)'):
+        session.problem()
+
+
+GOOD = np.eye(6)
+NAN = GOOD.copy()
+NAN[0, 0] = np.nan
+SKEW = GOOD.copy()
+SKEW[0, 1] = 0.5
+BAD_POSES = [
+    (pose_stamped(0), 'poses: zero stamp'),
+    (pose_stamped(105 * MS, (np.nan, 0, 0)), 'poses: NaN or infinite position'),
+    (pose_stamped(105 * MS, (0, 0, np.inf)), 'poses: NaN or infinite position'),
+    (pose_stamped(105 * MS, quat=(0, 0, 0, 0)), 'poses: quaternion not of length 1'),
+    (pose_stamped(105 * MS, quat=(0, 0, 0, 1.01)), 'poses: quaternion not of length 1'),
+    (pose_stamped(105 * MS, quat=(0, 0, np.nan, 1)), 'poses: quaternion not of length 1'),
+    (point_stamped(105 * MS, (0, -np.inf, 0)), 'poses: NaN or infinite position'),
+    (transform_stamped(0), 'poses: zero stamp'),
+    (transform_stamped(105 * MS, quat=(1, 1, 1, 1)), 'poses: quaternion not of length 1'),
+    (pose_with_covariance(105 * MS, NAN), 'poses: covariance with NaN or infinite values'),
+    (pose_with_covariance(105 * MS, SKEW), 'poses: covariance not symmetric'),
+    (pose_with_covariance(105 * MS, -GOOD), 'poses: covariance not positive definite'),
+    (pose_with_covariance(105 * MS, np.diag([1, 1, 1, 1, 1, 0])), 'poses: covariance not posit'),
+    (pose_stamped(5 * MS), 'poses: no joint sample before'),
+    (pose_stamped(1005 * MS), 'poses: no joint sample after'),
+]
+
+
+@pytest.mark.parametrize(('bad', 'cause'), BAD_POSES)
+def test_a_bad_measurement_is_dropped_and_counted_by_cause(tmp_path, bad, cause):
+    kind = type(bad)
+    makers = {
+        'PoseStamped': pose_stamped,
+        'PointStamped': point_stamped,
+        'TransformStamped': transform_stamped,
+        'PoseWithCovarianceStamped': lambda stamp_ns: pose_with_covariance(stamp_ns, GOOD),
+    }
+    good = makers[kind.__msgtype__.rpartition('/')[2]](305 * MS)
+    account = account_of(record(tmp_path / 'bag', standing([bad, good, bad])))
+    assert (account.poses, account.pairs) == (3, 1)
+    ((found, count),) = (
+        item for item in account.dropped.items() if item[0] != 'poses: same stamp twice'
+    )
+    assert found.startswith(cause)
+    assert count + account.dropped.get('poses: same stamp twice', 0) == 2
+    assert f'{count} x {cause}' in str(account)
+
+
+BAD_JOINTS = [
+    (joint_state(0), 'joints: zero stamp'),
+    (joint_state(55 * MS, (0.1, np.nan, 0.3)), 'joints: NaN or infinite joint value'),
+    (joint_state(55 * MS, (0.1, np.inf, 0.3)), 'joints: NaN or infinite joint value'),
+    (joint_state(55 * MS, (0.1, 0.2)), 'joints: names and positions differ in number'),
+    (joint_state(55 * MS, ()), 'joints: names and positions differ in number'),
+    (joint_state(55 * MS, (0.1, 0.2), ('a', 'c')), 'joints: joint "b" not in the message'),
+    (joint_state(55 * MS, (0.1,), ('gripper',)), 'joints: joint "a" not in the message'),
+    (joint_state(55 * MS, (), ()), 'joints: joint "a" not in the message'),
+]
+
+
+@pytest.mark.parametrize('first', [True, False])
+@pytest.mark.parametrize(('bad', 'cause'), BAD_JOINTS)
+def test_a_bad_joint_state_is_dropped_and_counted_by_cause(tmp_path, bad, cause, first):
+    events = standing([pose_stamped(55 * MS)])
+    bad = [('/joint_states', bad)] * 2
+    account = account_of(record(tmp_path / 'bag', [*bad, *events] if first else [*events, *bad]))
+    assert (account.joint_states, account.pairs) == (102, 1)
+    ((found, count),) = account.dropped.items()
+    assert count == 2
+    assert found.startswith(cause)
+    assert f'2 x {cause}' in str(account)
+
+
+def test_a_nan_of_a_foreign_joint_does_not_matter(tmp_path):
+    events = [
+        ('/joint_states', joint_state(k * MS, (1, 2, 3, np.nan), ('a', 'b', 'c', 'grip')))
+        for k in (10, 20)
+    ]
+    account = account_of(record(tmp_path / 'bag', [*events, ('/pose', pose_stamped(15 * MS))]))
+    assert (account.pairs, account.dropped) == (1, {})
+
+
+def test_stamps_going_backwards_lose_nothing_and_are_noted(tmp_path):
+    events = standing([pose_stamped(ms * MS, (ms, 0, 0)) for ms in (305, 105, 405, 205)])
+    session, _ = session_of(record(tmp_path / 'bag', events))
+    assert session.problem().observations.positions[:, 0].tolist() == [105, 205, 305, 405]
+    assert session.account().notes == {'poses with a stamp older than the one before': 2}
+    assert 'note: 2 x poses with a stamp older than the one before' in str(session.account())
+
+
+def test_poses_between_distant_joint_samples_are_counted(tmp_path):
+    events = [('/joint_states', joint_state(ms * MS)) for ms in (100, 300, 320)]
+    events += [('/pose', pose_stamped(ms * MS)) for ms in (150, 310)]
+    path = record(tmp_path / 'bag', events)
+    account = account_of(path)
+    assert (account.pairs, account.dropped) == (1, {'poses: joint samples too far apart': 1})
+    assert account_of(path, max_gap=0.2).pairs == 2
+
+
+def test_a_session_that_does_not_record_counts_what_it_leaves_out(tmp_path):
+    path = record(tmp_path / 'bag', standing([pose_stamped(105 * MS)]))
+    session = CalibrationSession(ARM)
+    session.recording = False
+    replay(path, session)
+    assert session.account().dropped == {'joints: not recording': 100, 'poses: not recording': 1}
+
+
+def damage(path, share=None, metadata=True):
+    """Cut the bag's file off, as by a full disk; without metadata as by kill -9."""
+    (file,) = (item for item in path.iterdir() if item.suffix in ('.mcap', '.db3'))
+    if share is not None:
+        content = file.read_bytes()
+        file.write_bytes(content[: int(share * len(content))])
+    if not metadata:
+        (path / 'metadata.yaml').unlink()
+    return file
+
+
+@storages
+@pytest.mark.parametrize(('metadata', 'alone'), [(True, False), (False, False), (True, True)])
+@pytest.mark.parametrize('share', [0.45, 0.55, 0.9])
+def test_of_a_truncated_bag_the_rest_is_used(tmp_path, storage, metadata, alone, share):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(300), storage)
+    whole = session_of(path)[0].problem().observations
+    file = damage(path, share, metadata)
+    session, warnings = session_of(file if alone else path)
+    part = session.problem().observations
+    (warning,) = warnings
+    assert str(path) in warning
+    assert 'damaged' in warning
+    assert 'lost' in warning
+    account = session.account()
+    assert str(account.joint_states + account.poses) in warning
+    assert 0.2 * share * len(whole) < len(part) < len(whole)
+    # What is read is what was recorded.
+    index = np.searchsorted(whole.stamps_ns, part.stamps_ns)
+    np.testing.assert_array_equal(whole.stamps_ns[index], part.stamps_ns)
+    np.testing.assert_array_equal(whole.positions[index], part.positions)
+    np.testing.assert_array_equal(whole.joints[index], part.joints)
+
+
+@storages
+def test_a_bag_that_was_never_closed_is_read(tmp_path, storage):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(), storage)
+    whole = session_of(path)[0].problem().observations
+    damage(path, metadata=False)
+    session, warnings = session_of(path)
+    assert_equal(session.problem().observations, whole)
+    assert len(warnings) == 1
+
+
+@storages
+def test_the_count_of_a_damaged_bag_is_of_the_messages_used(tmp_path, storage):
+    events = [*standing([pose_stamped(105 * MS)]), *[('/chatter', text_message())] * 7]
+    path = record(tmp_path / 'bag', events, storage)
+    damage(path, metadata=False)
+    assert ' 101 messages' in session_of(path)[1][0]
+
+
+@storages
+def test_a_damaged_bag_in_a_folder_with_an_odd_name(tmp_path, storage):
+    write_bag(tmp_path / 'bag', recording(), storage)
+    damage(tmp_path / 'bag', metadata=False)
+    path = (tmp_path / 'bag').rename(tmp_path / 'cell #1 50%20?')
+    assert session_of(path)[0].account().pairs == 30
+
+
+@pytest.mark.parametrize('share', [0.6, 0.75, 0.9])
+def test_of_a_truncated_compressed_bag_the_whole_chunks_are_used(tmp_path, share):
+    path = tmp_path / 'bag'
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    noise = np.random.default_rng(1)
+    with writer:
+        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=TYPESTORE)
+        kind = 'geometry_msgs/msg/PoseStamped'
+        poses = writer.add_connection('/pose', kind, typestore=TYPESTORE)
+        for k in range(1, 6001):
+            message = joint_state(k * 10 * MS, noise.normal(size=3))
+            writer.write(joints, k, TYPESTORE.serialize_cdr(message, JOINT_STATE))
+            message = pose_stamped(k * 10 * MS, noise.normal(size=3))
+            writer.write(poses, k, TYPESTORE.serialize_cdr(message, kind))
+    assert session_of(path)[0].account().pairs == 6000
+    session, warnings = session_of(damage(path, share))
+    assert 1000 < session.account().pairs < 6000
+    assert len(warnings) == 1
+
+
+@storages
+def test_a_hole_in_a_file_is_reported(tmp_path, storage):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(300), storage)
+    file = damage(path)
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 9000] = b'\xff' * 9000
+    file.write_bytes(bytes(content))
+    session, warnings = session_of(path)
+    account = session.account()
+    assert 0 < account.pairs < 300
+    assert len(warnings) == 1
+    assert 'lost' in warnings[0]
+
+
+@pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3', 'bag.bag', 'bag'])
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'',
+        b'garbage ' * 500,
+        bytes(range(256)) * 8,
+        b'\x89MCAP0\r\n' + b'\x05' * 500,
+        b'SQLite format 3\0' + b'\x01' * 500,
+    ],
+)
+def test_a_file_that_is_no_bag_is_refused(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
+        session_of(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize('metadata', [None, b'', b'\xff\xfe', b'- 1', b'rosbag2_bagfile: {'])
+def test_a_folder_that_is_no_bag_is_refused(tmp_path, metadata):
+    path = tmp_path / 'folder'
+    path.mkdir()
+    (path / 'notes.txt').write_text('no bag')
+    if metadata is not None:
+        (path / 'metadata.yaml').write_bytes(metadata)
+    with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
+        session_of(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_path_to_nothing_is_refused(tmp_path):
+    with pytest.raises(InputError, match=f'no bag at {tmp_path}{os.sep}missing'):
+        session_of(tmp_path / 'missing')
+
+
+def test_one_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
+    path = tmp_path / 'bag'
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=TYPESTORE)
+        kind = 'geometry_msgs/msg/PointStamped'
+        poses = writer.add_connection('/point', kind, typestore=TYPESTORE)
+        for k in range(1, 11):
+            data = TYPESTORE.serialize_cdr(joint_state(k * 10 * MS), JOINT_STATE)
+            writer.write(joints, k, data)
+            data = TYPESTORE.serialize_cdr(point_stamped(k * 10 * MS), kind)
+            writer.write(poses, k, data[:-9] if k == 3 else data)
+    session, warnings = session_of(path)
+    assert session.account().pairs >= 2
+    assert len(warnings) == 1
+    assert 'lost' in warnings[0]
+
+
+def test_messages_are_read_by_their_attributes_only():
+    # What rclpy delivers is another class with the same attributes.
+    stamp = SimpleNamespace(sec=1, nanosec=5)
+    message = SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id='tracker'),
+        point=SimpleNamespace(x=1, y=2, z=3),
+    )
+    reading = POSE_DECODERS['geometry_msgs/msg/PointStamped'](message)
+    assert reading == (1_000_000_005, 'tracker', (1.0, 2.0, 3.0), None, None)
