@@ -57,6 +57,11 @@ class Kind:
     base: str = 'base'
     tool: str = 'tool'
 
+    @property
+    def rows(self) -> int:
+        """Return the number of equations of one configuration."""
+        return 1 if self.distance else 6 if self.oriented else 3
+
 
 def structurally_independent(
     chain: Chain,

@@ -175,12 +175,12 @@ def identify(problem: Problem) -> Identification:
     structural = identifiability.structurally_independent(
         model, problem.free, problem.kinds, system.separation_rows
     )
-    determined = [name for name in structural if name not in problem.prior_names]
+    determined = [name for name in structural if name not in problem.prior_sigmas]
     _require_enough(problem, determined)
     start = start_frames(
         model, problem.sets, problem.sigma_position, problem.sigma_orientation, problem.loss
     )
-    wanted = [n for n in problem.free if n in structural or n in problem.prior_names]
+    wanted = [n for n in problem.free if n in structural or n in problem.prior_sigmas]
     few = problem.system([_some(each) for each in problem.sets])
     names = identifiability.independent(triangular_factor(start, wanted, few), wanted)
     if len(names) < len(wanted):  # more samples may determine more
@@ -295,13 +295,12 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
     rows = configurations = 0
     for each, kind in zip(problem.sets, problem.kinds, strict=True):
         count = len(np.unique(each.configurations))
-        rows += count * (1 if kind.distance else 6 if kind.oriented else 3)
+        rows += count * kind.rows
         configurations += count
     if not len(problem.observations):
         raise InputError('there are no pairs to fit')
     if rows < len(names):
-        kind = problem.kinds[0]
-        width = 1 if kind.distance else 6 if kind.oriented else 3
+        width = problem.kinds[0].rows
         raise TooFewObservationsError(
             configurations,
             -(-len(names) // width),

@@ -162,24 +162,25 @@ class Problem:
         return chain.with_effects(wanted)
 
     @property
-    def prior_names(self) -> tuple[str, ...]:
-        """Return the free parameters that have a prior."""
-        patterns = (*self.priors, *dict(self.model.effects))
-        return tuple(n for n in self.free if any(fnmatch.fnmatchcase(n, p) for p in patterns))
+    def prior_sigmas(self) -> dict[str, float]:
+        """Return the standard deviations [m, rad] of the priors of all parameters that have one.
 
-    def system(self, sets: Sequence[Observations]) -> System:
-        """Return sets of observations, and the priors, as the solver takes them."""
-        prior = None
+        Frames have none; effects always have one.
+        """
+        model = self.model
         sigmas: dict[str, float] = {}
         for name in self.free:
             for pattern, sigma in self.priors.items():
-                if fnmatch.fnmatchcase(name, pattern):
+                if fnmatch.fnmatchcase(name, pattern) and not model.owns_frame(name):
                     sigmas.setdefault(name, sigma)
-        model = self.model
         for name, _ in model.effects:
             sigmas.setdefault(name, effects.expected(name))
-        if sigmas:
-            prior = Prior(model, sigmas)
+        return sigmas
+
+    def system(self, sets: Sequence[Observations]) -> System:
+        """Return sets of observations, and the priors, as the solver takes them."""
+        sigmas = self.prior_sigmas
+        prior = Prior(self.model, sigmas) if sigmas else None
         samples = [Samples(each, self.sigma_position, self.sigma_orientation) for each in sets]
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)

@@ -71,7 +71,7 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
     if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
         return Robust(fit, distances, True, iterations, loss)
     for _ in range(REWEIGHTINGS):
-        before = [d.copy() for d in distances]
+        before = distances
         _weigh(system, [np.minimum(1.0, 1.0 / np.maximum(d, 1e-12)) for d in distances])
         fit = minimise(fit.chain, names, system, iterations=2)
         iterations += fit.iterations

@@ -122,15 +122,13 @@ def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Compar
     for part, _ in parts:
         groups.append(part.configurations + first)
         first += int(part.configurations.max(initial=-1)) + 1
-    joined = [
-        Residuals(
-            np.concatenate([part[k].position for part in parts]),
-            np.concatenate([part[k].orientation for part in parts]),
-            np.concatenate(groups),
-        )
-        for k in (0, 1)
-    ]
-    return Comparison(joined[0], joined[1], np.ones(len(joined[0].position), dtype=bool))
+    numbers = np.concatenate(groups)
+    index = np.arange(len(numbers))
+    return Comparison(
+        _joined([first for first, _ in parts], numbers, index),
+        _joined([second for _, second in parts], numbers, index),
+        np.ones(len(numbers), dtype=bool),
+    )
 
 
 def is_length(name: str) -> bool:
@@ -157,10 +155,7 @@ def validate(
     groups = [each.configurations for each in problem.sets]
     counts = [len(np.unique(group)) for group in groups]
     folds = min(problem.folds, sum(counts))
-    rows = sum(
-        count * (1 if kind.distance else 6 if kind.oriented else 3)
-        for count, kind in zip(counts, problem.kinds, strict=True)
-    )
+    rows = sum(count * kind.rows for count, kind in zip(counts, problem.kinds, strict=True))
     if folds < 2 or rows * (folds - 1) // folds < len(names) + 6:
         return None, 'nothing: too few configurations to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
@@ -194,18 +189,24 @@ def validate(
     ]
     index = np.argsort(np.concatenate(order))
     whole = compare(before, after, problem.sets).before.configurations
-
-    def joined(which: str) -> Residuals:
-        pieces = [getattr(part, which) for part in parts]
-        return Residuals(
-            np.concatenate([piece.position for piece in pieces])[index],
-            np.concatenate([piece.orientation for piece in pieces])[index],
-            whole,
-        )
-
     return (
-        Comparison(joined('before'), joined('after'), ~robust.outliers),
+        Comparison(
+            _joined([part.before for part in parts], whole, index),
+            _joined([part.after for part in parts], whole, index),
+            ~robust.outliers,
+        ),
         f'{folds}-fold cross-validation over {sum(counts)} distinct configurations',
+    )
+
+
+def _joined(
+    pieces: Sequence[Residuals], configurations: NDArray[np.intp], index: NDArray[np.intp]
+) -> Residuals:
+    """Return the residuals of several parts as one, put in order by an index (N,)."""
+    return Residuals(
+        np.concatenate([piece.position for piece in pieces])[index],
+        np.concatenate([piece.orientation for piece in pieces])[index],
+        configurations,
     )
 
 
@@ -233,16 +234,13 @@ def _leave_one_place_out(
         for each in problem.sets
     ]
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
-    joined = [
-        Residuals(
-            np.concatenate([getattr(part, which).position for part in parts]),
-            np.concatenate([getattr(part, which).orientation for part in parts]),
-            groups,
-        )
-        for which in ('before', 'after')
-    ]
+    index = np.arange(len(groups))
     return (
-        Comparison(joined[0], joined[1], ~robust.outliers),
+        Comparison(
+            _joined([part.before for part in parts], groups, index),
+            _joined([part.after for part in parts], groups, index),
+            ~robust.outliers,
+        ),
         f'leaving out one of {len(problem.separations)} places at a time',
     )
 
