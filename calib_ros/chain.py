@@ -38,6 +38,8 @@ Recorder: TypeAlias = Callable[[str, bool, FloatArray, FloatArray], None]
 DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
 ANGLES = ('alpha', 'theta', 'beta')
 FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
+DELAY = 'delay'
+"""Kind of parameter [s] of a base frame: how late the stamps of its device are."""
 PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
 
@@ -102,10 +104,15 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A constant transform (4, 4); `fixed` when it is known and must not be fitted."""
+    """A constant transform (4, 4); `fixed` when it is known and must not be fitted.
+
+    `delay` [s] is how much later than the joints' the stamps of the device at a base frame are;
+    None where the arm stood and no delay shows.
+    """
 
     matrix: FloatArray = field(default_factory=lambda: np.eye(4))
     fixed: bool = False
+    delay: float | None = None
 
     def moved(self, offsets: Mapping[str, float]) -> Frame:
         """Return the frame shifted by x, y, z [m] and turned by rx, ry, rz [rad].
@@ -118,6 +125,8 @@ class Frame:
         turn = np.array([offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]])
         if turn.any():
             matrix[:3, :3] = se3.nearest_rotation(se3.exp_rotation(turn) @ matrix[:3, :3])
+        if 'delay' in offsets:
+            return replace(self, matrix=matrix, delay=(self.delay or 0.0) + offsets['delay'])
         return replace(self, matrix=matrix)
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
@@ -212,6 +221,7 @@ class Chain:
         The model holds beta instead of d at the joints named in `parallel`.
         """
         names = [f'{frame}.{kind}' for frame in self.frame_names for kind in FRAME_KINDS]
+        names += [f'{k}.{DELAY}' for k in self.frame_names if self.frame(k).delay is not None]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
             names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
@@ -232,12 +242,14 @@ class Chain:
         owner, kind = self._split(name)
         if isinstance(owner, Joint):
             return float(getattr(owner, kind)) if kind in DH_KINDS else dict(self.effects)[name]
+        if kind == DELAY:
+            return owner.delay or 0.0
         return float(owner.offsets()[FRAME_KINDS.index(kind)])
 
     def offset(self, name: str, nominal: Chain) -> float:
         """Return what `with_offsets` adds to the nominal chain's parameter to come here."""
         owner, kind = self._split(name)
-        if isinstance(owner, Joint):
+        if isinstance(owner, Joint) or kind == DELAY:
             return self.value(name) - nominal.value(name)
         reference = nominal.frame(name.partition('.')[0])
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
@@ -424,7 +436,7 @@ class Chain:
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
         owner, _, kind = name.partition('.')
-        if owner in self.frame_names and kind in FRAME_KINDS:
+        if owner in self.frame_names and kind in (*FRAME_KINDS, DELAY):
             return self.frame(owner), kind
         for joint in self.joints:
             if joint.name == owner and (kind in DH_KINDS or name in dict(self.effects)):

@@ -76,8 +76,6 @@ def _parser() -> argparse.ArgumentParser:
         help='between two sockets of a place, 0.05 if not given',
     )
     _add_chain(identify)
-    identify.add_argument('--joint-topic', help='needed only with several JointState topics')
-    identify.add_argument('--pose-topic', help='needed only with several pose topics')
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
     identify.add_argument('--force', action='store_true', help='overwrite files in --out')
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
@@ -149,7 +147,7 @@ def _identify(options: argparse.Namespace) -> int:
         raise InputError('give either a bag or --csv FILE')
     source = 'table' if options.csv else 'bag'
     useless = (
-        ('joint_topic', 'pose_topic', 'joint_names')
+        ('joint_topics', 'sources', 'joint_names', 'frame_id')
         if options.csv
         else ('session', 'eye_in_hand', 'socket_distance')
     )
@@ -158,7 +156,7 @@ def _identify(options: argparse.Namespace) -> int:
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
     given: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(Settings)}
-    for name in ('joint_names', 'fixed', 'priors'):
+    for name in ('joint_names', 'joint_topics', 'fixed', 'priors', 'sources'):
         given[name] = tuple(part for text in given[name] for part in text.split(','))
     settings = Settings(**given)
     _refuse_overwriting(options)
@@ -170,8 +168,10 @@ def _identify(options: argparse.Namespace) -> int:
             options.csv,
             len(chain.joints),
             _sessions(options),
-            (settings.sigma_position, settings.sigma_orientation) if options.eye_in_hand else None,
+            (settings.sigma_position, settings.sigma_orientation),
+            options.eye_in_hand,
         )
+        warnings = table.warnings
         sockets = 0.05 if options.socket_distance is None else options.socket_distance
         problem = Problem(
             chain,
@@ -183,7 +183,7 @@ def _identify(options: argparse.Namespace) -> int:
         )
         result = identify_model(problem, settings.model)
         samples: dict[str, Any] = {
-            'pairs': sum(map(len, table.fitted)),
+            'samples': sum(map(len, table.fitted)),
             'held_out': sum(map(len, table.held_out)),
             'sets': len(table.fitted),
         }
@@ -192,7 +192,7 @@ def _identify(options: argparse.Namespace) -> int:
         from calib_ros.session import CalibrationSession
 
         session = CalibrationSession(chain, settings)
-        warnings = replay(options.bag, session, options.joint_topic, options.pose_topic)
+        warnings = replay(options.bag, session)
         result = session.identify()
         samples = session.account().as_document()
     for warning in warnings:

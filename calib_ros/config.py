@@ -26,10 +26,19 @@ CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
     'calibration',
 )
-FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed')
+FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
+MODES = ('dwell', 'continuous', 'triggered')
+"""How samples are taken."""
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
+
+
+STARTUP = (
+    *('max_gap', 'joint_buffer', 'pose_buffer', 'mode', 'lateness', 'delay', 'sources'),
+    *('joint_topics', 'joint_names'),
+)
+"""Settings that a running node cannot change."""
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
@@ -55,9 +64,42 @@ class Settings:
         0.1, 'longest time between the two joint samples that bracket a pose [s]', 0.0
     )
     joint_buffer: int = _setting(
-        200_000, 'joint samples kept; older ones are let go when it is full', 2
+        200_000, 'joint samples that may wait; the older half is let go when it is full', 2
     )
-    pose_buffer: int = _setting(50_000, 'poses kept; new ones are dropped when it is full', 1)
+    pose_buffer: int = _setting(
+        50_000, 'measurements that may wait, and samples kept, of each source', 1
+    )
+    mode: str = _setting(
+        'dwell',
+        'dwell (each stop of the arm becomes a sample), continuous (each measurement does, moving '
+        'or not) or triggered (one by each call of ~/capture)',
+    )
+    still: float = _setting(
+        5e-4, 'the arm stands while no joint leaves its value by more [rad or m]', 0.0
+    )
+    settle: float = _setting(
+        0.1, 'time after a stop in which it is not measured yet: vibration [s]', 0.0
+    )
+    shortest_stop: float = _setting(0.2, 'a shorter stop is no sample [s]', 0.0)
+    longest_stop: float = _setting(5.0, 'of a longer stop only the beginning is used [s]', 0.0)
+    lateness: float = _setting(
+        1.0, 'how much later than joint states of the same stamp measurements may come [s]', 0.0
+    )
+    delay: float = _setting(
+        0.0,
+        'how much later than those of the joints the stamps of measurements are known to be [s]',
+        -10.0,
+    )
+    sources: tuple[str, ...] = _setting(
+        (),
+        'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
+        'target, eye_in_hand, validation',
+    )
+    joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
+    wanted_accuracy: float = _setting(
+        1e-4, 'standard deviation of predicted positions that is enough [m]', 1e-9
+    )
+    frame_id: str = _setting('', 'frame that measurements must be in; default: any one')
     folds: int = _setting(5, 'parts of the cross-validation', 2)
     largest_length: float = _setting(
         0.05, 'a corrected length further from nominal is not accepted: wrong robot? [m]', 0.0
@@ -100,6 +142,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
+        if self.mode not in MODES:
+            raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
             lower = item.metadata.get('lower')
             value = getattr(self, item.name)
@@ -235,20 +279,26 @@ def chain_document(chain: Chain) -> dict[str, Any]:
 
 
 def _frame_document(frame: Frame) -> dict[str, Any]:
-    return {
+    document = {
         'xyz': frame.matrix[:3, 3].tolist(),
         'quat_xyzw': se3.to_quat(frame.matrix[:3, :3]).tolist(),
         'fixed': frame.fixed,
     }
+    return document if frame.delay is None else document | {'delay': frame.delay}
 
 
 def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
     """Return the text of a chain file; `calibration` says where the numbers come from."""
-    import yaml
-
     document = chain_document(chain)
     if calibration is not None:
         document['calibration'] = dict(calibration)
+    return dump_yaml(document)
+
+
+def dump_yaml(document: Mapping[str, Any]) -> str:
+    """Return plain values as YAML."""
+    import yaml
+
     return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000))
 
 
@@ -327,4 +377,9 @@ def _frame(value: object, where: str) -> Frame | None:
     fixed = content.get('fixed', False)
     if not isinstance(fixed, bool):
         raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
-    return Frame(se3.transform(se3.from_quat(quat), xyz), fixed)
+    delay = content.get('delay')
+    return Frame(
+        se3.transform(se3.from_quat(quat), xyz),
+        fixed,
+        None if delay is None else _number(delay, f'{where}.delay'),
+    )

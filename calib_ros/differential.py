@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_ros import effects, se3
-from calib_ros.chain import ANGLES, DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.chain import ANGLES, DELAY, DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.errors import UnknownNameError
 from calib_ros.se3 import FloatArray
 
@@ -56,6 +56,7 @@ class ErrorModel:
         rotates: dict[str, bool] = {}
         for frame in chain.frame_names:
             rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
+            rotates[f'{frame}.{DELAY}'] = True
         for joint in chain.joints:
             rotates |= {f'{joint.name}.{kind}': kind in ANGLES for kind in DH_KINDS}
         self._effects = [name for name, _ in chain.effects if name in self.names]
@@ -79,7 +80,10 @@ class ErrorModel:
         """Row of each named parameter in the arrays of `linearise`."""
 
     def linearise(
-        self, q: FloatArray, approach: FloatArray | None = None
+        self,
+        q: FloatArray,
+        approach: FloatArray | None = None,
+        velocity: FloatArray | None = None,
     ) -> tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]:
         """Return pose and derivatives for one block of samples.
 
@@ -89,6 +93,8 @@ class ErrorModel:
             Joint values [rad or m], a row per joint.
         approach : (n, B), optional
             Signs of the velocities before, for backlash.
+        velocity : (n, B), optional
+            Velocities of the joints, for the delay of the measuring device.
 
         Returns
         -------
@@ -109,7 +115,9 @@ class ErrorModel:
         arm = np.empty((rotations, 3, samples))
         for name in row:
             frame = name.partition('.')[0]
-            if frame in self.chain.frame_names and frame not in self._ends:
+            if name.endswith(f'.{DELAY}') or (
+                frame in self.chain.frame_names and frame not in self._ends
+            ):
                 k = row[name]
                 (turn if k < rotations else shift)[k] = 0.0
                 if k < rotations:
@@ -121,6 +129,10 @@ class ErrorModel:
                 strict=True,
             )
         )
+
+        late = None
+        if velocity is not None and f'{self._ends[0]}.{DELAY}' in row:
+            late = _Twist(self.chain, velocity)
 
         def put(k: int, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
             if rotates:
@@ -136,14 +148,24 @@ class ErrorModel:
             for effect in self._driven.get(name, ()):
                 sign = self._signs[effect.partition('.')[0]]
                 put(row[effect], rotates, axis * (sign * phi[effect]), point)
+            if late is not None:
+                late.add(name, rotates, axis, point)
 
         effective = self.chain.effective(q, approach)
         axes, origin = self.chain.trace(effective, record, *self._ends)
         np.subtract(origin, arm, out=arm)
         cross(turn[:-1], arm, shift[:rotations])
+        if late is not None:
+            k = row[f'{self._ends[0]}.{DELAY}']
+            turn[k], shift[k] = late.of(origin)
         return axes, origin, shift, turn
 
-    def jacobian(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
+    def jacobian(
+        self,
+        q: FloatArray,
+        approach: FloatArray | None = None,
+        velocity: FloatArray | None = None,
+    ) -> FloatArray:
         """Return the Jacobian (N, 6, P) of position [m] and orientation [rad] at poses q (N, n).
 
         Rows 0-2 are the target's position in the world. Rows 3-5 are its rotation as a vector
@@ -151,12 +173,43 @@ class ErrorModel:
         """
         rows = np.ascontiguousarray(np.asarray(q, dtype=float).T)
         came = None if approach is None else np.ascontiguousarray(approach.T)
-        _, _, shift, turn = self.linearise(rows, came)
+        moving = None if velocity is None else np.ascontiguousarray(velocity.T)
+        _, _, shift, turn = self.linearise(rows, came, moving)
         full = np.zeros((len(q), 6, len(self.names)))
         full[:, :3] = shift[self.order].transpose(2, 1, 0)
         rotational = self.order < self.rotations
         full[:, 3:, rotational] = turn[self.order[rotational]].transpose(2, 1, 0)
         return full
+
+
+class _Twist:
+    """The target's velocity, with the sign reversed: what a delay of one second would change."""
+
+    def __init__(self, chain: Chain, velocity: FloatArray) -> None:
+        self._rates = {
+            f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}': -joint.sign * values
+            for joint, values in zip(chain.joints, velocity, strict=True)
+        }
+        self._turn, self._shift = np.zeros((2, 3, velocity.shape[1]))
+
+    def add(self, name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
+        """Add what the motion of one joint does."""
+        rate = self._rates.get(name)
+        if rate is None:
+            return
+        if not rotates:
+            self._shift += rate * axis
+            return
+        self._turn += rate * axis
+        moment = np.empty_like(self._shift)
+        cross(np.broadcast_to(axis, moment.shape), np.broadcast_to(point, moment.shape), moment)
+        self._shift -= rate * moment
+
+    def of(self, origin: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return turn and shift (3, B) of a target at a position (3, B)."""
+        shift = np.empty_like(self._shift)
+        cross(self._turn, np.broadcast_to(origin, shift.shape), shift)
+        return self._turn, shift + self._shift
 
 
 def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:

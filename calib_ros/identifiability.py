@@ -54,6 +54,7 @@ class Kind:
 
     oriented: bool = True
     distance: bool = False
+    moving: bool = False
     base: str = 'base'
     tool: str = 'tool'
 
@@ -86,9 +87,10 @@ def structurally_independent(
     rows = np.zeros((0, len(names)))
     if extra is not None:
         rows = extra(anywhere, names)[0]
+    velocity = rng.normal(size=joints.shape)
     for kind in kinds:
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
-        jacobian = model.jacobian(joints, approach)
+        jacobian = model.jacobian(joints, approach, velocity if kind.moving else None)
         if kind.distance:
             line = anywhere.forward(joints, approach, kind.base, kind.tool)[:, :3, 3]
             line /= np.linalg.norm(line, axis=1, keepdims=True)

@@ -93,10 +93,17 @@ class Samples:
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         nothing = np.zeros((0, 0))
+        joints, velocity = self.joints, None
+        delay = chain.frame(self.observations.base).delay
+        if self.observations.velocity is not None and delay is not None:
+            then = self.observations.earlier(delay)
+            joints = np.ascontiguousarray(then.joints.T)
+            velocity = np.ascontiguousarray(np.asarray(then.velocity).T)
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
             approach = None if self.approach is None else self.approach[:, part]
-            axes, origin, shift, turn = model.linearise(self.joints[:, part], approach)
+            moving = None if velocity is None else velocity[:, part]
+            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving)
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part])
             else:
@@ -148,7 +155,9 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
     Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
     """
     came = None if observations.approach is None else np.ascontiguousarray(observations.approach.T)
-    joints = chain.effective(np.ascontiguousarray(observations.joints.T), came)
+    delay = chain.frame(observations.base).delay
+    then = observations if delay is None else observations.earlier(delay)
+    joints = chain.effective(np.ascontiguousarray(then.joints.T), came)
     axes, origin = chain.trace(joints, base=observations.base, tool=observations.tool)
     if observations.distances is not None:
         length = np.linalg.norm(origin, axis=0)

@@ -8,6 +8,7 @@ which the message is counted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -32,14 +33,20 @@ class JointReading(NamedTuple):
     values: FloatArray
 
 
-class PoseReading(NamedTuple):
-    """One measured pose: position [m]; quaternion and covariance when they were measured."""
+class Reading(NamedTuple):
+    """One measurement: position [m], quaternion and covariance as far as they were measured.
+
+    A measured distance [m] comes without a position. `child` names the target where the message
+    does.
+    """
 
     stamp_ns: int
     frame_id: str
-    position: tuple[float, float, float]
-    quat_xyzw: tuple[float, float, float, float] | None
-    covariance: FloatArray | None
+    position: tuple[float, float, float] | None = None
+    quat_xyzw: tuple[float, float, float, float] | None = None
+    covariance: FloatArray | None = None
+    distance: float | None = None
+    child: str = ''
 
 
 def joint_state(message: Any) -> JointReading:
@@ -50,44 +57,52 @@ def joint_state(message: Any) -> JointReading:
     return JointReading(stamp(message.header.stamp), message.name, values)
 
 
-def pose_stamped(message: Any) -> PoseReading:
+def pose_stamped(message: Any) -> Reading:
     """Decode a geometry_msgs/PoseStamped."""
-    return _pose(message.header, message.pose.position, message.pose.orientation, None)
+    return _pose(message.header, message.pose.position, message.pose.orientation)
 
 
-def pose_with_covariance(message: Any) -> PoseReading:
+def pose_with_covariance(message: Any) -> Reading:
     """Decode a geometry_msgs/PoseWithCovarianceStamped; a covariance of zeros means none."""
-    covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
     pose = message.pose.pose
-    if not covariance.any():
-        return _pose(message.header, pose.position, pose.orientation, None)
-    if not np.isfinite(covariance).all():
-        raise MessageError('covariance with NaN or infinite values')
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-15):
-        raise MessageError('covariance not symmetric')
-    if np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise MessageError('covariance not positive definite')
-    return _pose(message.header, pose.position, pose.orientation, covariance)
+    reading = _pose(message.header, pose.position, pose.orientation)
+    return reading._replace(covariance=_covariance(message.pose.covariance))
 
 
-def point_stamped(message: Any) -> PoseReading:
+def point_stamped(message: Any) -> Reading:
     """Decode a geometry_msgs/PointStamped."""
-    return _pose(message.header, message.point, None, None)
+    return _pose(message.header, message.point, None)
 
 
-def transform_stamped(message: Any) -> PoseReading:
-    """Decode a geometry_msgs/TransformStamped; each child is a frame of its own."""
+def transform_stamped(message: Any) -> Reading:
+    """Decode a geometry_msgs/TransformStamped; each child frame is a target."""
     transform = message.transform
-    reading = _pose(message.header, transform.translation, transform.rotation, None)
-    return reading._replace(frame_id=f'{reading.frame_id} to {message.child_frame_id}')
+    reading = _pose(message.header, transform.translation, transform.rotation)
+    return reading._replace(child=message.child_frame_id)
 
 
-POSE_DECODERS: dict[str, Callable[[Any], PoseReading]] = {
+def odometry(message: Any) -> Reading:
+    """Decode a nav_msgs/Odometry, of which only the pose counts."""
+    return pose_with_covariance(message)._replace(child=message.child_frame_id)
+
+
+def distance(message: Any) -> Reading:
+    """Decode a sensor_msgs/Range: the distance of a draw-wire or ball-bar."""
+    value = float(message.range)
+    if not (np.isfinite(value) and value > 0.0):
+        raise MessageError('distance not a positive number')
+    return Reading(stamp(message.header.stamp), message.header.frame_id, distance=value)
+
+
+DECODERS: dict[str, Callable[[Any], Reading]] = {
     'geometry_msgs/msg/PoseStamped': pose_stamped,
     'geometry_msgs/msg/PoseWithCovarianceStamped': pose_with_covariance,
     'geometry_msgs/msg/PointStamped': point_stamped,
     'geometry_msgs/msg/TransformStamped': transform_stamped,
+    'nav_msgs/msg/Odometry': odometry,
+    'sensor_msgs/msg/Range': distance,
 }
+"""Types of measurements."""
 
 
 def stamp(time: Any) -> int:
@@ -98,15 +113,28 @@ def stamp(time: Any) -> int:
     return int(stamp_ns)
 
 
-def _pose(header: Any, point: Any, quaternion: Any, covariance: FloatArray | None) -> PoseReading:
+def _pose(header: Any, point: Any, quaternion: Any) -> Reading:
     stamp_ns = stamp(header.stamp)
     position = (float(point.x), float(point.y), float(point.z))
-    if not np.isfinite(position).all():
+    if not all(map(math.isfinite, position)):
         raise MessageError('NaN or infinite position')
     quat = None
     if quaternion is not None:
         quat = (quaternion.x, quaternion.y, quaternion.z, quaternion.w)
-        length = float(np.sqrt(sum(part * part for part in quat)))
+        length = math.sqrt(sum(part * part for part in quat))
         if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
             raise MessageError('quaternion not of length 1')
-    return PoseReading(stamp_ns, header.frame_id, position, quat, covariance)
+    return Reading(stamp_ns, header.frame_id, position, quat)
+
+
+def _covariance(numbers: Any) -> FloatArray | None:
+    covariance = np.array(numbers, dtype=np.float64).reshape(6, 6)
+    if not covariance.any():
+        return None
+    if not np.isfinite(covariance).all():
+        raise MessageError('covariance with NaN or infinite values')
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-15):
+        raise MessageError('covariance not symmetric')
+    if np.linalg.eigvalsh(covariance)[0] <= 0.0:
+        raise MessageError('covariance not positive definite')
+    return covariance

@@ -3,18 +3,21 @@
 """The node: topics in, services, corrected parameters out. `docs/node.md` describes it.
 
 Messages are taken on the executor's thread. An identification runs on a thread of its own, on a
-snapshot of the pairs, and its answer is sent when it has ended.
+snapshot of the samples, and its answer is sent when it has ended.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
 import threading
+import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -22,16 +25,15 @@ from typing import Any
 # Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import (
-    PointStamped,
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    TransformStamped,
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
 )
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy._rclpy_pybind11 import RCLError  # has no public name in Jazzy
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -46,19 +48,24 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, MultiArrayDimension, String
+from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import MarkerArray
 
-from calib_ros import report
-from calib_ros.chain import DH_KINDS
-from calib_ros.config import Settings, load_chain
-from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
+from calib_ros import outgoing, report
+from calib_ros.config import STARTUP, Settings, load_chain
+from calib_ros.deferred import DeferredTrigger
+from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.files import write_file
 from calib_ros.identification import Identification
+from calib_ros.journal import Journal
+from calib_ros.messages import DECODERS
 from calib_ros.problem import Problem
-from calib_ros.se3 import to_quat
+from calib_ros.samples import Sample
 from calib_ros.selection import identify_model
 from calib_ros.session import CalibrationSession
+from calib_ros.sources import STANDARD, Source, parse_sources
+from calib_ros.tables import read_table
 
 try:
     from rclpy.experimental import EventsExecutor
@@ -69,20 +76,33 @@ INPUT_QUEUE = 200
 CORRECTED_POSE_PERIOD = 0.1
 DIAGNOSTICS_PERIOD = 1.0
 JOIN_TIMEOUT = 1.0
+SILENCE = 5.0
+"""A source that has been heard before and is silent for so long [s] is reported."""
 
 
 class CalibrationNode(Node):
-    """Calibrates one robot from its joint states and measured poses."""
+    """Calibrates one robot from its joint states and measurements."""
 
     def __init__(self, **node_options: Any) -> None:
         super().__init__('calibration_node', **node_options)
         chain_name = self._declare(
             'chain', '', 'chain file of the robot, or the name of one that calib_ros ships'
         )
-        self._target = self._declare(
-            'target_filename', '', 'file that ~/save writes; default: a new one under ROS_HOME'
-        )
         self._declare('executor', 'events', 'events or single_threaded: how messages are taken')
+        self._serial = self._declare('serial', '', 'serial number of the robot, for the record')
+        folder = self._declare(
+            'data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'
+        )
+        resume = self._declare('resume', False, 'go on with the newest journal of this robot')
+        self._declare(
+            'target_filename', '', 'file that ~/save writes; default: a new one in data_dir', False
+        )
+        self._declare(
+            'calibration_filename', '', 'file that ~/load reads; default: the newest saved', False
+        )
+        self._declare(
+            'marker_scale', 200.0, 'residual vectors are drawn so many times as long', False
+        )
         settings = Settings(
             **{item.name: self._declare_setting(item) for item in fields(Settings)}
         )
@@ -92,11 +112,25 @@ class CalibrationNode(Node):
                 'parameter "chain" is not set: give the chain file of the robot, for example '
                 '--ros-args -p chain:=ur10e'
             )
-        self.session = CalibrationSession(load_chain(chain_name), settings)
+        home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
+        self._folder = Path(folder).expanduser() if folder else home / 'calib_ros'
+        self.session = CalibrationSession(load_chain(chain_name), settings, self._on_sample)
+        self._journal: Journal | None = None
+        self._unwritten: list[Sample] = []
+        self._journal_error = ''
         self._last = 'nothing identified yet'
         self._calibration_text = ''
         self._dropped_before = 0
+        self._heard: Counter[str] = Counter()
+        self._heard_before: Counter[str] = Counter()
+        self._heard_at: dict[str, float] = {}
+        self._looked_at = time.monotonic()
+        self._status_text = ''
         self._joints: tuple[Any, Any] | None = None
+        self._sources = parse_sources(settings.sources) or STANDARD
+        if resume:
+            self._resume()
+        self.add_on_set_parameters_callback(self._on_parameters)
         self._subscribe()
         latched = QoSProfile(
             depth=1,
@@ -105,43 +139,58 @@ class CalibrationNode(Node):
         )
         self._dh_parameters = self.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
         self._calibration = self.create_publisher(String, '~/calibration', latched)
+        self._status = self.create_publisher(String, '~/status', latched)
+        self._residuals = self.create_publisher(MarkerArray, '~/residuals', latched)
         self._corrected_pose = self.create_publisher(PoseStamped, '~/corrected_pose', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._identify = DeferredTrigger(self, '~/identify', self._snapshot, self._run)
+        self._identify = DeferredTrigger(
+            self, '~/identify', self._answer, self.session.problem, self._run
+        )
         for kind, name, callback in (
+            (Trigger, '~/capture', self._on_capture),
+            (Trigger, '~/remove_last', self._on_remove_last),
+            (Trigger, '~/validate', self._on_validate),
             (Trigger, '~/clear', self._on_clear),
             (Trigger, '~/save', self._on_save),
+            (Trigger, '~/load', self._on_load),
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(callback))
-        self.create_timer(DIAGNOSTICS_PERIOD, self._guarded(self._publish_diagnostics))
+        self.create_timer(DIAGNOSTICS_PERIOD, self._guarded(self._on_second))
         self.create_timer(CORRECTED_POSE_PERIOD, self._guarded(self._publish_corrected_pose))
         self.get_logger().info(
             f'ready to calibrate {self.session.chain.name}: joints '
-            f'{", ".join(self.session.joint_names)}'
+            f'{", ".join(self.session.joint_names)}; samples are kept in {self._folder}'
         )
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
         finished = self._identify.join(JOIN_TIMEOUT)
+        self._write_journal()
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
         self.destroy_node()
         return finished
 
     # Parameters
 
-    def _declare(self, name: str, default: Any, text: str, **ranges: Any) -> Any:
-        descriptor = ParameterDescriptor(description=text, read_only=True, **ranges)
+    def _declare(
+        self, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
+    ) -> Any:
+        descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
         return self.declare_parameter(name, default, descriptor).value
 
     def _declare_setting(self, item: Any) -> Any:
         text, lower = item.metadata['text'], item.metadata.get('lower')
+        fixed = item.name in STARTUP
         if isinstance(item.default, tuple):  # an empty list has no type in ROS, [''] has one
-            return tuple(name for name in self._declare(item.name, [''], text) or () if name)
+            return _names(self._declare(item.name, [''], text, fixed))
         if isinstance(item.default, str):
-            return self._declare(item.name, item.default, text)
+            return self._declare(item.name, item.default, text, fixed)
         if isinstance(item.default, int):
             span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)
-            return self._declare(item.name, item.default, text, integer_range=[span])
+            return self._declare(item.name, item.default, text, fixed, integer_range=[span])
         # Declared with any type first, so that "max_gap: 1" is taken as 1.0.
         loose = ParameterDescriptor(dynamic_typing=True)
         value = self.declare_parameter(item.name, item.default, loose).value
@@ -150,7 +199,7 @@ class CalibrationNode(Node):
         self.undeclare_parameter(item.name)
         span = FloatingPointRange(from_value=float(lower), to_value=1e9)
         descriptor = ParameterDescriptor(
-            description=text, read_only=True, floating_point_range=[span]
+            description=text, read_only=fixed, floating_point_range=[span]
         )
         return self.declare_parameter(
             item.name, float(value), descriptor, ignore_override=True
@@ -162,6 +211,23 @@ class CalibrationNode(Node):
         for name in self._parameter_overrides:
             if name not in known and not name.startswith(('qos_overrides.', 'use_sim_time')):
                 raise UnknownNameError('parameter', name, known)
+
+    def _on_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
+        """Take over settings that change while the node runs, all or none."""
+        known = {item.name: item.default for item in fields(Settings)}
+        values = {
+            each.name: _names(each.value) if isinstance(known[each.name], tuple) else each.value
+            for each in changes
+            if each.name in known
+        }
+        try:
+            settings = replace(self.session.settings, **values)
+            settings.for_problem()
+        except CalibrationError as err:
+            return SetParametersResult(successful=False, reason=str(err))
+        if values:
+            self.session.change(settings)
+        return SetParametersResult(successful=True)
 
     # Topics in
 
@@ -175,44 +241,94 @@ class CalibrationNode(Node):
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
         taking: list[tuple[Any, str, Callable[[Any], None]]] = [
-            (JointState, 'joint_states', self._on_joint_state)
+            (JointState, topic, self._taking_joints(topic))
+            for topic in self.session.settings.joint_topics or ('joint_states',)
         ]
-        for kind, topic in (
-            (PoseStamped, 'measured_pose'),
-            (PoseWithCovarianceStamped, 'measured_pose_with_covariance'),
-            (PointStamped, 'measured_point'),
-            (TransformStamped, 'measured_transform'),
-        ):
-            taking.append((kind, topic, self._taking(kind, held_out=False)))
-        for kind, topic in ((PoseStamped, 'validation_pose'), (PointStamped, 'validation_point')):
-            taking.append((kind, topic, self._taking(kind, held_out=True)))
+        for source in self._sources:
+            name = source.type or 'geometry_msgs/msg/PoseStamped'
+            taking.append((_message_type(name), source.topic, self._taking(source, name)))
         for kind, topic, callback in taking:
             self.create_subscription(
                 kind, topic, self._guarded(callback), qos, qos_overriding_options=overriding
             )
 
-    def _on_joint_state(self, message: JointState) -> None:
-        values = self.session.take_joints(message)
-        if values is not None:
-            self._joints = (message.header.stamp, values)
-
-    def _taking(self, kind: Any, held_out: bool) -> Callable[[Any], None]:
-        name = f'geometry_msgs/msg/{kind.__name__}'
-
+    def _taking_joints(self, topic: str) -> Callable[[Any], None]:
         def take(message: Any) -> None:
-            self.session.take_pose(name, message, held_out)
+            self._heard[topic] += 1
+            values = self.session.take_joints(message)
+            if values is not None:
+                self._joints = (message.header.stamp, values)
 
         return take
 
-    # Services
+    def _taking(self, source: Source, name: str) -> Callable[[Any], None]:
+        assert name in DECODERS
 
-    def _snapshot(self) -> Problem:
-        return self.session.problem()
+        def take(message: Any) -> None:
+            self._heard[source.topic] += 1
+            self.session.take(source, name, message)
+
+        return take
+
+    # The journal
+
+    def _on_sample(self, sample: Sample) -> None:
+        self._unwritten.append(sample)
+        self._write_journal()
+
+    def _write_journal(self) -> None:
+        """Write the samples that are not on disk yet; those that cannot be are kept."""
+        try:
+            while self._unwritten:
+                if self._journal is None:
+                    self._journal = self._new_journal()
+                self._journal.add(self._unwritten[0])
+                del self._unwritten[0]
+        except OSError as err:
+            if not self._journal_error:
+                self.get_logger().error(f'samples are kept in memory only: {err}')
+            self._journal_error = str(err)
+        else:
+            self._journal_error = ''
+
+    def _new_journal(self) -> Journal:
+        path = self._folder / f'{self.session.chain.name}_{_moment()}.csv'
+        journal = Journal(path, len(self.session.chain.joints))
+        write_file(path.with_suffix('.settings.yaml'), self._configuration())
+        return journal
+
+    def _configuration(self) -> str:
+        chain = self.get_parameter('chain').value
+        return report.configuration_yaml(chain, self.session.settings)
+
+    def _resume(self) -> None:
+        """Go on with the newest journal of this robot."""
+        found = sorted(self._folder.glob(f'{self.session.chain.name}_*Z.csv'))
+        if not found:
+            self.get_logger().warning(f'nothing to resume in {self._folder}: a new session begins')
+            return
+        joints = len(self.session.chain.joints)
+        self._journal = Journal(found[-1], joints)
+        table = read_table(found[-1], joints)
+        self.session.restore(table.samples)
+        for warning in table.warnings:
+            self.get_logger().warning(warning)
+        self.get_logger().info(f'resumed {len(table.samples)} samples of {found[-1]}')
+
+    # Services
 
     def _run(self, problem: Problem) -> tuple[bool, str]:
         """Identify, on a thread of its own; publish only what is accepted."""
         result = identify_model(problem, self.session.settings.model)
         self._last = report.summary(result)
+        self._residuals.publish(
+            outgoing.residual_markers(
+                result,
+                problem.sets,
+                self.get_parameter('marker_scale').value,
+                self.get_clock().now().to_msg(),
+            )
+        )
         if result.accepted:
             self.session.adopt(result)
             self._publish_calibration(result)
@@ -220,81 +336,158 @@ class CalibrationNode(Node):
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
 
+    def _on_capture(self, request: Any) -> tuple[bool, str]:
+        count, why = self.session.capture()
+        if not count:
+            return False, f'no sample taken: {why}'
+        taken = self.session.samples[-count:]
+        words = ', '.join(
+            f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken
+        )
+        return True, f'sample {len(self.session.samples)} taken ({words})'
+
+    def _on_remove_last(self, request: Any) -> tuple[bool, str]:
+        sample = self.session.remove_last()
+        if sample in self._unwritten:
+            self._unwritten.remove(sample)
+        elif self._journal is not None:
+            self._journal.remove(sample)
+        return True, f'sample {len(self.session.samples) + 1} removed'
+
+    def _on_validate(self, request: Any) -> tuple[bool, str]:
+        return report.verdict(self.session.calibration, *self.session.validate())
+
     def _on_clear(self, request: Any) -> tuple[bool, str]:
-        account = self.session.account()
+        count = len(self.session.samples)
         self.session.clear()
-        return True, f'{account.pairs + account.held_out} pairs cleared; the calibration stays'
+        self._write_journal()
+        kept = ''
+        if self._journal is not None:
+            kept = f'; they stay in {self._journal.path}'
+            self._journal.close()
+            self._journal = None
+        return True, f'{count} samples cleared{kept}; the calibration stays'
 
     def _on_record(self, request: Any) -> tuple[bool, str]:
         self.session.recording = bool(request.data)
-        return True, 'recording' if request.data else 'not recording: messages are dropped'
+        return True, 'recording' if request.data else 'not recording: messages are not used'
 
     def _on_save(self, request: Any) -> tuple[bool, str]:
         if not self._calibration_text:
             return False, 'there is no accepted calibration to save: call ~/identify first'
-        if self._target:
-            path = Path(self._target).expanduser()
+        target = self.get_parameter('target_filename').value
+        if target:
+            path = Path(target).expanduser()
         else:
-            home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
-            moment = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
-            path = home / 'calib_ros' / f'{self.session.chain.name}_{moment}.yaml'
+            path = self._folder / f'{self.session.chain.name}_{_moment()}.yaml'
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, self._calibration_text)
+        write_file(path.with_suffix('.settings.yaml'), self._configuration(), overwrite=True)
         return True, f'saved to {path}'
+
+    def _on_load(self, request: Any) -> tuple[bool, str]:
+        name = self.get_parameter('calibration_filename').value
+        if name:
+            path = Path(name).expanduser()
+        else:
+            saved = sorted(self._folder.glob(f'{self.session.chain.name}_*Z.yaml'))
+            if not saved:
+                raise InputError(
+                    f'there is no saved calibration of {self.session.chain.name} in '
+                    f'{self._folder}: set calibration_filename'
+                )
+            path = saved[-1]
+        chain = load_chain(path)
+        self.session.load(chain)
+        self._calibration_text = path.read_text(encoding='utf-8')
+        self._dh_parameters.publish(outgoing.dh_parameters(chain))
+        self._calibration.publish(String(data=self._calibration_text))
+        return True, f'loaded {path}'
 
     # Topics out
 
     def _publish_calibration(self, result: Identification) -> None:
-        table = result.chain.table
-        array = Float64MultiArray()
-        rows, columns = table.shape
-        array.layout.dim = [
-            MultiArrayDimension(label='joint', size=rows, stride=rows * columns),
-            MultiArrayDimension(label=','.join(DH_KINDS), size=columns, stride=columns),
-        ]
-        array.data = table.ravel().tolist()
-        self._dh_parameters.publish(array)
-        self._calibration_text = report.calibration_yaml(result)
+        self._dh_parameters.publish(outgoing.dh_parameters(result.chain))
+        self._calibration_text = report.calibration_yaml(result, self._origin())
         self._calibration.publish(String(data=self._calibration_text))
 
+    def _origin(self) -> dict[str, Any]:
+        """Return where the samples come from, for the record."""
+        samples = list(self.session.samples)  # others are taken meanwhile
+        return {
+            'robot_serial': self._serial,
+            'topics': [topic for topic, count in self._heard.items() if count],
+            'first_stamp_ns': min(sample.stamp_ns for sample in samples),
+            'last_stamp_ns': max(sample.stamp_ns for sample in samples),
+            'samples': len(samples),
+            'journal': '' if self._journal is None else str(self._journal.path),
+        }
+
     def _publish_corrected_pose(self) -> None:
-        result = self.session.calibration
-        if result is None or self._joints is None:
+        calibration = self.session.calibration
+        if calibration is None or self._joints is None:
             return
         stamp, values = self._joints
         self._joints = None
-        pose = result.chain.forward(values[np.newaxis])[0]
-        message = PoseStamped()
-        message.header.stamp = stamp
-        message.header.frame_id = result.world_frame
-        point, turn = message.pose.position, message.pose.orientation
-        point.x, point.y, point.z = pose[:3, 3].tolist()
-        turn.x, turn.y, turn.z, turn.w = to_quat(pose[:3, :3]).tolist()
-        self._corrected_pose.publish(message)
+        self._corrected_pose.publish(
+            outgoing.pose(calibration.chain, values, stamp, calibration.world_frame)
+        )
 
-    def _publish_diagnostics(self) -> None:
+    def _on_second(self) -> None:
+        self._write_journal()
+        text = self.session.status()
+        if text != self._status_text:
+            self._status_text = text
+            self._status.publish(String(data=text))
+        now = time.monotonic()
+        span, self._looked_at = now - self._looked_at, now
+        rates = {}
+        for topic, count in self._heard.items():
+            fresh = count - self._heard_before[topic]
+            rates[topic] = fresh / span
+            if fresh:
+                self._heard_at[topic] = now
+        self._heard_before = self._heard.copy()
+        silent = [topic for topic, last in self._heard_at.items() if now - last > SILENCE]
         account = self.session.account()
-        status = DiagnosticStatus(name=f'{self.get_name()}: calibration', hardware_id='')
         dropped = sum(account.dropped.values())
-        fresh = dropped > self._dropped_before
+        fresh_drops = dropped > self._dropped_before
         self._dropped_before = dropped
-        status.level = DiagnosticStatus.WARN if fresh else DiagnosticStatus.OK
-        status.message = str(account)
+        level, words = DiagnosticStatus.OK, text
+        if fresh_drops:
+            level, words = DiagnosticStatus.WARN, f'messages are dropped; {text}'
+        if silent:
+            level, words = DiagnosticStatus.WARN, f'nothing heard on {", ".join(silent)}; {text}'
+        if self._journal_error:
+            level = DiagnosticStatus.ERROR
+            words = f'samples are in memory only: {self._journal_error}'
+        delay = self.session.delay
         values = {
             'robot': self.session.chain.name,
             'recording': self.session.recording,
+            'state': self.session.state,
             'calibrated': self.session.calibration is not None,
             'last identification': self._last,
             'joint states': account.joint_states,
             'poses': account.poses,
-            'pairs': account.pairs,
-            'held-out pairs': account.held_out,
+            'poses waiting': account.waiting,
+            'samples': account.samples,
+            'held-out samples': account.held_out,
             'configurations': account.configurations,
+            'delay [s]': 'not known' if delay is None else f'{delay.seconds:.4f}',
+            **{f'rate of {topic} [Hz]': f'{rate:.1f}' for topic, rate in rates.items()},
+            **{
+                f'age of {topic} [s]': f'{now - last:.1f}'
+                for topic, last in self._heard_at.items()
+            },
+            **{f'not used {cause}': count for cause, count in account.unused.items()},
             **{f'dropped {cause}': count for cause, count in account.dropped.items()},
             **{f'note {cause}': count for cause, count in account.notes.items()},
         }
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        message = DiagnosticArray(status=[status])
+        name = f'{self.get_name()}: calibration'
+        message = DiagnosticArray(
+            status=[outgoing.status(name, self._serial, level, words, values)]
+        )
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
 
@@ -311,12 +504,12 @@ class CalibrationNode(Node):
 
     def _answering(self, callback: Callable[[Any], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
-            response.success, response.message = self.answer(lambda: callback(request))
+            response.success, response.message = self._answer(lambda: callback(request))
             return response
 
         return answer
 
-    def answer(self, work: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
+    def _answer(self, work: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
         """Run the work of a service; an error is its answer."""
         try:
             success, text = work()
@@ -328,77 +521,17 @@ class CalibrationNode(Node):
         return bool(success), str(text)
 
 
-class DeferredTrigger:
-    """A Trigger service whose work runs on a thread of its own.
+def _names(values: Sequence[str] | None) -> tuple[str, ...]:
+    return tuple(name for name in values or () if name)
 
-    Jazzy's executors send the answer through the service's `send_response` right after the
-    callback, on the same thread. It is replaced here by one that holds the answer of an accepted
-    call back until its work has ended; an async callback would do, but the events executor takes
-    none. A call that comes meanwhile is refused at once.
 
-    Parameters
-    ----------
-    node : CalibrationNode
-    name : str
-    prepare : callable
-        Runs on the executor's thread; returns the snapshot to work on.
-    work : callable
-        Takes the snapshot, returns success and message.
+def _message_type(name: str) -> Any:
+    package, _, kind = name.partition('/msg/')
+    return getattr(importlib.import_module(f'{package}.msg'), kind)
 
-    """
 
-    def __init__(
-        self,
-        node: CalibrationNode,
-        name: str,
-        prepare: Callable[[], Any],
-        work: Callable[[Any], tuple[bool, str]],
-    ) -> None:
-        self._node, self._prepare, self._work = node, prepare, work
-        self._thread: threading.Thread | None = None
-        self._running = threading.Event()
-        self._snapshot: list[Any] = []
-        self._service = node.create_service(Trigger, name, self._on_call)
-        self._send = self._service.send_response
-        self._service.send_response = self._send_unless_deferred
-
-    def join(self, timeout: float) -> bool:
-        """Wait for the work [s]; return whether it has ended."""
-        if self._thread is not None:
-            self._thread.join(timeout)
-        return self._thread is None or not self._thread.is_alive()
-
-    def _on_call(self, request: Any, response: Any) -> Any:
-        if self._running.is_set():
-            response.success = False
-            response.message = 'refused: an identification is running, wait for its answer'
-            return response
-
-        def prepare() -> tuple[bool, str]:
-            self._snapshot = [self._prepare()]
-            return True, ''
-
-        response.success, response.message = self._node.answer(prepare)
-        return response
-
-    def _send_unless_deferred(self, response: Any, header: Any) -> None:
-        if not self._snapshot:
-            self._send(response, header)
-            return
-        snapshot = self._snapshot.pop()
-        self._running.set()
-        self._thread = threading.Thread(
-            target=self._run, args=(snapshot, response, header), daemon=True
-        )
-        self._thread.start()
-
-    def _run(self, snapshot: Any, response: Any, header: Any) -> None:
-        response.success, response.message = self._node.answer(lambda: self._work(snapshot))
-        self._running.clear()  # before the answer: the caller may call again at once
-        try:
-            self._send(response, header)
-        except Exception:  # the node is gone meanwhile, and with it the one who asked
-            return
+def _moment() -> str:
+    return datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
 
 
 def _executor(kind: str) -> Executor:

@@ -146,7 +146,11 @@ class Problem:
         """Return what each set measures."""
         return tuple(
             identifiability.Kind(
-                bool(each.oriented.any()), each.distances is not None, each.base, each.tool
+                bool(each.oriented.any()),
+                each.distances is not None,
+                each.velocity is not None,
+                each.base,
+                each.tool,
             )
             for each in self.sets
         )
@@ -158,6 +162,11 @@ class Problem:
         known = dict(chain.frames)
         added = {n for each in self.sets for n in (each.base, each.tool)} - set(chain.frame_names)
         chain = replace(chain, frames=tuple((known | dict.fromkeys(sorted(added))).items()))
+        for each in self.sets:
+            device = chain.frame(each.base)
+            if each.velocity is not None and device.delay is None:
+                start = 0.0 if each.delay is None else float(np.median(each.delay))
+                chain = chain.with_frame(each.base, replace(device, delay=start))
         wanted = [each for name in self.effects for each in effects.resolve(chain, name)]
         return chain.with_effects(wanted)
 

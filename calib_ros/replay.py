@@ -15,35 +15,30 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from calib_ros.config import Settings
 from calib_ros.errors import InputError
-from calib_ros.messages import JOINT_STATE, POSE_DECODERS
+from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
+from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
-VALIDATION = 'validation_'
-"""Topics whose last name starts so hold poses that judge the result and are never fitted."""
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
+STAND_NS = 400_000_000
+"""Time for which the arm stands at each row of a table that is made into a bag."""
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Topics of a bag to replay, and their message types."""
+    """Topics of a bag to replay: their message types, and the sources of measurements."""
 
-    joint_states: str
-    poses: Mapping[str, str]
-
-    @property
-    def all(self) -> dict[str, str]:
-        """Return every topic to read, with its type."""
-        return {self.joint_states: JOINT_STATE, **self.poses}
+    types: Mapping[str, str]
+    sources: Mapping[str, Source]
 
     @classmethod
-    def choose(
-        cls, available: Mapping[str, str], joint_topic: str | None, pose_topic: str | None
-    ) -> Topics:
+    def choose(cls, available: Mapping[str, str], settings: Settings) -> Topics:
         """Choose topics by type from those available (topic to type), unless they are named.
 
         Raises
@@ -52,51 +47,56 @@ class Topics:
             When there is none or more than one; it lists the candidates.
 
         """
-        poses = {topic: kind for topic, kind in available.items() if kind in POSE_DECODERS}
-        judging = {
-            topic: kind
-            for topic, kind in poses.items()
-            if topic.rpartition('/')[2].startswith(VALIDATION)
-        }
-        measured = [topic for topic in poses if topic not in judging]
+        named = settings.joint_topics
         joints = [topic for topic, kind in available.items() if kind == JOINT_STATE]
-        chosen = _choose('pose', pose_topic, measured, sorted(POSE_DECODERS), available)
-        return cls(
-            _choose('joint', joint_topic, joints, [JOINT_STATE], available),
-            {chosen: available[chosen], **judging},
+        if named:
+            for topic in named:
+                if topic not in joints:
+                    raise _no_topic(f'"{topic}"', (JOINT_STATE,), available)
+            joints = list(named)
+        elif not joints:
+            raise _no_topic('joint topic', (JOINT_STATE,), available)
+        sources = parse_sources(settings.sources)
+        if not sources:
+            sources = _found(available)
+        for source in sources:
+            kind = available.get(source.topic, '')
+            if kind not in DECODERS or source.type not in ('', kind):
+                expected = (source.type,) if source.type else tuple(DECODERS)
+                raise _no_topic(f'"{source.topic}"', expected, available)
+        if all(source.validation for source in sources):
+            raise _no_topic('pose topic', tuple(DECODERS), available)
+        chosen = {source.topic: source for source in sources}
+        return cls({topic: available[topic] for topic in (*joints, *chosen)}, chosen)
+
+
+def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
+    """Return the sources of a bag by their types; one at most is fitted."""
+    sources = [
+        parse_source(f'{topic} type={kind}')
+        for topic, kind in available.items()
+        if kind in DECODERS
+    ]
+    fitted = sorted(source.topic for source in sources if not source.validation)
+    if len(fitted) > 1:
+        raise InputError(
+            'the bag has several pose topics, choose one or more with --sources: '
+            f'{", ".join(fitted)}; it holds {_contents(available)}'
         )
+    return tuple(sources)
 
 
-def _choose(
-    what: str,
-    named: str | None,
-    candidates: Sequence[str],
-    types: Sequence[str],
-    available: Mapping[str, str],
-) -> str:
-    if named is not None and named in available and available[named] in types:
-        return named
-    if named is None and len(candidates) == 1:
-        return candidates[0]
-    contents = ', '.join(f'{t} ({kind})' for t, kind in sorted(available.items())) or 'nothing'
-    if named is not None:
-        problem = f'has no topic "{named}" of type {" or ".join(types)}'
-    elif candidates:
-        problem = (
-            f'has several {what} topics, choose one with --{what}-topic: '
-            f'{", ".join(sorted(candidates))}'
-        )
-    else:
-        problem = f'has no {what} topic (of type {" or ".join(types)})'
-    raise InputError(f'the bag {problem}; it holds {contents}')
+def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
+    return InputError(
+        f'the bag has no {what} of type {" or ".join(types)}; it holds {_contents(available)}'
+    )
 
 
-def replay(
-    path: Path,
-    session: CalibrationSession,
-    joint_topic: str | None = None,
-    pose_topic: str | None = None,
-) -> tuple[str, ...]:
+def _contents(available: Mapping[str, str]) -> str:
+    return ', '.join(f'{t} ({kind})' for t, kind in sorted(available.items())) or 'nothing'
+
+
+def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
     """Feed a bag to a session; return warnings about what could not be read.
 
     Parameters
@@ -104,9 +104,7 @@ def replay(
     path : Path
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
-        Takes the messages.
-    joint_topic, pose_topic : str, optional
-        Needed only where the types leave a choice.
+        Takes the messages; its settings name topics where the types leave a choice.
 
     """
     if not path.exists():
@@ -118,7 +116,7 @@ def replay(
         found = salvage(path)
         if found is None:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
-        topics = Topics.choose(found.topics, joint_topic, pose_topic)
+        topics = Topics.choose(found.topics, session.settings)
         count, problem = _feed(session, topics, iter(found.messages))
         total = recorded(path if path.is_dir() else path.parent)
         lost = 'how many are lost is not known'
@@ -130,8 +128,8 @@ def replay(
         )
     with closing(reader):
         available = {c.topic: c.msgtype for c in reader.connections}
-        topics = Topics.choose(available, joint_topic, pose_topic)
-        connections = [c for c in reader.connections if c.topic in topics.all]
+        topics = Topics.choose(available, session.settings)
+        connections = [c for c in reader.connections if c.topic in topics.types]
         expected = sum(c.msgcount for c in connections)
         raw = ((c.topic, data) for c, _, data in reader.messages(connections))
         count, problem = _feed(session, topics, raw)
@@ -153,19 +151,21 @@ def _feed(
         try:
             topic, data = next(raw)
         except StopIteration:
+            session.finish()
             return count, problem
         except Exception as err:  # see `replay`
+            session.finish()
             return count, str(err) or type(err).__name__
-        kind = topics.all.get(topic)
+        kind = topics.types.get(topic)
         try:
             message = None if kind is None else _TYPESTORE.deserialize_cdr(data, kind)
         except Exception as err:
             problem = f'a message on {topic} cannot be decoded: {err!r}'
             continue
-        if topic == topics.joint_states:
+        if kind == JOINT_STATE:
             session.take_joints(message)
         elif kind is not None:
-            session.take_pose(kind, message, topic.rpartition('/')[2].startswith(VALIDATION))
+            session.take(topics.sources[topic], kind, message)
         count += kind is not None
 
 
@@ -185,15 +185,16 @@ class Recording:
         joint_names: tuple[str, ...],
         observations: Observations,
         held_out: NDArray[np.bool_],
-        half_dwell_ns: int = 10_000_000,
     ) -> Recording:
-        """Turn a table into a recording: the arm stands around the stamp of every pose."""
-        stamps = observations.stamps_ns
+        """Turn a table into a recording: the arm stands for a while at every row."""
+        count = len(observations)
+        begin = (1 + np.arange(count)[:, np.newaxis]) * 1_000_000_000
+        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 10)
         return cls(
             joint_names,
-            np.stack([stamps - half_dwell_ns, stamps + half_dwell_ns], axis=1).ravel(),
-            np.repeat(observations.joints, 2, axis=0),
-            observations,
+            stamps.ravel(),
+            np.repeat(observations.joints, stamps.shape[1], axis=0),
+            observations.at(begin.ravel() + STAND_NS * 3 // 4),
             held_out,
         )
 

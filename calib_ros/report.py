@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime, timezone
 from typing import Any
@@ -13,11 +14,14 @@ import numpy as np
 
 import calib_ros
 from calib_ros import effects
-from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain
-from calib_ros.config import dump_chain
+from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.config import Settings, dump_chain, dump_yaml
 from calib_ros.identification import Identification
+from calib_ros.session import Calibration
 from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
 
+HOLDS = 1.5
+"""A calibration whose error on new samples has grown by more does not hold."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
 
@@ -69,10 +73,40 @@ def provenance(result: Identification) -> dict[str, Any]:
     }
 
 
-def calibration_yaml(result: Identification) -> str:
-    """Return the corrected chain as the text of a chain file, which can be an input again."""
+def calibration_yaml(result: Identification, origin: Mapping[str, Any] | None = None) -> str:
+    """Return the corrected chain as the text of a chain file, which can be an input again.
+
+    `origin` says where the samples come from.
+    """
     head = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
-    return head + dump_chain(result.chain, provenance(result))
+    return head + dump_chain(result.chain, provenance(result) | dict(origin or {}))
+
+
+def configuration_yaml(chain: str, settings: Settings) -> str:
+    """Return the configuration as a parameter file, with which a node does the same again."""
+    parameters: dict[str, Any] = {'chain': chain}
+    for name, value in asdict(settings).items():
+        parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
+    return dump_yaml({'/**': {'ros__parameters': parameters}})
+
+
+def verdict(
+    calibration: Calibration | None, now: ErrorFigures, nominal: ErrorFigures | None
+) -> tuple[bool, str]:
+    """Return whether a calibration still holds on new samples, and why in words."""
+    text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
+    text += f'{now.count} samples taken since'
+    if nominal is not None:
+        text += f'; the nominal chain has {nominal.rms_mm:.3f} mm'
+    judged = None if calibration is None else calibration.rms_mm
+    if judged is None:
+        return True, text
+    if now.rms_mm > HOLDS * judged:
+        return False, (
+            f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '
+            'tracker, the target or the robot moved?'
+        )
+    return True, f'the calibration holds: {text}; it had {judged:.3f} mm'
 
 
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
@@ -138,6 +172,8 @@ BEFORE = 'the nominal chain with its base and tool frames fitted to the same pai
 def unit(name: str) -> str:
     """Return the unit of a parameter."""
     kind = name.partition('.')[2]
+    if kind == DELAY:
+        return 's'
     if kind in DH_KINDS or kind in FRAME_KINDS:
         return 'm' if is_length(name) else 'rad'
     return effects.unit(name)

@@ -5,34 +5,45 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from calib_ros import messages
 from calib_ros.chain import Chain
+from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
+from calib_ros.delays import Delay
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
-from calib_ros.observations import Pairing
+from calib_ros.live import LiveEstimate, barely_moved
+from calib_ros.observations import configurations
 from calib_ros.problem import Problem
+from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
+from calib_ros.sources import Source
+from calib_ros.validation import ErrorFigures, compare
 
-MOST_FRAMES = 10
-"""Frames of measurements that are told apart."""
+LOOK_AGAIN_NS = 2_000_000_000
+"""Time between two looks for the delay."""
+MOST_NAMES = 50
+"""Frames of measurements, and sets of joint names, that are told apart."""
 
 
 @dataclass(frozen=True)
 class Account:
-    """What became of the messages: how many came, how many pairs they made, what was dropped."""
+    """What became of the messages: how many came, how many samples, what was dropped and why."""
 
     joint_states: int
     poses: int
-    pairs: int
+    waiting: int
+    samples: int
     held_out: int
     configurations: int
+    unused: dict[str, int]
     dropped: dict[str, int]
     notes: dict[str, int]
     foreign_names: tuple[str, ...]
@@ -43,11 +54,18 @@ class Account:
 
     def __str__(self) -> str:
         """Return the account in words."""
-        text = f'{self.joint_states} joint states and {self.poses} poses gave {self.pairs} pairs'
+        text = f'{self.joint_states} joint states and {self.poses} poses gave {self.samples} '
+        text += 'samples'
         if self.held_out:
             text += f' to fit and {self.held_out} held out'
         text += f' in {self.configurations} configurations'
-        for label, counts in (('dropped', self.dropped), ('note', self.notes)):
+        if self.waiting:
+            text += f', {self.waiting} poses wait'
+        for label, counts in (
+            ('not used', self.unused),
+            ('dropped', self.dropped),
+            ('note', self.notes),
+        ):
             if counts:
                 parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
                 text += f'; {label}: {parts}'
@@ -59,20 +77,43 @@ class Account:
         return text
 
 
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A corrected chain in use.
+
+    `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
+    the error that it was judged to have, and `taken` counts the samples there were.
+    """
+
+    chain: Chain
+    before: Chain | None
+    world_frame: str
+    rms_mm: float | None
+    taken: int
+
+
 class CalibrationSession:
-    """Takes messages, keeps the matched pairs, identifies, and keeps the last good result.
+    """Takes messages, keeps the samples, identifies, and keeps the last good result.
 
     Parameters
     ----------
     chain : Chain
         The nominal chain.
     settings : Settings
+    on_sample : callable, optional
+        Called with every sample as soon as it is taken.
 
     """
 
-    def __init__(self, chain: Chain, settings: Settings | None = None) -> None:
+    def __init__(
+        self,
+        chain: Chain,
+        settings: Settings | None = None,
+        on_sample: Callable[[Sample], None] | None = None,
+    ) -> None:
         self.chain = chain
         self.settings = settings or Settings()
+        self.on_sample = on_sample or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
         count = len(chain.joints)
         if len(self.joint_names) != count or len(set(self.joint_names)) != count:
@@ -81,106 +122,214 @@ class CalibrationSession:
                 f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
             )
         self.recording = True
-        self.calibration: Identification | None = None
-        """The last result that was accepted."""
+        self.calibration: Calibration | None = None
+        """The last one that was accepted or loaded."""
         self.clear()
 
     def clear(self) -> None:
         """Forget all samples and counts; the last good calibration stays."""
-        self._pairing = Pairing(
-            [joint.type == 'revolute' for joint in self.chain.joints],
-            max_gap=self.settings.max_gap,
-            joint_capacity=self.settings.joint_buffer,
-            pose_capacity=self.settings.pose_buffer,
+        self._collector = Collector(
+            [joint.type == 'revolute' for joint in self.chain.joints], self.settings
         )
+        continuous = self.settings.mode == 'continuous'
+        self._collector.holding = continuous and self.settings.delay == 0.0
+        self.samples: list[Sample] = []
         self.received: Counter[str] = Counter()
         """Messages that came so far, by stream."""
+        self.delay: Delay | None = None
+        """How late the measurements are stamped, as far as the motion shows."""
         self._dropped: Counter[str] = Counter()
+        self._unused: Counter[str] = Counter()
         self._notes: Counter[str] = Counter()
         self._newest = {'joints': 0, 'poses': 0}
-        self._frame_ids: list[str] = []
-        self._names: list[str] | None = None
+        self._looked_ns = 0
+        self._frame_ids: dict[str, list[str]] = {}
+        self._layouts: dict[tuple[str, ...], tuple[tuple[int, ...], list[int]] | None] = {}
         self._foreign_names: list[str] = []
-        self._index: list[int] = []
+        self._live = LiveEstimate(self._problem_of)
+        if self.calibration is not None:
+            self.calibration = replace(self.calibration, taken=0)
+
+    def change(self, settings: Settings) -> None:
+        """Go on with other settings; the buffers and samples stay."""
+        self.settings = settings
+        self._collector.settings = settings
+        self._live.restart()
+
+    # Messages
 
     def take_joints(self, message: Any) -> FloatArray | None:
-        """Take a JointState; return its values (n,) in the order of the chain if it is usable."""
+        """Take a JointState; return its values (n,) in the order of the chain if it has all."""
         self.received['joints'] += 1
         try:
             reading = messages.joint_state(message)
-            values = self._ordered(reading)
+            columns, index = self._layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
             return None
-        if self.recording:
-            self._watch_order('joints', reading.stamp_ns)
-            self._pairing.add_joints(reading.stamp_ns, values)
+        values = reading.values[index]
+        if not np.isfinite(values).all():
+            self._dropped['joints: NaN or infinite joint value'] += 1
+            return None
+        if not self.recording:
+            self._unused['joints: not recording'] += 1
         else:
-            self._dropped['joints: not recording'] += 1
-        return values
+            self._watch_order('joints', reading.stamp_ns)
+            self._look_for_delay(reading.stamp_ns)
+            self._collector.add_joints(columns, reading.stamp_ns, values)
+            self._take()
+        return values if len(columns) == len(self.chain.joints) else None
 
-    def take_pose(self, msgtype: str, message: Any, held_out: bool = False) -> None:
-        """Take a measurement of the type named; a held-out one judges and is never fitted."""
+    def take(self, source: Source, msgtype: str, message: Any) -> None:
+        """Take a measurement of the message type named."""
         self.received['poses'] += 1
         if not self.recording:
-            self._dropped['poses: not recording'] += 1
+            self._unused['poses: not recording'] += 1
             return
         try:
-            reading = messages.POSE_DECODERS[msgtype](message)
+            reading = messages.DECODERS[msgtype](message)
+            self._check_frame(source.device, reading.frame_id)
         except messages.MessageError as err:
             self._dropped[f'poses: {err}'] += 1
             return
         self._watch_order('poses', reading.stamp_ns)
-        if reading.frame_id not in self._frame_ids and len(self._frame_ids) < MOST_FRAMES:
-            self._frame_ids.append(reading.frame_id)
-        self._pairing.add_pose(
-            reading.stamp_ns, reading.position, reading.quat_xyzw, reading.covariance, held_out
+        key = StreamKey(
+            source.device,
+            source.target or reading.child,
+            source.validation,
+            reading.distance is not None,
+            source.eye_in_hand,
         )
+        self._collector.add(key, reading)
 
-    def account(self) -> Account:
-        """Return what became of the messages so far."""
-        pairs, held_out, configurations, dropped = self._pairing.tally()
-        notes = self._notes.copy()
-        notes['joint samples let go after use, the joint buffer was full'] = self._pairing.let_go
-        return Account(
-            self.received['joints'],
-            self.received['poses'],
-            pairs,
-            held_out,
-            configurations,
-            dict(sorted((self._dropped + dropped).items())),
-            dict(sorted((+notes).items())),
-            tuple(self._foreign_names),
-        )
+    def finish(self) -> None:
+        """Make samples of everything that still waits; nothing more will come."""
+        self._look_for_delay(None)
+        self._collector.finish()
+        self._take()
 
-    def problem(self) -> Problem:
-        """Return a snapshot of the pairs as a problem; later messages do not change it.
+    # Samples
+
+    def capture(self) -> tuple[int, str]:
+        """Take one sample of each source now; return how many, and why none if so."""
+        found = self._collector.capture()
+        self._take()
+        return found
+
+    def remove_last(self) -> Sample:
+        """Take back the last sample.
 
         Raises
         ------
         InputError
-            Without any pair, or when poses came in different frames.
+            When there is none.
 
         """
-        if len(self._frame_ids) > 1:
-            raise InputError(
-                f'poses came in different frames ({", ".join(sorted(self._frame_ids))}), one is '
-                'needed: remap or record only the measuring device to use, then clear and '
-                'measure again'
-            )
-        fitted, held_out, _ = self._pairing.match()
-        if not len(fitted):
-            raise InputError(f'no matched pairs: {self.account()}')
+        if not self.samples:
+            raise InputError('there is no sample to remove')
+        sample = self.samples.pop()
+        self._collector.forget(sample)
+        self._live.restart()
+        return sample
+
+    def restore(self, samples: Sequence[Sample]) -> None:
+        """Go on with samples taken before."""
+        for sample in samples:
+            if sample.joints.shape != (len(self.chain.joints),):
+                raise InputError(
+                    f'samples to go on with have {len(sample.joints)} joint values, chain '
+                    f'"{self.chain.name}" has {len(self.chain.joints)} joints'
+                )
+        self.samples = [*samples, *self.samples]
+        self._live.restart()
+
+    @property
+    def state(self) -> str:
+        """Return in words what the arm does, as far as samples are concerned."""
+        return self._collector.state()
+
+    def account(self) -> Account:
+        """Return what became of the messages so far."""
+        fitted = [sample.joints for sample in self.samples if not sample.validation]
+        distinct = len(fitted)
+        if self.settings.mode != 'continuous' and fitted:
+            distinct = len(np.unique(configurations(np.array(fitted))))
+        collector = self._collector
+        dropped = self._dropped + collector.dropped
+        return Account(
+            self.received['joints'],
+            self.received['poses'],
+            collector.waiting,
+            len(fitted),
+            len(self.samples) - len(fitted),
+            distinct,
+            dict(sorted((self._unused + collector.unused).items())),
+            dict(sorted(dropped.items())),
+            dict(sorted((self._notes + collector.notes).items())),
+            tuple(self._foreign_names),
+        )
+
+    def status(self) -> str:
+        """Return in words how far the samples have come."""
+        fitted = [sample for sample in self.samples if not sample.validation]
+        words = [f'{len(fitted)} samples']
+        estimate = self._live.update(self.samples)
+        wanted = self.settings.wanted_accuracy
+        if estimate is not None:
+            more = estimate.more_for(wanted)
+            words.append(f'{1e3 * estimate.sigma:.3f} mm expected')
+            if more:
+                words.append(f'{more} more expected for {1e3 * wanted:g} mm')
+            else:
+                words.append('enough for the accuracy wanted')
+        for sample in self._live.suspicious[-1:]:
+            number = self.samples.index(sample) + 1
+            words.append(f'sample {number} does not fit to the others, was the target moved?')
+        if fitted:
+            still = barely_moved(self.chain, np.array([sample.joints for sample in fitted]))
+            if still:
+                words.append(f'hardly moved so far: {", ".join(still)}')
+        return f'{", ".join(words)}; {self.state}'
+
+    # Identification
+
+    def problem(self) -> Problem:
+        """Return a snapshot of the samples as a problem; later messages do not change it.
+
+        Raises
+        ------
+        InputError
+            Without any sample, or when measurements came in different frames.
+
+        """
+        self._look_for_delay(None)
+        self._collector.flush()
+        self._take()
+        for frame_ids in self._frame_ids.values():
+            if len(frame_ids) > 1:
+                raise InputError(
+                    f'poses came in different frames ({", ".join(sorted(frame_ids))}), one is '
+                    'needed: set frame_id (--frame-id) to the one to use, or give each source a '
+                    'device of its own; then clear and measure again'
+                )
+        return self._problem_of(self.samples)
+
+    def _problem_of(self, samples: Sequence[Sample]) -> Problem:
+        settings = self.settings
+        fitted, held_out = collect(samples, (settings.sigma_position, settings.sigma_orientation))
+        if not fitted:
+            raise InputError(f'no samples to fit: {self.account()}')
         return Problem(
             self.chain,
-            fitted,
+            fitted[0],
             held_out,
-            world_frame=self._frame_ids[0],
-            **self.settings.for_problem(),
+            more=fitted[1:],
+            world_frame=next((ids[0] for ids in self._frame_ids.values()), ''),
+            **settings.for_problem(),
         )
 
     def identify(self) -> Identification:
-        """Identify on the pairs so far and keep the result if it is accepted."""
+        """Identify on the samples so far and keep the result if it is accepted."""
         problem = self.problem()
         try:
             result = identify_model(problem, self.settings.model)
@@ -192,25 +341,117 @@ class CalibrationSession:
     def adopt(self, result: Identification) -> None:
         """Keep a result as the calibration if it is accepted, else the last good one stays."""
         if result.accepted:
-            self.calibration = result
+            after = (result.validation or result.fitted).figures[1]
+            self.calibration = Calibration(
+                result.chain, result.before, result.world_frame, after.rms_mm, len(self.samples)
+            )
 
-    def _ordered(self, reading: messages.JointReading) -> FloatArray:
-        """Return the joint values in the order of the chain."""
-        if reading.names != self._names:
-            index = []
-            for name in self.joint_names:
-                if name not in reading.names:
-                    self._foreign_names = list(reading.names)
-                    raise messages.MessageError(f'joint "{name}" not in the message')
-                index.append(reading.names.index(name))
-            self._names, self._index = list(reading.names), index
-        values = reading.values[self._index]
-        if not np.isfinite(values).all():
-            raise messages.MessageError('NaN or infinite joint value')
-        return values
+    def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:
+        """Take a calibration from a file as the present one.
+
+        Raises
+        ------
+        InputError
+            When it is that of another robot.
+
+        """
+        if chain.joint_names != self.chain.joint_names:
+            raise InputError(
+                f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
+                f'{", ".join(self.chain.joint_names)}'
+            )
+        self.calibration = Calibration(chain, None, world_frame, rms_mm, len(self.samples))
+
+    def validate(self) -> tuple[ErrorFigures, ErrorFigures | None]:
+        """Judge the calibration on the samples taken since; nothing is fitted.
+
+        Returns
+        -------
+        now : ErrorFigures
+            Of the calibration.
+        nominal : ErrorFigures or None
+            Of the nominal chain with fitted frames, where the calibration was identified here.
+
+        Raises
+        ------
+        InputError
+            Without a calibration, or without samples since.
+
+        """
+        if self.calibration is None:
+            raise InputError('there is no calibration to judge: identify or load one first')
+        self._collector.flush()
+        self._take()
+        frames = Frames()
+        for sample in self.samples:
+            frames.of(sample)
+        sigmas = (self.settings.sigma_position, self.settings.sigma_orientation)
+        since = self.samples[self.calibration.taken :]
+        sets = [each for part in collect(since, sigmas, frames) for each in part]
+        if not sets:
+            raise InputError('no samples have been taken since: measure some new poses first')
+        known = self.calibration.chain.frame_names
+        for each in sets:
+            if each.base not in known or each.tool not in known:
+                raise InputError(
+                    'the samples since were measured by a device or on a target that the '
+                    'calibration does not know'
+                )
+        before, after = self.calibration.before, self.calibration.chain
+        figures = compare(before or after, after, sets).figures
+        return figures[1], figures[0] if before is not None else None
+
+    # Details
+
+    def _take(self) -> None:
+        """Keep the samples that the collector has made."""
+        for sample in self._collector.take():
+            self.samples.append(sample)
+            self.on_sample(sample)
+
+    def _layout(self, names: Sequence[str]) -> tuple[tuple[int, ...], list[int]]:
+        """Return which joints of the chain a message names, and where in the message."""
+        key = tuple(names)
+        if key not in self._layouts:
+            if len(self._layouts) == MOST_NAMES:
+                self._layouts.clear()
+            known = [(k, key.index(n)) for k, n in enumerate(self.joint_names) if n in key]
+            self._layouts[key] = (
+                (tuple(k for k, _ in known), [i for _, i in known]) if known else None
+            )
+            named = {name for names in self._layouts for name in names}
+            missing = [name for name in self.joint_names if name not in named]
+            self._foreign_names = sorted(named) if missing else []
+        layout = self._layouts[key]
+        if layout is None:
+            raise messages.MessageError('none of the joints in the message')
+        return layout
+
+    def _check_frame(self, device: str, frame_id: str) -> None:
+        if self.settings.frame_id and frame_id != self.settings.frame_id:
+            raise messages.MessageError(
+                f'in frame "{frame_id}", not in frame_id "{self.settings.frame_id}"'
+            )
+        known = self._frame_ids.setdefault(device, [])
+        if frame_id not in known and len(known) < MOST_NAMES:
+            known.append(frame_id)
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
-        """Note stamps that go backwards; pairing goes by stamps, so nothing is lost by it."""
+        """Note stamps that go backwards; samples go by stamps, so nothing is lost by it."""
         if stamp_ns < self._newest[stream]:
             self._notes[f'{stream} with a stamp older than the one before'] += 1
         self._newest[stream] = max(stamp_ns, self._newest[stream])
+
+    def _look_for_delay(self, now_ns: int | None) -> None:
+        """Look for the delay of the measurements after some time of motion, until it shows.
+
+        Nothing is sampled before; at the end (None) what has come must do.
+        """
+        collector = self._collector
+        if not collector.holding:
+            return
+        if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
+            return
+        self._looked_ns = now_ns or 0
+        self.delay = collector.find_delay(self.chain)
+        collector.holding = self.delay is None and now_ns is not None

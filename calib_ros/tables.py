@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of measured configurations (CSV), described in docs/formats.md.
+"""Tables of samples (CSV), described in docs/formats.md: measured elsewhere, or a journal.
 
-Joint values are in q1 ... qn; s1 ... sn, if present, hold the signs of the joints' last moves.
-What was measured shows in the other columns: a pose (x y z and qx qy qz qw), a position (x y z), a
-distance to a fixed point (distance), or that a ball sat in a socket (location, socket), whose
-place is not known.
+Joint values are in q1 ... qn. What was measured shows in the cells of the row that are filled: a
+pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), or that
+a ball sat in a socket (location, socket), whose place is not known. Rows of all kinds may stand in
+one table.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -23,28 +23,36 @@ from calib_ros import se3
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.observations import Observations
+from calib_ros.samples import Frames, Sample, collect
+from calib_ros.se3 import FloatArray
 
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
-Rows: TypeAlias = list[tuple[int, dict[str, str]]]
+UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
+SPLITS = ('', 'train', 'test', 'removed')
+Row: TypeAlias = Mapping[str, str | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Sets of observations to fit, each with frames of its own, and of those held out.
+    """Samples, and the sets to fit and held out that they make, each with frames of its own.
 
     `pairs` names the frames of the two sockets of each location.
     """
 
+    samples: tuple[Sample, ...]
     fitted: tuple[Observations, ...]
     held_out: tuple[Observations, ...]
     pairs: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def read_table(
     path: Path,
     joints: int,
     sessions: Sequence[str] = (),
-    eye_in_hand: tuple[float, float] | None = None,
+    sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
+    eye_in_hand: bool = False,
 ) -> Table:
     """Read a CSV.
 
@@ -56,9 +64,10 @@ def read_table(
         Number of joints.
     sessions : sequence of str
         Sessions to read; each but the first gets a base and a tool frame of its own.
-    eye_in_hand : (float, float), optional
-        The poses are those of a fixed target in a camera on the flange, measured with these
-        sigmas [m, rad].
+    sigmas : (float, float)
+        Standard deviations [m, rad] of poses seen by a camera on the flange.
+    eye_in_hand : bool
+        All poses are those of a fixed target in a camera on the flange.
 
     Raises
     ------
@@ -67,101 +76,220 @@ def read_table(
         message names the line.
 
     """
-    header, rows = _read(path)
-    columns = _columns(path, joints, header)
-    fitted: list[Observations] = []
-    held_out: list[Observations] = []
-    pairs = []
-    for number, (session, part) in enumerate(_by_session(path, header, rows, sessions)):
-        suffix = '' if number == 0 else f'_{_plain(session)}'
-        for line, row in part:
-            if (row.get('split') or '') not in ('', 'train', 'test'):
-                raise InputError(
-                    f'{path}, line {line}: split must be train or test, not {row["split"]!r}'
-                )
-        if 'socket' in columns:
-            places = _by(part, ('location', 'socket'))
-            names = {place: f'base{suffix}_{_plain("_".join(place))}' for place in places}
-            locations = dict.fromkeys(location for location, _ in places)
-            for location in locations:
-                ends = [names[place] for place in places if place[0] == location]
-                if len(ends) == 2:
-                    pairs.append((ends[0], ends[1]))
-            groups = [(names[place], f'tool{suffix}', each) for place, each in places.items()]
+    header, rows, warnings = _read(path, columns(joints))
+    reader = _Reader(path, joints, header)
+    chosen = _of_sessions(path, header, rows, sessions)
+    samples: dict[tuple[int, str, str, str], Sample] = {}
+    for line, row in chosen:
+        sample = reader.sample(line, row)
+        key = (sample.stamp_ns, sample.session, sample.device, sample.target)
+        if row.get('split') == 'removed':
+            samples.pop(key, None)
+        elif key in samples:
+            raise InputError(f'{path}, line {line}: stamp_ns {sample.stamp_ns} is there already')
         else:
-            targets = _by(part, ('target',)) if 'target' in header else {('',): part}
-            ends = [f'_{_plain(name)}' if k else '' for k, (name,) in enumerate(targets)]
-            groups = [
-                (f'base{suffix}{end}', f'tool{suffix}', each)
-                if eye_in_hand
-                else (f'base{suffix}', f'tool{suffix}{end}', each)
-                for end, each in zip(ends, targets.values(), strict=True)
-            ]
-        for base, tool, each in groups:
-            observations = _observations(path, joints, each, columns)
-            if f's{joints}' in header:
-                signs = [f's{k + 1}' for k in range(joints)]
-                approach = np.array([_numbers(path, line, row, signs) for line, row in each])
-                observations = replace(observations, approach=np.sign(approach))
-            if eye_in_hand:
-                observations = observations.inverted(eye_in_hand)
-            observations = replace(observations, base=base, tool=tool)
-            test = np.array([row.get('split') == 'test' for _, row in each])
-            if not test.all():
-                fitted.append(observations.select(~test))
-            if test.any():
-                held_out.append(observations.select(test))
-        if not any(len(each) for each in fitted):
-            raise InputError(f'{path} has no rows to fit, only such that are marked test')
-    return Table(tuple(fitted), tuple(held_out), tuple(pairs))
+            samples[key] = sample
+    found = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples.values()]
+    if not any(not sample.validation for sample in found):
+        raise InputError(f'{path} has no rows to fit, only such that are marked test')
+    fitted, kept_out = collect(found, sigmas)
+    return Table(tuple(found), fitted, kept_out, reader.pairs(found), warnings)
 
 
-def _plain(name: str) -> str:
-    """Return a name as part of a frame's, which holds no dots."""
-    return name.replace('.', '-')
+def columns(joints: int) -> list[str]:
+    """Return the columns of a table that can hold every kind of sample."""
+    numbers = range(1, joints + 1)
+    names = ['stamp_ns']
+    names += [f'{letter}{k}' for letter in 'qsva' for k in numbers]
+    names += [*POSITION, *QUATERNION, 'distance', *COVARIANCE]
+    return [
+        *names,
+        'device',
+        'target',
+        'eye_in_hand',
+        'delay',
+        'count',
+        'spread',
+        'session',
+        'split',
+    ]
 
 
-def _read(path: Path) -> tuple[Sequence[str], Rows]:
+def cells(sample: Sample, split: str | None = None) -> list[str]:
+    """Return the cells of a sample in the order of `columns`; numbers are exact."""
+
+    def numbers(values: FloatArray | None, count: int) -> list[str]:
+        return [''] * count if values is None else [repr(float(value)) for value in values]
+
+    joints = len(sample.joints)
+    row = [str(sample.stamp_ns)]
+    for values in (sample.joints, sample.approach, sample.velocity, sample.acceleration):
+        row += numbers(values, joints)
+    row += numbers(sample.position, 3)
+    row += numbers(None if sample.rotation is None else se3.to_quat(sample.rotation), 4)
+    row.append('' if sample.distance is None else repr(sample.distance))
+    covariance = sample.covariance
+    row += numbers(None if covariance is None else covariance[tuple(np.transpose(UPPER))], 21)
+    row += [sample.device, sample.target, '1' if sample.eye_in_hand else '']
+    row += [repr(sample.delay), str(sample.count), repr(sample.spread), sample.session]
+    return [*row, split or ('test' if sample.validation else 'train')]
+
+
+class _Reader:
+    """Turns rows into samples."""
+
+    def __init__(self, path: Path, joints: int, header: Sequence[str]) -> None:
+        self._path = path
+        self._header = set(header)
+        self._joints = joints
+        self._quaternion = bool(set(QUATERNION) & self._header)
+        self._places: dict[tuple[str, str, str], Sample] = {}
+        needed = [f'q{k + 1}' for k in range(joints)]
+        if not {'distance', 'socket'} & self._header or set(POSITION) & self._header:
+            needed += POSITION
+        if self._quaternion:
+            needed += QUATERNION
+        if 'socket' in self._header:
+            needed.append('location')
+        missing = [name for name in needed if name not in self._header]
+        if missing:
+            expected = ', '.join([*needed[:joints], *POSITION])
+            raise InputError(
+                f'{path} has no column {", ".join(missing)}; expected {expected} '
+                f'and, with orientation, {", ".join(QUATERNION)} as well (or '
+                f'distance, or location and socket); found {", ".join(header) or "nothing"}'
+            )
+
+    def sample(self, line: int, row: Row) -> Sample:
+        """Return the sample of a row."""
+        joints = self._optional(line, row, 'q')
+        if joints is None:
+            raise InputError(f'{self._path}, line {line}: q1 must be a number, not blank')
+        split = row.get('split') or ''
+        if split not in SPLITS:
+            raise InputError(
+                f'{self._path}, line {line}: split must be train or test, not {split!r}'
+            )
+        stamp_ns = line * 1_000_000_000
+        if row.get('stamp_ns'):
+            stamp_ns = self._integer(line, row, 'stamp_ns')
+        plain = Sample(
+            stamp_ns,
+            joints,
+            velocity=self._optional(line, row, 'v'),
+            acceleration=self._optional(line, row, 'a'),
+            session=row.get('session') or '',
+            device=row.get('device') or '',
+            target=row.get('target') or '',
+            eye_in_hand=row.get('eye_in_hand') in ('1', 'true'),
+            validation=split == 'test',
+            delay=self._number(line, row, 'delay') if row.get('delay') else 0.0,
+            count=self._integer(line, row, 'count') if row.get('count') else 1,
+            spread=self._number(line, row, 'spread') if row.get('spread') else 0.0,
+        )
+        signs = self._optional(line, row, 's')
+        if signs is not None:
+            plain = replace(plain, approach=np.sign(signs))
+        return self._measured(line, row, plain)
+
+    def _measured(self, line: int, row: Row, plain: Sample) -> Sample:
+        """Return the sample with what was measured."""
+        kinds = [name for name in ('x', 'distance', 'socket') if row.get(name)]
+        if len(kinds) > 1:
+            raise InputError(
+                f'{self._path}, line {line} has both {" and ".join(kinds)}: give each kind of '
+                'measurement a row of its own'
+            )
+        if kinds == ['distance']:
+            device = plain.device
+            if not device and 'x' in self._header:  # the origin of a tracker is another one
+                device = 'distance'
+            return replace(plain, distance=self._number(line, row, 'distance'), device=device)
+        if kinds == ['socket']:
+            place = f'{row["location"]}_{row["socket"]}'
+            sample = replace(plain, position=np.zeros(3), device=place)
+            key = (plain.session, str(row['location']), str(row['socket']))
+            self._places.setdefault(key, sample)
+            return sample
+        position = self._numbers(line, row, POSITION)
+        quat = None
+        if self._quaternion and any(row.get(name) for name in QUATERNION):
+            quat = self._numbers(line, row, QUATERNION)
+            length = float(np.linalg.norm(quat))
+            if abs(length - 1.0) > QUATERNION_TOLERANCE:
+                raise InputError(
+                    f'{self._path}, line {line}: quaternion qx qy qz qw has length '
+                    f'{length:.6g}, expected 1'
+                )
+        covariance = None
+        if row.get(COVARIANCE[0]):
+            covariance = np.zeros((6, 6))
+            covariance[tuple(np.transpose(UPPER))] = self._numbers(line, row, COVARIANCE)
+            covariance += np.triu(covariance, 1).T
+        rotation = None if quat is None else se3.from_quat(quat)
+        return replace(plain, position=position, rotation=rotation, covariance=covariance)
+
+    def pairs(self, samples: Sequence[Sample]) -> tuple[tuple[str, str], ...]:
+        """Return the names of the base frames of the two sockets of each location."""
+        frames = Frames()
+        names = {frames.of(sample)[0]: sample for sample in samples}
+        by_device = {(s.session, s.device): name for name, s in names.items()}
+        ends: dict[tuple[str, str], list[str]] = {}
+        for (session, location, _), sample in self._places.items():
+            name = by_device.get((session, sample.device))
+            if name is not None:
+                ends.setdefault((session, location), []).append(name)
+        return tuple((pair[0], pair[1]) for pair in ends.values() if len(pair) == 2)
+
+    def _optional(self, line: int, row: Row, letter: str) -> FloatArray | None:
+        """Return the values of all joints, None where their columns are missing or blank."""
+        names = [f'{letter}{k + 1}' for k in range(self._joints)]
+        if not any(row.get(name) for name in names):
+            return None
+        return self._numbers(line, row, names)
+
+    def _numbers(self, line: int, row: Row, names: Sequence[str]) -> FloatArray:
+        return np.array([self._number(line, row, name) for name in names])
+
+    def _number(self, line: int, row: Row, name: str) -> float:
+        text = row.get(name)
+        try:
+            number = float(text or 'blank')
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            found = 'the row ends before it' if text is None else f'not {text!r}'
+            raise InputError(f'{self._path}, line {line}: {name} must be a number, {found}')
+        return number
+
+    def _integer(self, line: int, row: Row, name: str) -> int:
+        text = row.get(name) or ''
+        if not text.lstrip('-').isdigit():
+            raise InputError(f'{self._path}, line {line}: {name} must be an integer, not {text!r}')
+        return int(text)
+
+
+def _read(
+    path: Path, journal: Sequence[str]
+) -> tuple[Sequence[str], list[tuple[int, Row]], tuple[str, ...]]:
+    """Return header, rows with their lines, and warnings; `journal` is the header of one."""
     try:
-        with path.open(newline='', encoding='utf-8-sig') as file:
-            reader = csv.DictReader(file)
-            rows = [(reader.line_num, row) for row in reader]
-            header = reader.fieldnames or []
+        text = path.read_text(encoding='utf-8-sig')
+        reader = csv.DictReader(text.splitlines(keepends=True), strict=True)
+        rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as err:
         raise InputError(f'cannot read {path}: {err}') from err
-    return header, rows
+    header = reader.fieldnames or []
+    if rows and header == journal and not text.endswith('\n'):
+        line, _ = rows.pop()
+        return header, rows, (f'{path}: line {line} was cut off and is left out',)
+    return header, rows, ()
 
 
-def _columns(path: Path, joints: int, header: Sequence[str]) -> list[str]:
-    """Return the columns to read: joint values, and what was measured."""
-    values = [f'q{k + 1}' for k in range(joints)]
-    measured = list(POSITION)
-    if not set(POSITION) & set(header):
-        if 'distance' in header:
-            measured = ['distance']
-        elif 'socket' in header:
-            measured = ['location', 'socket']
-    elif 'distance' in header:
-        raise InputError(
-            f'{path} has both x y z and distance: put them into tables of their own, or remove one'
-        )
-    elif set(QUATERNION) & set(header):
-        measured += QUATERNION
-    missing = [name for name in (*values, *measured) if name not in header]
-    if missing:
-        expected = ', '.join([*values, *POSITION])
-        raise InputError(
-            f'{path} has no column {", ".join(missing)}; expected {expected} '
-            f'and, with orientation, {", ".join(QUATERNION)} as well (or '
-            f'distance, or location and socket); found {", ".join(header) or "nothing"}'
-        )
-    return values + measured
-
-
-def _by_session(
-    path: Path, header: Sequence[str], rows: Rows, sessions: Sequence[str]
-) -> list[tuple[str, Rows]]:
-    """Return the rows of each session that is asked for."""
+def _of_sessions(
+    path: Path, header: Sequence[str], rows: list[tuple[int, Row]], sessions: Sequence[str]
+) -> list[tuple[int, Row]]:
+    """Return the rows of the sessions that are asked for, session by session."""
     if not rows:
         raise InputError(f'{path} has no rows')
     if 'session' not in header:
@@ -169,67 +297,22 @@ def _by_session(
             raise InputError(
                 f'{path} has no column "session" to choose "{", ".join(sessions)}" from'
             )
-        return [('', rows)]
+        return rows
+    known: dict[str, list[tuple[int, Row]]] = {}
     for line, row in rows:
         if row['session'] is None:
             raise InputError(f'{path}, line {line}: session is missing')
-    known = {name: part for (name,), part in _by(rows, ('session',)).items()}
+        known.setdefault(row['session'], []).append((line, row))
     if not sessions:
         if len(known) > 1:
             raise InputError(
                 f'{path} holds several sessions, choose one of {", ".join(known)} (or several, '
                 'joined by commas, to fit them together)'
             )
-        return list(known.items())
+        return rows
     for name in sessions:
         if list(sessions).count(name) > 1:
             raise InputError(f'session "{name}" is named twice')
         if name not in known:
             raise UnknownNameError(f'session in {path}', name, known)
-    return [(name, known[name]) for name in sessions]
-
-
-def _by(rows: Rows, keys: Sequence[str]) -> dict[tuple[str, ...], Rows]:
-    """Return the rows grouped by some columns, in the order in which the groups appear."""
-    groups: dict[tuple[str, ...], Rows] = {}
-    for line, row in rows:
-        groups.setdefault(tuple(row[key] for key in keys), []).append((line, row))
-    return groups
-
-
-def _observations(path: Path, joints: int, rows: Rows, columns: Sequence[str]) -> Observations:
-    kind = columns[joints]
-    numeric = columns[:joints] if kind == 'location' else columns
-    numbers = np.array([_numbers(path, line, row, numeric) for line, row in rows])
-    q = numbers[:, :joints]
-    if kind == 'location':
-        return Observations.from_arrays(q, np.zeros((len(rows), 3)))
-    if kind == 'distance':
-        at_origin = Observations.from_arrays(q, np.zeros((len(rows), 3)))
-        return replace(at_origin, distances=numbers[:, joints])
-    rotations = None
-    if 'qx' in columns:
-        quat = numbers[:, -4:]
-        length = np.linalg.norm(quat, axis=1)
-        wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
-        if wrong.size:
-            raise InputError(
-                f'{path}, line {rows[wrong[0]][0]}: quaternion qx qy qz qw has length '
-                f'{length[wrong[0]]:.6g}, expected 1'
-            )
-        rotations = se3.from_quat(quat)
-    return Observations.from_arrays(q, numbers[:, joints : joints + 3], rotations)
-
-
-def _numbers(path: Path, line: int, row: dict[str, str], columns: Sequence[str]) -> list[float]:
-    numbers = []
-    for name in columns:
-        try:
-            number = float(row[name])
-        except (TypeError, ValueError):
-            number = math.nan
-        if not math.isfinite(number):
-            found = 'the row ends before it' if row[name] is None else f'not {row[name]!r}'
-            raise InputError(f'{path}, line {line}: {name} must be a number, {found}')
-        numbers.append(number)
-    return numbers
+    return [each for name in sessions for each in known[name]]

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A service whose answer may take its time while messages are taken."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+Answer = tuple[bool, str]
+
+
+class DeferredTrigger:
+    """A Trigger service whose work runs on a thread of its own.
+
+    Jazzy's executors send the answer through the service's `send_response` right after the
+    callback, on the same thread. It is replaced here by one that holds the answer of an accepted
+    call back until its work has ended; an async callback would do, but the events executor takes
+    none. A call that comes meanwhile is refused at once.
+
+    Parameters
+    ----------
+    node : Node
+    name : str
+    answer : callable
+        Runs work and returns what it returns; makes an answer of an error.
+    prepare : callable
+        Runs on the executor's thread; returns the snapshot to work on.
+    work : callable
+        Takes the snapshot, returns success and message.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        answer: Callable[[Callable[[], Answer]], Answer],
+        prepare: Callable[[], Any],
+        work: Callable[[Any], Answer],
+    ) -> None:
+        self._answer, self._prepare, self._work = answer, prepare, work
+        self._thread: threading.Thread | None = None
+        self._running = threading.Event()
+        self._snapshot: list[Any] = []
+        self._service = node.create_service(Trigger, name, self._on_call)
+        self._send = self._service.send_response
+        self._service.send_response = self._send_unless_deferred
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the work [s]; return whether it has ended."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+        return self._thread is None or not self._thread.is_alive()
+
+    def _on_call(self, request: Any, response: Any) -> Any:
+        if self._running.is_set():
+            response.success = False
+            response.message = 'refused: an identification is running, wait for its answer'
+            return response
+
+        def prepare() -> Answer:
+            self._snapshot = [self._prepare()]
+            return True, ''
+
+        response.success, response.message = self._answer(prepare)
+        return response
+
+    def _send_unless_deferred(self, response: Any, header: Any) -> None:
+        if not self._snapshot:
+            self._send(response, header)
+            return
+        snapshot = self._snapshot.pop()
+        self._running.set()
+        self._thread = threading.Thread(
+            target=self._run, args=(snapshot, response, header), daemon=True
+        )
+        self._thread.start()
+
+    def _run(self, snapshot: Any, response: Any, header: Any) -> None:
+        response.success, response.message = self._answer(lambda: self._work(snapshot))
+        self._running.clear()  # before the answer: the caller may call again at once
+        try:
+            self._send(response, header)
+        except Exception:  # the node is gone meanwhile, and with it the one who asked
+            return

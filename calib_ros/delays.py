@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How late a measuring device stamps, from the motion itself.
+
+The speed of the target by the joints and the chain, and the speed by the measurements, are the
+same signal twice. Angular speed depends on no frame; linear speed is that of the flange, near
+enough to that of the target for a start. The lag of the greatest correlation is refined by a
+parabola; the identification then fits the rest as a parameter (`base.delay`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.chain import Chain
+from calib_ros.se3 import FloatArray
+from calib_ros.track import Stamps
+
+STEP = 5e-3
+"""Time between two values of the speeds [s]."""
+LONGEST = 1.0
+"""Largest delay that is looked for [s]."""
+LEAST_MOTION = 3.0
+"""Time in motion that is needed [s]."""
+CONVINCING = 0.8
+"""Least correlation."""
+MOVING = 0.1
+"""Share of the 95th percentile of the speed beyond which the arm counts as moving."""
+SMOOTHING = 0.05
+"""Time over which speeds are taken [s]; short against a move, long against the noise."""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How much later than the joints' the stamps of measurements are, and how sure it is."""
+
+    seconds: float
+    correlation: float
+
+
+def find_delay(
+    chain: Chain,
+    joint_stamps: Stamps,
+    joints: FloatArray,
+    stamps: Stamps,
+    positions: FloatArray,
+    rotations: FloatArray | None,
+) -> Delay | None:
+    """Return the delay of measurements (N) against joint samples (M); None where none shows.
+
+    Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3).
+    """
+    if len(joint_stamps) < 10 or len(stamps) < 10:
+        return None
+    start = joint_stamps[0]
+    joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
+    begin = max(joint_times[0], times[0] - LONGEST)
+    end = min(joint_times[-1], times[-1] + LONGEST)
+    if end - begin < LEAST_MOTION:
+        return None
+    grid = np.arange(begin, end, STEP)
+    coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
+    nearest = np.unique(np.round(coarse).astype(int))
+    poses = chain.forward(joints[nearest])
+    first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
+    second = _speed(times, positions, rotations, rotations is not None)
+    by_joints = np.interp(grid, *first)
+    if (by_joints > MOVING * np.percentile(by_joints, 95)).sum() * STEP < LEAST_MOTION:
+        return None
+    lags = np.arange(-LONGEST, LONGEST + STEP / 2, STEP)
+    score = np.array([_correlation(grid + lag, by_joints, second) for lag in lags])
+    best = int(np.argmax(score))
+    if score[best] < CONVINCING or best in (0, len(lags) - 1):
+        return None
+    left, middle, right = score[best - 1 : best + 2]
+    bend = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    return Delay(float(lags[best] + shift * STEP), float(score[best]))
+
+
+def _speed(
+    times: FloatArray, positions: FloatArray, rotations: FloatArray | None, angular: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return times and speeds, over SMOOTHING or from one measurement to the next."""
+    behind = np.searchsorted(times, times + SMOOTHING)
+    behind = np.minimum(np.maximum(behind, np.arange(len(times)) + 1), len(times) - 1)
+    first = np.flatnonzero(times[behind] > times)
+    last = behind[first]
+    span = times[last] - times[first]
+    if angular and rotations is not None:
+        turn = np.swapaxes(rotations[first], 1, 2) @ rotations[last]
+        way = np.linalg.norm(se3.log_rotation(turn), axis=1)
+    else:
+        way = np.linalg.norm(positions[last] - positions[first], axis=1)
+    return 0.5 * (times[first] + times[last]), way / span
+
+
+def _correlation(
+    grid: FloatArray, by_joints: FloatArray, measured: tuple[FloatArray, FloatArray]
+) -> float:
+    times, speed = measured
+    inside = (grid >= times[0]) & (grid <= times[-1])
+    if inside.sum() * STEP < LEAST_MOTION:
+        return -1.0
+    first, second = by_joints[inside], np.interp(grid[inside], times, speed)
+    first, second = first - first.mean(), second - second.mean()
+    size = np.sqrt((first @ first) * (second @ second))
+    return float(first @ second / size) if size > 0.0 else -1.0

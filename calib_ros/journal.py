@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The journal: every sample at once on disk, in a table that can be identified by itself.
+
+A row is written by one call, so that a process that is killed leaves whole rows; a row that a
+crash of the machine cut off is left out when the journal is read again. A sample that is taken
+back gets a second row, marked `removed`; nothing is ever deleted.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from calib_ros.samples import Sample
+from calib_ros.tables import cells, columns
+
+
+class Journal:
+    """An open journal, which only grows.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it is made if there is none, else rows are added.
+    joints : int
+        Number of joints.
+
+    """
+
+    def __init__(self, path: Path, joints: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+        size = os.fstat(self._file).st_size
+        if size == 0:
+            self._write(columns(joints))
+        elif os.pread(self._file, 1, size - 1) != b'\n':
+            os.ftruncate(self._file, _last_line(self._file, size))
+
+    def add(self, sample: Sample) -> None:
+        """Write a sample.
+
+        Raises
+        ------
+        OSError
+            When the disk is full, say; what was written before is whole.
+
+        """
+        self._write(cells(sample))
+
+    def remove(self, sample: Sample) -> None:
+        """Write that a sample was taken back."""
+        self._write(cells(sample, 'removed'))
+
+    def sync(self) -> None:
+        """Wait until everything is on the disk, to survive a power failure too."""
+        os.fsync(self._file)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _write(self, row: Sequence[str]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator='\n').writerow(row)
+        data = text.getvalue().encode()
+        begin = os.fstat(self._file).st_size
+        written = os.write(self._file, data)
+        if written < len(data):  # the disk is full: no half row may stay
+            os.ftruncate(self._file, begin)
+            raise OSError(f'{self.path}: the disk is full, the sample was not written')
+
+
+def _last_line(file: int, size: int) -> int:
+    """Return where the last, unfinished line begins."""
+    data = os.pread(file, min(size, 1 << 16), max(0, size - (1 << 16)))
+    return size - len(data) + data.rfind(b'\n') + 1

@@ -1,0 +1,225 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The estimate while samples are being taken: what is known so far, and how many more it takes.
+
+At a chain that is near enough, every sample adds its share J^T W J and J^T W r to the information
+matrix and vector, so the estimate and its covariance follow each sample at the cost of that sample
+alone (an information filter; Maybeck 1979). The point of linearisation moves to the estimate when
+that has gone further than the linear model holds. Wide priors stand for what no sample has told
+yet; at the end they weigh nothing, and the estimate is that of the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.chain import ANGLES, DELAY, Chain
+from calib_ros.differential import ErrorModel
+from calib_ros.errors import CalibrationError
+from calib_ros.frames import start_frames
+from calib_ros.identifiability import structurally_independent
+from calib_ros.leastsquares import (
+    Prior,
+    Samples,
+    System,
+    normal_equations,
+    residual_arrays,
+)
+from calib_ros.problem import Problem
+from calib_ros.samples import Frames, Sample, collect
+from calib_ros.se3 import FloatArray
+
+WIDE = (0.01, 0.02)
+"""Standard deviations [m, rad] of arm parameters before anything is measured."""
+FAR = 1e-3
+"""Step [m or rad] from which the linear model is made anew."""
+MOST_STEPS = 5
+START = 6
+"""Samples with which the frames can be found."""
+MOST_ANEW = 500
+"""Samples up to which the linear model is made anew."""
+FAR_OFF = 7.0
+"""Distance [standard deviations] from which a sample is left out as suspicious."""
+LOOK = 100
+"""Configurations at which the accuracy is predicted."""
+LITTLE = 0.35
+"""Range [rad] of a joint over all samples that is too little; a tenth of it [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the samples so far tell.
+
+    `sigma` is the RMS standard deviation [m] of positions predicted over the joint range, by the
+    noise that the residuals show, which is `noise` [sigma given].
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    covariance: FloatArray
+    samples: int
+    sigma: float
+    noise: float
+
+    def more_for(self, wanted: float) -> int:
+        """Return how many more samples are expected to bring the sigma to a wanted one [m]."""
+        return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))
+
+
+class LiveEstimate:
+    """An information filter over the parameters of a problem, as its samples come.
+
+    Parameters
+    ----------
+    problem_of : callable
+        Makes a problem of samples, as the identification will.
+
+    """
+
+    def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
+        self._problem_of = problem_of
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again with the next update."""
+        self._frames = Frames()
+        self._names: tuple[str, ...] = ()
+        self._chain: Chain | None = None
+        self._added: list[Sample] = []
+        self._taken = 0
+        self.suspicious: list[Sample] = []
+        """Samples that lie too far from what the others predict; they are left out here."""
+
+    def update(self, samples: Sequence[Sample]) -> Estimate | None:
+        """Take what a growing list of samples has beyond that of the last call.
+
+        Returns None while there are too few.
+        """
+        fresh = [sample for sample in samples[self._taken :] if not sample.validation]
+        if self._chain is None or any(not self._knows(sample) for sample in fresh):
+            if len(samples) < START or not self._begin(samples):
+                return None
+        elif fresh:
+            self._add(fresh)
+            for _ in range(MOST_STEPS):
+                if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
+                    break
+                self._linearise(self._estimate())
+        self._taken = len(samples)
+        return self._result()
+
+    def _knows(self, sample: Sample) -> bool:
+        assert self._chain is not None
+        return set(self._frames.of(sample)) <= set(self._chain.frame_names)
+
+    def _begin(self, samples: Sequence[Sample]) -> bool:
+        """Choose the parameters, and a first chain with frames near the samples."""
+        self.restart()
+        fitted = [sample for sample in samples if not sample.validation]
+        problem = self._problem_of(fitted)
+        model = problem.model
+        self._sigmas = (problem.sigma_position, problem.sigma_orientation)
+        try:
+            self._names = structurally_independent(model, problem.free, problem.kinds)
+            chain = start_frames(model, problem.sets, *self._sigmas, problem.loss)
+        except (CalibrationError, np.linalg.LinAlgError):
+            return False
+        wide = {name: _wide(name) for name in self._names if not model.owns_frame(name)}
+        self._prior = Prior(model, wide | problem.prior_sigmas)
+        self._joints = chain.random_joints(LOOK, np.random.default_rng(0))
+        self._added = fitted
+        for _ in range(MOST_STEPS):
+            self._linearise(chain)
+            chain = self._estimate()
+            if np.abs(self._step()).max() < FAR:
+                break
+        return True
+
+    def _linearise(self, chain: Chain) -> None:
+        """Begin the information anew at a chain, with the samples taken so far."""
+        inverse, residual = self._prior.rows(chain, self._names)
+        self._chain = chain
+        self._information = np.diag(inverse**2)
+        self._vector = inverse * residual
+        self._cost, self._rows = float(residual @ residual), 0
+        added, self._added = self._added, []
+        self._add(added, gate=False)
+
+    def _add(self, samples: Sequence[Sample], gate: bool = True) -> None:
+        """Add the information of samples."""
+        assert self._chain is not None
+        if gate and self._rows > 2 * len(self._names):
+            samples = self._plausible(samples)
+        sets, _ = collect(samples, self._sigmas, self._frames)
+        system = System(tuple(Samples(each, *self._sigmas) for each in sets))
+        normal = normal_equations(self._chain, self._names, system)
+        self._information = self._information + normal.matrix
+        self._vector = self._vector + normal.gradient
+        self._cost += normal.cost
+        self._rows += system.rows
+        self._added += samples
+
+    def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
+        """Return the samples that lie where the others predict them."""
+        result, good = self._result(), []
+        for sample in samples:
+            ((one,), _) = collect([sample], self._sigmas, self._frames)
+            left = residual_arrays(result.chain, one)[0][0]
+            model = ErrorModel(result.chain, self._names, one.base, one.tool)
+            jacobian = model.jacobian(one.joints, one.approach, one.velocity)[0, :3]
+            if one.distances is not None:
+                point = result.chain.forward(one.joints, one.approach, one.base, one.tool)[
+                    0, :3, 3
+                ]
+                jacobian = (point / np.linalg.norm(point))[np.newaxis] @ jacobian
+            spread = jacobian @ result.covariance @ jacobian.T
+            spread += np.eye(len(left)) * result.noise**2 * self._sigmas[0] ** 2
+            if left @ np.linalg.solve(spread, left) > FAR_OFF**2:
+                self.suspicious.append(sample)
+            else:
+                good.append(sample)
+        return good
+
+    def _step(self) -> FloatArray:
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
+        matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        return np.asarray(scale * linalg.solve(matrix, scale * self._vector, assume_a='pos'))
+
+    def _estimate(self) -> Chain:
+        assert self._chain is not None
+        return self._chain.with_offsets(dict(zip(self._names, self._step(), strict=True)))
+
+    def _result(self) -> Estimate:
+        step, chain = self._step(), self._estimate()
+        left = max(self._cost - float(step @ self._vector), 0.0)
+        freedom = self._rows - len(self._names)
+        noise = left / freedom if freedom > 0 else 1.0
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
+        matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        covariance = noise * np.outer(scale, scale) * np.linalg.inv(matrix)
+        jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
+        variance = np.einsum('nip,pq,niq->n', jacobian, covariance, jacobian, optimize=True)
+        sigma = float(np.sqrt(variance.mean()))
+        return Estimate(
+            chain, self._names, covariance, len(self._added), sigma, float(np.sqrt(noise))
+        )
+
+
+def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
+    """Return the joints whose values (N, n) span too little to tell much about them."""
+    span = np.ptp(joints, axis=0)
+    least = [LITTLE if joint.type == 'revolute' else 0.1 * LITTLE for joint in chain.joints]
+    return tuple(
+        joint.name
+        for joint, reached, wanted in zip(chain.joints, span.tolist(), least, strict=True)
+        if reached < wanted
+    )
+
+
+def _wide(name: str) -> float:
+    kind = name.partition('.')[2]
+    return 1.0 if kind == DELAY else WIDE[1] if kind in ANGLES else WIDE[0]

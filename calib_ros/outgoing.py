@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Results as ROS messages.
+
+Jazzy's messages do not check their fields, and an int or a numpy number where a float belongs
+arrives as garbage: everything is made a plain Python value here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, PoseStamped
+from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
+from visualization_msgs.msg import Marker, MarkerArray
+
+from calib_ros.chain import DH_KINDS, Chain
+from calib_ros.identification import Identification, residuals
+from calib_ros.observations import Observations
+from calib_ros.se3 import FloatArray, to_quat
+
+MOST_ARROWS = 1000
+
+
+def dh_parameters(chain: Chain) -> Float64MultiArray:
+    """Return the DH table, joint by joint."""
+    rows, columns = chain.table.shape
+    array = Float64MultiArray()
+    array.layout.dim = [
+        MultiArrayDimension(label='joint', size=rows, stride=rows * columns),
+        MultiArrayDimension(label=','.join(DH_KINDS), size=columns, stride=columns),
+    ]
+    array.data = chain.table.ravel().tolist()
+    return array
+
+
+def pose(chain: Chain, joints: FloatArray, stamp: Any, frame_id: str) -> PoseStamped:
+    """Return the pose of the target at joint values (n,)."""
+    matrix = chain.forward(joints[np.newaxis])[0]
+    message = PoseStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    point, turn = message.pose.position, message.pose.orientation
+    point.x, point.y, point.z = matrix[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = to_quat(matrix[:3, :3]).tolist()
+    return message
+
+
+def status(
+    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
+) -> DiagnosticStatus:
+    """Return one line of diagnostics."""
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(
+        name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
+    )
+
+
+def residual_markers(
+    result: Identification, sets: Sequence[Observations], scale: float, stamp: Any
+) -> MarkerArray:
+    """Return what is left at each measured position, drawn `scale` times as long as it is.
+
+    A line from the measured position towards the predicted one: green for a small residual, red
+    for one of three times the RMS and beyond.
+    """
+    lines = Marker(ns='residuals', id=0, type=Marker.LINE_LIST, action=Marker.ADD)
+    lines.header.stamp = stamp
+    lines.header.frame_id = result.world_frame
+    lines.pose.orientation.w = 1.0
+    lines.scale.x = 0.002
+    for each in sets:
+        if each.distances is not None:
+            continue
+        left = residuals(result.chain, each).position
+        size = np.linalg.norm(left, axis=1)
+        share = np.clip(size / max(3.0 * float(np.sqrt(np.mean(size**2))), 1e-12), 0.0, 1.0)
+        ends = each.positions - scale * left
+        for k in range(max(0, len(each) - MOST_ARROWS), len(each)):
+            color = ColorRGBA(r=float(share[k]), g=float(1.0 - share[k]), b=0.0, a=1.0)
+            for x, y, z in (each.positions[k].tolist(), ends[k].tolist()):
+                lines.points.append(Point(x=x, y=y, z=z))
+                lines.colors.append(color)
+    return MarkerArray(markers=[lines])

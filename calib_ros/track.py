@@ -1,0 +1,351 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Recent joint samples: where the joints were at a stamp, and when they stood still.
+
+Everything is a function of the samples held, by their header stamps; the order of arrival does
+not matter. Several publishers may each name part of the joints: each part is a track of its own,
+interpolated on its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.se3 import FloatArray
+
+Stamps = NDArray[np.int64]
+
+MOVED = 1e-3
+"""A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
+LAGS = 4
+"""Samples within the window with which the present one is compared."""
+
+CAUSES = (
+    '',
+    'no joint sample before',
+    'no joint sample after',
+    'joint samples too far apart',
+)
+"""Why there are no joint values at a stamp; the first entry stands for none."""
+
+
+class Rows:
+    """Stamped rows of numbers in one growing block of memory, up to a capacity."""
+
+    def __init__(self, width: int, capacity: int) -> None:
+        self.capacity = capacity
+        self.count = 0
+        self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
+        self._values = np.empty((len(self._stamps), width))
+
+    @property
+    def full(self) -> bool:
+        """Tell whether there is no room for another row."""
+        return self.count == self.capacity
+
+    @property
+    def stamps(self) -> Stamps:
+        """Return the stamps (M,) in the order of arrival."""
+        return self._stamps[: self.count]
+
+    @property
+    def values(self) -> FloatArray:
+        """Return the rows (M, width) in the order of arrival."""
+        return self._values[: self.count]
+
+    def append(self, stamp_ns: int, row: Sequence[float] | FloatArray) -> None:
+        """Add a row; the caller has seen that there is room."""
+        if self.count == len(self._stamps):
+            size = min(2 * self.count, self.capacity)
+            self._stamps = np.resize(self._stamps, size)
+            self._values = np.resize(self._values, (size, self._values.shape[1]))
+        self._stamps[self.count] = stamp_ns
+        self._values[self.count] = row
+        self.count += 1
+
+    def keep(self, index: NDArray[np.generic]) -> None:
+        """Keep only the rows of a mask or an index, in its order."""
+        stamps = self.stamps[index]
+        self._values[: len(stamps)] = self.values[index]
+        self._stamps[: len(stamps)] = stamps
+        self.count = len(stamps)
+
+    def sort(self) -> int:
+        """Put the rows in the order of their stamps, one row a stamp; return how many went.
+
+        Of equal stamps the smallest values win, so that the order of arrival does not choose.
+        """
+        before = self.count
+        if before > 1 and not (np.diff(self.stamps) > 0).all():
+            order = np.lexsort((*self.values.T[::-1], self.stamps))
+            stamps = self.stamps[order]
+            self.keep(order[np.concatenate([[True], np.diff(stamps) > 0])])
+        return before - self.count
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Joint values (N, n), their velocities and accelerations at N stamps.
+
+    `approach` (N, n) holds the signs of the last moves; `cause` (N,) is an index of CAUSES, and
+    where it is not zero the values count for nothing.
+    """
+
+    joints: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+    approach: FloatArray
+    cause: NDArray[np.intp]
+
+
+class Track:
+    """Recent samples of all joints.
+
+    Parameters
+    ----------
+    revolute : (n,) bool
+        True for the joints whose values are angles.
+    max_gap : float
+        Longest time [s] between two samples to interpolate between.
+    capacity : int
+        Samples that are kept of one publisher.
+
+    """
+
+    def __init__(self, revolute: Sequence[bool], max_gap: float, capacity: int) -> None:
+        self._revolute = np.array(revolute, dtype=bool)
+        self._max_gap_ns = round(max_gap * 1e9)
+        self._capacity = capacity
+        self._parts: dict[tuple[int, ...], Rows] = {}
+        self._came = np.zeros(len(revolute))  # signs of the last moves before the samples held
+        self.horizon_ns = 0
+        """Samples before this stamp have been let go."""
+
+    @property
+    def newest_ns(self) -> int:
+        """Return the stamp up to which all publishers have been heard."""
+        newest = [int(rows.stamps.max()) for rows in self._parts.values() if rows.count]
+        return min(newest, default=0)
+
+    @property
+    def full(self) -> bool:
+        """Tell whether some part has no room for another sample."""
+        return any(rows.full for rows in self._parts.values())
+
+    @property
+    def missing(self) -> tuple[int, ...]:
+        """Return the joints that no publisher has named."""
+        named = {column for part in self._parts for column in part}
+        return tuple(k for k in range(len(self._revolute)) if k not in named)
+
+    def add(self, columns: tuple[int, ...], stamp_ns: int, values: FloatArray) -> None:
+        """Take the values of some joints, given by their numbers in the chain."""
+        rows = self._parts.get(columns)
+        if rows is None:
+            rows = self._parts[columns] = Rows(len(columns), self._capacity)
+        rows.append(stamp_ns, values)
+
+    def sort(self) -> int:
+        """Put all samples in order; return how many had the stamp of another one."""
+        return sum(rows.sort() for rows in self._parts.values())
+
+    def at(self, stamps: Stamps) -> Motion:
+        """Return the motion at stamps (N,), after `sort`."""
+        shape = (len(stamps), len(self._revolute))
+        joints, velocity, acceleration = (np.zeros(shape) for _ in range(3))
+        approach = np.zeros(shape)
+        cause = np.full(shape, 1, dtype=np.intp)
+        # A joint that several publishers name is taken from the one that names the most.
+        for columns, rows in sorted(self._parts.items(), key=lambda item: len(item[0])):
+            index = list(columns)
+            why, first, last = self._brackets(rows.stamps, stamps)
+            found = _interpolated(rows, stamps, first, last, self._revolute[index])
+            came = _approach(rows.values, first, found[0], self._came[index])
+            good = np.ix_(why == 0, index)
+            for whole, part in zip(
+                (joints, velocity, acceleration, approach), (*found, came), strict=True
+            ):
+                whole[good] = part[why == 0]
+            worse = cause[:, index] != 0
+            cause[:, index] = np.where(worse, why[:, np.newaxis], cause[:, index])
+        return Motion(joints, velocity, acceleration, approach, cause.max(axis=1, initial=0))
+
+    def _brackets(
+        self, known: Stamps, stamps: Stamps
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Return causes (N,) and the samples before and after each stamp."""
+        nowhere = np.zeros(len(stamps), dtype=np.intp)
+        if len(known) == 0:
+            return nowhere + 1, nowhere, nowhere
+        after = np.searchsorted(known, stamps, side='left')
+        last = np.minimum(after, len(known) - 1)
+        hit = known[last] == stamps
+        first = np.where(hit, last, np.maximum(after - 1, 0))
+        cause = np.select(
+            [hit, after == len(known), after == 0, known[last] - known[first] > self._max_gap_ns],
+            [0, 2, 1, 3],
+            0,
+        )
+        return cause.astype(np.intp), first.astype(np.intp), last.astype(np.intp)
+
+    def standing(self, still: float, window: float) -> Stamps:
+        """Return (K, 2) from when to when all joints stood, after `sort`.
+
+        A joint stands where its value [rad or m] has stayed within `still` during a window [s].
+        """
+        common: Stamps | None = None
+        for rows in self._parts.values():
+            found = _standing(rows, still, round(window * 1e9), self._max_gap_ns)
+            common = found if common is None else _intersection(common, found)
+        return np.zeros((0, 2), dtype=np.int64) if common is None else common
+
+    def release(self, before_ns: int) -> int:
+        """Let go the samples before a stamp, after `sort`; return how many."""
+        gone = 0
+        for columns, rows in self._parts.items():
+            cut = int(np.searchsorted(rows.stamps, before_ns))
+            cut = min(cut, max(rows.count - 2, 0))
+            if cut <= 0:
+                continue
+            index = list(columns)
+            here = np.array([cut])
+            came = _approach(rows.values, here, rows.values[here], self._came[index])
+            self._came[index] = came[0]
+            rows.keep(np.arange(cut, rows.count))
+            gone += cut
+        self.horizon_ns = max(self.horizon_ns, before_ns)
+        return gone
+
+    def halve(self) -> int:
+        """Let go the older half of the samples, after `sort`; return how many."""
+        middle = [int(rows.stamps[rows.count // 2]) for rows in self._parts.values() if rows.full]
+        return self.release(max(middle, default=0))
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._parts.clear()
+        self._came[:] = 0.0
+        self.horizon_ns = 0
+
+    def samples(self) -> tuple[Stamps, FloatArray]:
+        """Return stamps (M,) and joint values (M, n) where the main publisher was heard."""
+        if self.missing:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, len(self._revolute)))
+        main = max(self._parts.items(), key=lambda item: len(item[0]))[1]
+        motion = self.at(main.stamps)
+        good = motion.cause == 0
+        return main.stamps[good], motion.joints[good]
+
+
+def _interpolated(
+    rows: Rows,
+    stamps: Stamps,
+    first: NDArray[np.intp],
+    last: NDArray[np.intp],
+    revolute: NDArray[np.bool_],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return values, velocities and accelerations (N, n) of the cubic through four samples.
+
+    Two before and two after the stamp (Lagrange). At the ends of the recording and beside equal
+    stamps, where there are fewer, values are interpolated linearly.
+    """
+    known, values = rows.stamps, rows.values
+    nothing = np.zeros((len(stamps), values.shape[1]))
+    if rows.count == 0:
+        return nothing, nothing, nothing
+    origin = values[first]
+    span = (known[last] - known[first]) * 1e-9
+    share = (stamps - known[first]) * 1e-9 / np.maximum(span, 1e-9)
+    step = _unwrapped(values[last] - origin, revolute)
+    joints = origin + share[:, np.newaxis] * step
+    velocity = step / np.maximum(span, 1e-9)[:, np.newaxis]
+    before, behind = first - 1, np.maximum(last, first + 1) + 1
+    inner = (before >= 0) & (behind < rows.count)
+    near = np.stack([first - 1, first, np.maximum(last, first + 1), behind])[:, inner]
+    if not near.size:
+        return joints, velocity, nothing
+    times = (known[near] - stamps[inner]) * 1e-9  # (4, N)
+    # A cubic over a pause in the samples would follow nothing that was measured.
+    even = np.diff(times, axis=0).max(axis=0) < 3.0 * np.diff(times, axis=0).min(axis=0)
+    inner[inner] = even
+    near, times = near[:, even], times[:, even]
+    heights = _unwrapped(values[near] - origin[inner], revolute)  # (4, N, n)
+    at, slope, bend = _lagrange(times)
+    joints[inner] = origin[inner] + np.einsum('kn,knj->nj', at, heights)
+    velocity[inner] = np.einsum('kn,knj->nj', slope, heights)
+    acceleration = nothing.copy()
+    acceleration[inner] = np.einsum('kn,knj->nj', bend, heights)
+    return joints, velocity, acceleration
+
+
+def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the weights (4, N) of four heights for value, slope and bend at time zero."""
+    at, slope, bend = (np.empty_like(times) for _ in range(3))
+    for k in range(4):
+        a, b, c = (times[i] for i in range(4) if i != k)
+        below = (times[k] - a) * (times[k] - b) * (times[k] - c)
+        at[k] = -a * b * c / below
+        slope[k] = (a * b + b * c + c * a) / below
+        bend[k] = -2.0 * (a + b + c) / below
+    return at, slope, bend
+
+
+def _unwrapped(steps: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+    """Return differences of joint values; a driver may count angles within one turn."""
+    turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
+    return np.asarray(steps - np.where(revolute, turn, 0.0))
+
+
+def _approach(
+    values: FloatArray, first: NDArray[np.intp], now: FloatArray, came: FloatArray
+) -> FloatArray:
+    """Return the signs (N, n) of the last move of each joint before it stood as it does now.
+
+    Looked for further and further back among the samples (M, n) before index `first` (N,);
+    `came` (n,) holds the signs from before them.
+    """
+    signs = np.zeros_like(now)
+    if len(values) == 0:
+        return signs
+    back = 1
+    while True:
+        change = now - values[np.maximum(first - back, 0)]
+        found = (signs == 0.0) & (np.abs(change) > MOVED)
+        signs[found] = np.sign(change[found])
+        if back > first.max(initial=0):
+            return np.where(signs == 0.0, came, signs)
+        back *= 4
+
+
+def _standing(rows: Rows, still: float, window_ns: int, max_gap_ns: int) -> Stamps:
+    """Return (K, 2) from when to when the joints of one publisher stood."""
+    stamps, values = rows.stamps, rows.values
+    if rows.count == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    index = np.arange(rows.count)
+    gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
+    begin = index[gap][np.cumsum(gap) - 1]  # where the samples without a gap begin
+    quiet = np.ones(rows.count, dtype=bool)
+    back = begin
+    for lag in range(1, LAGS + 1):
+        back = np.searchsorted(stamps, stamps - window_ns * lag // LAGS)
+        back = np.maximum(np.minimum(back, index - 1), begin)
+        quiet &= np.abs(values - values[back]).max(axis=1) <= still
+    starts = np.flatnonzero(quiet & ~np.concatenate([[False], quiet[:-1]]) | (quiet & gap))
+    ends = np.flatnonzero(quiet & ~(np.concatenate([quiet[1:], [False]])))
+    ends = np.union1d(ends, np.flatnonzero(quiet & np.concatenate([gap[1:], [False]])))
+    found = np.stack([stamps[back[starts]], stamps[ends]], axis=1)
+    found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch parts two stands
+    return np.asarray(found, dtype=np.int64)
+
+
+def _intersection(first: Stamps, second: Stamps) -> Stamps:
+    """Return (K, 2) what two sorted lists of intervals have in common."""
+    starts = np.maximum(first[:, np.newaxis, 0], second[np.newaxis, :, 0])
+    ends = np.minimum(first[:, np.newaxis, 1], second[np.newaxis, :, 1])
+    chosen = starts < ends
+    return np.stack([starts[chosen], ends[chosen]], axis=1)
