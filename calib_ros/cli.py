@@ -95,6 +95,14 @@ def _parser() -> argparse.ArgumentParser:
     _add_chain(csv2bag)
     _add_storage(csv2bag)
 
+    export = command(
+        'export', _export, 'write a calibration in the forms that controllers and others read'
+    )
+    export.add_argument('calibration', type=Path, help='calibration.yaml of an identification')
+    _add_chain(export)
+    export.add_argument('--out', type=Path, required=True, help='folder to write')
+    export.add_argument('--force', action='store_true', help='overwrite files in --out')
+
     demo = command(
         'demo', _demo, 'simulate an arm, identify it, and compare the result with the truth'
     )
@@ -241,6 +249,26 @@ def _csv2bag(options: argparse.Namespace) -> int:
     judging = np.arange(len(rows)) >= len(fitted)
     write_bag(options.bag, Recording.of_dwells(chain.joint_names, rows, judging), options.storage)
     print(f'wrote {options.bag}: {len(fitted)} poses to fit, {len(held_out)} held out')
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from calib_ros.config import load_chain
+    from calib_ros.export import exports
+    from calib_ros.files import write_file
+
+    found = exports(load_chain(options.calibration), load_chain(options.chain))
+    options.out.mkdir(parents=True, exist_ok=True)
+    if not options.force:
+        there = [each.name for each in found if (options.out / each.name).exists()]
+        if there:
+            raise InputError(
+                f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
+            )
+    for each in found:
+        write_file(options.out / each.name, each.content, overwrite=options.force)
+        exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
+        print(f'{options.out / each.name}: {exact}')
     return 0
 
 

@@ -20,7 +20,7 @@ ORDER = [
     {'config', 'differential', 'observations'},
     {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
     {'dwells', 'delays', 'robust', 'simulation', 'sources', 'tables'},
-    {'collector', 'frames', 'journal'},
+    {'collector', 'export', 'frames', 'journal'},
     {'problem'},
     {'live', 'validation'},
     {'identification'},
