@@ -19,7 +19,7 @@ ORDER = [
     {'chain'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
-    {'dwells', 'delays', 'robust', 'simulation', 'sources', 'tables'},
+    {'cdr', 'dwells', 'delays', 'robust', 'simulation', 'sources', 'tables'},
     {'collector', 'export', 'frames', 'journal'},
     {'problem'},
     {'live', 'validation'},
