@@ -426,9 +426,8 @@ class Collector:
     # Buffers
 
     def _make_room(self) -> None:
-        """Let go the older half of the joint samples."""
-        if self.settings.mode == 'continuous':  # nothing may be held any longer
-            self._round(self._track.newest_ns - self._lateness_ns)
+        """Let go the older half of the joint samples; nothing may be held any longer."""
+        self._round(self._track.newest_ns - self._lateness_ns)
         if self._track.full:
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 

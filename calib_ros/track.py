@@ -127,9 +127,18 @@ class Track:
 
     @property
     def newest_ns(self) -> int:
-        """Return the stamp up to which all publishers have been heard."""
-        newest = [int(rows.stamps.max()) for rows in self._parts.values() if rows.count]
-        return min(newest, default=0)
+        """Return the stamp up to which every joint that anybody names has been heard."""
+        heard = self._heard()
+        return int(heard[heard > 0].min(initial=np.iinfo(np.int64).max)) if heard.any() else 0
+
+    def _heard(self) -> Stamps:
+        """Return (n,) the newest stamp of each joint, zero where nobody has named it."""
+        heard = np.zeros(len(self._revolute), dtype=np.int64)
+        for columns, rows in self._parts.items():
+            if rows.count:
+                index = list(columns)
+                heard[index] = np.maximum(heard[index], rows.stamps.max())
+        return heard
 
     @property
     def full(self) -> bool:
@@ -204,14 +213,22 @@ class Track:
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
 
     def release(self, before_ns: int) -> int:
-        """Let go the samples before a stamp, after `sort`; return how many."""
+        """Let go the samples before a stamp, after `sort`; return how many.
+
+        The last one is kept, unless others name the joints of a publisher that has fallen silent.
+        """
         gone = 0
-        for columns, rows in self._parts.items():
+        heard = self._heard()
+        for columns, rows in tuple(self._parts.items()):
+            index = list(columns)
             cut = int(np.searchsorted(rows.stamps, before_ns))
-            cut = min(cut, max(rows.count - 2, 0))
+            if 0 < cut == rows.count and (heard[index] > rows.stamps[-1]).all():
+                del self._parts[columns]
+                gone += cut
+                continue
+            cut = min(cut, rows.count - 1)
             if cut <= 0:
                 continue
-            index = list(columns)
             here = np.array([cut])
             came = _approach(rows.values, here, rows.values[here], self._came[index])
             self._came[index] = came[0]
