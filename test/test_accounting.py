@@ -5,7 +5,18 @@
 import numpy as np
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from streams import MS, POSE, RANGE, START, TRANSFORM, distance, joint_state, pose, stops, transform
+from streams import (
+    MS,
+    POSE,
+    RANGE,
+    START,
+    TRANSFORM,
+    distance,
+    joint_state,
+    pose,
+    stops,
+    transform,
+)
 
 from calib_ros.chain import Chain, Joint
 from calib_ros.config import MODES, Settings
