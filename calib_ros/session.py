@@ -231,9 +231,6 @@ class CalibrationSession:
         self._unused['poses: of a sample that was taken back'] += sample.count
         self._collector.forget(sample)
         self._live.restart()
-        if self.calibration is not None:
-            taken = min(self.calibration.taken, len(self.samples))
-            self.calibration = replace(self.calibration, taken=taken)
         return sample
 
     def restore(self, samples: Sequence[Sample]) -> None:
@@ -245,9 +242,6 @@ class CalibrationSession:
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
         self.samples = [*samples, *self.samples]
-        if self.calibration is not None:
-            taken = self.calibration.taken + len(samples)
-            self.calibration = replace(self.calibration, taken=taken)
         self._live.restart()
 
     @property
