@@ -228,6 +228,7 @@ class CalibrationSession:
         if not self.samples:
             raise InputError('there is no sample to remove')
         sample = self.samples.pop()
+        self._unused['poses: of a sample that was taken back'] += sample.count
         self._collector.forget(sample)
         self._live.restart()
         return sample
