@@ -37,6 +37,7 @@ JUMP = 20
 _POSITION, _QUAT, _COVARIANCE, _DISTANCE = slice(0, 3), slice(3, 7), slice(7, 43), 43
 _WIDTH = 44
 _ONE = np.ones(1, dtype=bool)
+_FOREVER = np.iinfo(np.int64).max
 
 
 @dataclass(frozen=True, order=True)
@@ -92,19 +93,33 @@ class Collector:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
 
-    def find_delay(self, chain: Chain) -> Delay | None:
-        """Return how late the waiting measurements are, and take it into account from now on."""
+    def find_delay(self, chain: Chain, now_ns: int | None) -> Delay | None:
+        """Return how late the waiting measurements are, and take it into account from now on.
+
+        Only what is older by `lateness` than the stamp `now_ns` counts, of which all has come;
+        None: everything counts.
+        """
         self._sort()
         stamps, joints = self._track.samples()
+        until = _FOREVER if now_ns is None else now_ns - self._lateness_ns
+        complete = stamps <= until
         found = []
         for key, rows in self._waiting.items():
             if key.distance or key.eye_in_hand:
                 continue
-            values = rows.values
+            known = rows.stamps <= until
+            values = rows.values[known]
             oriented = not np.isnan(values[:, _QUAT]).any()
-            rotations = se3.from_quat(values[:, _QUAT]) if oriented and rows.count else None
+            rotations = se3.from_quat(values[:, _QUAT]) if oriented and len(values) else None
             found.append(
-                find_delay(chain, stamps, joints, rows.stamps, values[:, _POSITION], rotations)
+                find_delay(
+                    chain,
+                    stamps[complete],
+                    joints[complete],
+                    rows.stamps[known],
+                    values[:, _POSITION],
+                    rotations,
+                )
             )
         convincing = [delay for delay in found if delay is not None]
         if not convincing:
@@ -241,7 +256,7 @@ class Collector:
 
     def _take_each(self, until: int) -> None:
         """Make a sample of every measurement up to a stamp of the joints."""
-        for key, rows in self._waiting.items():
+        for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= until
             if not due.any():
@@ -311,7 +326,7 @@ class Collector:
     def _average(self, begin: int, end: int) -> None:
         """Make one sample of each stream from what was measured in a stop."""
         calm = begin + round(self.settings.settle * 1e9)
-        for key, rows in self._waiting.items():
+        for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= end
             inside = due & (stamps >= calm)
@@ -408,16 +423,14 @@ class Collector:
             )
         )
 
+    def remember(self, samples: Sequence[Sample]) -> None:
+        """Allow no other samples of the stamps of these."""
+        for sample in samples:
+            self._taken.setdefault(_key(sample), set()).add(sample.stamp_ns)
+
     def forget(self, sample: Sample) -> None:
         """Allow a sample of the same stamp again."""
-        key = StreamKey(
-            sample.device,
-            sample.target,
-            sample.validation,
-            sample.distance is not None,
-            sample.eye_in_hand,
-        )
-        self._taken.get(key, set()).discard(sample.stamp_ns)
+        self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
 
     def _count_causes(self, cause: NDArray[np.intp]) -> None:
         for k, text in enumerate(CAUSES[1:], start=1):
@@ -439,3 +452,13 @@ class Collector:
         self.notes['the clock jumped back'] += 1
         self._track.clear()
         self._advanced_ns = self._settled_ns = self._sampled_ns = 0
+
+
+def _key(sample: Sample) -> StreamKey:
+    return StreamKey(
+        sample.device,
+        sample.target,
+        sample.validation,
+        sample.distance is not None,
+        sample.eye_in_hand,
+    )

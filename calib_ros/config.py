@@ -161,11 +161,15 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
         if str(name_or_path) not in robots:
             raise UnknownNameError('robot', str(name_or_path), robots)
         path = robots[path.name]
+    return parse_chain(read_text(path), str(path))
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a chain file."""
     try:
-        text = path.read_text(encoding='utf-8')
+        return path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as err:
         raise ConfigError(f'cannot read chain file {path}: {err}') from err
-    return parse_chain(text, str(path))
 
 
 def shipped_robots() -> dict[str, Path]:
@@ -240,6 +244,14 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
                 raise
             raise UnknownNameError(f'{where}: {err.what}', err.name, err.alternatives) from err
         raise ConfigError(f'{where}: {err}') from err
+
+
+def calibration_record(text: str) -> dict[str, Any]:
+    """Return what a chain file says about where its numbers come from."""
+    import yaml
+
+    record = yaml.safe_load(text).get('calibration')
+    return record if isinstance(record, dict) else {}
 
 
 def chain_document(chain: Chain) -> dict[str, Any]:

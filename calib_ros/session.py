@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from calib_ros.delays import Delay
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
 from calib_ros.live import LiveEstimate, barely_moved
-from calib_ros.observations import configurations
+from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
@@ -82,14 +82,28 @@ class Calibration:
     """A corrected chain in use.
 
     `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
-    the error that it was judged to have, and `taken` counts the samples there were.
+    the error that it was judged to have, and `known` holds the samples that were there by then.
     """
 
     chain: Chain
     before: Chain | None
     world_frame: str
     rms_mm: float | None
-    taken: int
+    known: frozenset[Sample]
+
+
+def check_settings(chain: Chain, settings: Settings) -> None:
+    """Refuse settings that no identification of a chain could use, before anything is measured.
+
+    Raises
+    ------
+    ConfigError
+        When a name is unknown to this chain, say.
+
+    """
+    nothing = np.zeros((0, len(chain.joints)))
+    empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
+    Problem(chain, empty, **settings.for_problem())
 
 
 class CalibrationSession:
@@ -121,6 +135,7 @@ class CalibrationSession:
                 f'joint_names must be {count} different names, one for each of '
                 f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
             )
+        check_settings(chain, self.settings)
         self.recording = True
         self.calibration: Calibration | None = None
         """The last one that was accepted or loaded."""
@@ -147,11 +162,17 @@ class CalibrationSession:
         self._layouts: dict[tuple[str, ...], tuple[tuple[int, ...], list[int]] | None] = {}
         self._foreign_names: list[str] = []
         self._live = LiveEstimate(self._problem_of)
-        if self.calibration is not None:
-            self.calibration = replace(self.calibration, taken=0)
 
     def change(self, settings: Settings) -> None:
-        """Go on with other settings; the buffers and samples stay."""
+        """Go on with other settings; the buffers and samples stay.
+
+        Raises
+        ------
+        ConfigError
+            When no identification could use them; nothing is changed then.
+
+        """
+        check_settings(self.chain, settings)
         self.settings = settings
         self._collector.settings = settings
         self._live.restart()
@@ -241,12 +262,19 @@ class CalibrationSession:
                     f'samples to go on with have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
+        self._collector.remember(samples)
         self.samples = [*samples, *self.samples]
         self._live.restart()
 
     @property
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
+        missing = [self.joint_names[k] for k in self._collector.track.missing]
+        if missing and self._foreign_names:
+            return (
+                f'waiting for joint states of {", ".join(missing)}; those that come name '
+                f'{", ".join(self._foreign_names)}: set joint_names?'
+            )
         return self._collector.state()
 
     def account(self) -> Account:
@@ -336,15 +364,19 @@ class CalibrationSession:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
             raise InputError(f'{err} ({self.account()})') from err
-        self.adopt(result)
+        self.adopt(result, self.samples)
         return result
 
-    def adopt(self, result: Identification) -> None:
-        """Keep a result as the calibration if it is accepted, else the last good one stays."""
+    def adopt(self, result: Identification, samples: Iterable[Sample]) -> None:
+        """Keep a result as the calibration if it is accepted, else the last good one stays.
+
+        `samples` are those there were when the identification began.
+        """
         if result.accepted:
             after = (result.validation or result.fitted).figures[1]
             self.calibration = Calibration(
-                result.chain, result.before, result.world_frame, after.rms_mm, len(self.samples)
+                *(result.chain, result.before, result.world_frame, after.rms_mm),
+                known=frozenset(samples),
             )
 
     def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:
@@ -361,7 +393,7 @@ class CalibrationSession:
                 f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
             )
-        self.calibration = Calibration(chain, None, world_frame, rms_mm, len(self.samples))
+        self.calibration = Calibration(chain, None, world_frame, rms_mm, frozenset(self.samples))
 
     def validate(self) -> tuple[ErrorFigures, ErrorFigures | None]:
         """Judge the calibration on the samples taken since; nothing is fitted.
@@ -387,7 +419,7 @@ class CalibrationSession:
         for sample in self.samples:
             frames.of(sample)
         sigmas = (self.settings.sigma_position, self.settings.sigma_orientation)
-        since = self.samples[self.calibration.taken :]
+        since = [each for each in self.samples if each not in self.calibration.known]
         sets = [each for part in collect(since, sigmas, frames) for each in part]
         if not sets:
             raise InputError('no samples have been taken since: measure some new poses first')
@@ -454,5 +486,5 @@ class CalibrationSession:
         if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
             return
         self._looked_ns = now_ns or 0
-        self.delay = collector.find_delay(self.chain)
+        self.delay = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None

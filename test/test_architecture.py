@@ -21,7 +21,7 @@ ORDER = [
     {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
     {'cdr', 'dwells', 'delays', 'robust', 'simulation', 'sources', 'tables'},
     {'collector', 'export', 'frames', 'journal'},
-    {'problem'},
+    {'archive', 'problem'},
     {'live', 'validation'},
     {'identification'},
     {'selection', 'salvage'},
