@@ -147,7 +147,8 @@ class Archive:
         return self.folder / f'{self._robot}_{moment}{ending}'
 
     def _files(self, ending: str) -> list[Path]:
-        """Return the files of this robot, the oldest first."""
+        """Return the files of this robot that hold anything, the oldest first."""
         name = re.compile(rf'{re.escape(self._robot)}_\d{{8}}T\d{{12}}Z{re.escape(ending)}')
         found = self.folder.glob(f'*{ending}')
-        return sorted(path for path in found if name.fullmatch(path.name))
+        mine = [path for path in found if name.fullmatch(path.name)]
+        return sorted(path for path in mine if path.stat().st_size)

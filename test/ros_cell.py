@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
@@ -39,13 +40,21 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from calib_ros import se3
+from calib_ros.config import Settings, load_chain
 from calib_ros.node import CalibrationNode
+from calib_ros.replay import Recording
+from calib_ros.session import CalibrationSession
+from calib_ros.simulation import Cell as SimulatedCell
+from calib_ros.simulation import drive, faulty, measure
+from calib_ros.sources import STANDARD
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 BURST_NS = 370_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
+START = 1_700_000_000_000_000_000
+STOPS = 24
 _count = itertools.count()
 
 
@@ -141,11 +150,19 @@ class Cell:
             self._publishers[key] = publisher
         return self._publishers[key]
 
-    def play(self, streams, reliability=ReliabilityPolicy.RELIABLE, node=None, late_ns=0):
+    def play(
+        self,
+        streams,
+        reliability=ReliabilityPolicy.RELIABLE,
+        node=None,
+        late_ns=0,
+        jitter=None,
+    ):
         """Publish messages by topic in the order of their stamps, as a bag or a robot does.
 
-        All but joint states come `late_ns` later than their stamps. Returns when the node has
-        taken all; a node in a child process is not waited for.
+        All but joint states come `late_ns` later than their stamps; a generator `jitter` makes
+        everything come up to 0.3 s late. Returns when the node has taken all; a node in a child
+        process is not waited for.
         """
         node = node or self.node
         queue = []
@@ -154,6 +171,11 @@ class Cell:
             stream = 'joints' if isinstance(messages[0], JointState) else 'poses'
             late = 0 if stream == 'joints' else late_ns
             queue += [(stamp_ns(m) + late, stream, publisher, m) for m in messages]
+        if jitter is not None:
+            late = jitter.integers(0, 300_000_000, len(queue))
+            queue = [
+                (item[0] + int(more), *item[1:]) for item, more in zip(queue, late, strict=True)
+            ]
         queue.sort(key=lambda item: item[0])
         for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
             wanted = node.session.received.copy() if node else {}
@@ -274,3 +296,45 @@ KINDS = {
     'measured_odometry': Odometry,
     'measured_distance': Range,
 }
+
+
+def true_arm():
+    return faulty(load_chain('ur10e'), SimulatedCell(), np.random.default_rng(1))
+
+
+def shift(truth):
+    """Return a recording: the arm moves to 24 configurations and is measured at each."""
+    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=4)
+    rng = np.random.default_rng(2)
+    configurations = truth.random_joints(STOPS, rng)
+    stamps, joints, pose_stamps = drive(configurations, cell, START)
+    poses = measure(truth, np.repeat(configurations, 4, axis=0), rng, 2e-5, 1e-4).at(pose_stamps)
+    return Recording(truth.joint_names, stamps, joints, poses, np.zeros(len(poses), bool))
+
+
+def assert_same(first, second):
+    for name in ('stamps_ns', 'joints', 'positions', 'oriented', 'approach', 'delay'):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    np.testing.assert_allclose(first.rotations, second.rotations, rtol=0, atol=1e-15)
+
+
+def direct(recording, **settings):
+    """Return a session that has taken a recording without ROS."""
+    session = CalibrationSession(load_chain('ur10e'), Settings(**settings))
+    messages = [*joint_messages(recording), *pose_messages(recording.poses)]
+    for message in sorted(messages, key=stamp_ns):
+        if isinstance(message, PoseStamped):
+            session.take(STANDARD[0], STANDARD[0].type, message)
+        else:
+            session.take_joints(message)
+    return session
+
+
+def topics(recording, **more):
+    """Return the messages of a recording by topic."""
+    joints, poses = joint_messages(recording), pose_messages(recording.poses)
+    return {'joint_states': joints, 'measured_pose': poses, **more}
+
+
+def values_of(message):
+    return {item.key: item.value for item in message.status[0].values}

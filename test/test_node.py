@@ -25,7 +25,21 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from ros_cell import KINDS, Cell, Child, joint_messages, pose_messages, stamp_ns
+from ros_cell import (
+    KINDS,
+    STOPS,
+    Cell,
+    Child,
+    assert_same,
+    direct,
+    joint_messages,
+    pose_messages,
+    shift,
+    stamp_ns,
+    topics,
+    true_arm,
+    values_of,
+)
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Float64MultiArray, String
@@ -36,31 +50,23 @@ from calib_ros import node as node_module
 from calib_ros.config import Settings, calibration_record, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
-from calib_ros.replay import Recording, replay, write_bag
+from calib_ros.replay import replay, write_bag
 from calib_ros.session import CalibrationSession
 from calib_ros.simulation import Cell as SimulatedCell
-from calib_ros.simulation import drive, faulty, measure, random_frame
+from calib_ros.simulation import faulty, measure, random_frame
 from calib_ros.sources import STANDARD
 
-START = 1_700_000_000_000_000_000
-STOPS = 24
 SHIPPED = Path(__file__).parents[1] / 'config' / 'calibration_node.yaml'
 
 
 @pytest.fixture(scope='module')
 def truth():
-    return faulty(load_chain('ur10e'), SimulatedCell(), np.random.default_rng(1))
+    return true_arm()
 
 
 @pytest.fixture(scope='module')
 def recording(truth):
-    """Return a short shift: the arm moves to 24 configurations and is measured at each."""
-    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=4)
-    rng = np.random.default_rng(2)
-    configurations = truth.random_joints(STOPS, rng)
-    stamps, joints, pose_stamps = drive(configurations, cell, START)
-    poses = measure(truth, np.repeat(configurations, 4, axis=0), rng, 2e-5, 1e-4).at(pose_stamps)
-    return Recording(truth.joint_names, stamps, joints, poses, np.zeros(len(poses), bool))
+    return shift(truth)
 
 
 @pytest.fixture(scope='module')
@@ -70,31 +76,8 @@ def motion(truth, recording):
     some = slice(5, -5, 2)
     poses = measure(truth, recording.joints[some], rng, 2e-5, 1e-4)
     stamps = recording.joint_stamps_ns[some] + 30_000_000
-    return Recording(
-        truth.joint_names,
-        recording.joint_stamps_ns,
-        recording.joints,
-        poses.at(stamps),
-        np.zeros(len(poses), bool),
-    )
-
-
-def assert_same(first, second):
-    for name in ('stamps_ns', 'joints', 'positions', 'oriented', 'approach', 'delay'):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    np.testing.assert_allclose(first.rotations, second.rotations, rtol=0, atol=1e-15)
-
-
-def direct(recording, **settings):
-    """Return a session that has taken a recording without ROS."""
-    session = CalibrationSession(load_chain('ur10e'), Settings(**settings))
-    messages = [*joint_messages(recording), *pose_messages(recording.poses)]
-    for message in sorted(messages, key=stamp_ns):
-        if isinstance(message, PoseStamped):
-            session.take(STANDARD[0], STANDARD[0].type, message)
-        else:
-            session.take_joints(message)
-    return session
+    none = np.zeros(len(poses), bool)
+    return replace(recording, poses=poses.at(stamps), held_out=none)
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
@@ -124,12 +107,6 @@ def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, ex
         assert live.delay == expected.delay == replayed.delay
         if mode == 'continuous':
             assert abs(live.delay.seconds - 0.03) < 0.002
-
-
-def topics(recording, **more):
-    """Return the messages of a recording by topic."""
-    joints, poses = joint_messages(recording), pose_messages(recording.poses)
-    return {'joint_states': joints, 'measured_pose': poses, **more}
 
 
 @pytest.fixture
@@ -485,10 +462,6 @@ def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cel
 # What it publishes
 
 
-def values_of(message):
-    return {item.key: item.value for item in message.status[0].values}
-
-
 def test_diagnostics_status_and_corrected_pose(monkeypatch, tmp_path, recording, truth):
     monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
     joints = joint_messages(recording)
@@ -677,15 +650,11 @@ def test_stamps_follow_simulated_time(monkeypatch, tmp_path):
 def test_several_robots_in_one_process(tmp_path, recording, truth):
     rng = np.random.default_rng(12)
     small = faulty(load_chain('meca500'), SimulatedCell(), rng)
-    shift = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=4)
-    configurations = small.random_joints(STOPS, rng)
-    stamps, joints, pose_stamps = drive(configurations, shift, START)
-    poses = measure(small, np.repeat(configurations, 4, axis=0), rng, 1e-5, 1e-4).at(pose_stamps)
-    other = Recording(small.joint_names, stamps, joints, poses, np.zeros(len(poses), bool))
+    other = shift(small)
     with Cell() as cell:
-        for namespace, chain, shift in (('/a', 'ur10e', recording), ('/b', 'meca500', other)):
+        for namespace, chain, played in (('/a', 'ur10e', recording), ('/b', 'meca500', other)):
             node = cell.start(namespace=namespace, chain=chain, data_dir=str(tmp_path))
-            messages = {f'{namespace}/{name}': m for name, m in topics(shift).items()}
+            messages = {f'{namespace}/{name}': m for name, m in topics(played).items()}
             cell.play(messages, node=node)
         first = cell.start_call('identify', node='/a/calibration_node')
         second = cell.start_call('identify', node='/b/calibration_node')
