@@ -26,7 +26,7 @@ from calib_ros.dwells import Mean, RestlessError, average
 from calib_ros.messages import Reading
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
-from calib_ros.track import CAUSES, Motion, Rows, Track
+from calib_ros.track import CAUSES, Motion, Rows, Track, unwrapped
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
@@ -63,6 +63,7 @@ class Collector:
 
     def __init__(self, revolute: Sequence[bool], settings: Settings) -> None:
         self.settings = settings
+        self._revolute = np.array(revolute, dtype=bool)
         self._track = Track(revolute, settings.max_gap, settings.joint_buffer)
         self._waiting: dict[StreamKey, Rows] = {}
         self._taken: dict[StreamKey, set[int]] = {}
@@ -172,7 +173,7 @@ class Collector:
         self._round(self._track.newest_ns, ends_here=True)
         for rows in self._waiting.values():
             if rows.count:
-                self._count_causes(self._track.at(rows.stamps - self.delay_ns).cause)
+                self._count_causes(self._track.causes(rows.stamps - self.delay_ns))
                 rows.keep(np.zeros(rows.count, dtype=bool))
 
     def state(self) -> str:
@@ -304,7 +305,7 @@ class Collector:
             stamps = rows.stamps - self.delay_ns
             due = stamps <= until
             if due.any():
-                cause = self._track.at(stamps[due]).cause
+                cause = self._track.causes(stamps[due])
                 self._count_causes(cause)
                 fine = int((cause == 0).sum())
                 if fine:
@@ -384,7 +385,8 @@ class Collector:
         if not np.isnan(rows[:, _COVARIANCE]).any():
             covariance = rows[:, _COVARIANCE].mean(axis=0).reshape(6, 6)
         if which is None:
-            joints = motion.joints[0] + (motion.joints[mean.used] - motion.joints[0]).mean(axis=0)
+            steps = unwrapped(motion.joints[mean.used] - motion.joints[0], self._revolute)
+            joints = motion.joints[0] + steps.mean(axis=0)
             velocity = acceleration = None
             approach = motion.approach[0]
         else:
@@ -429,9 +431,8 @@ class Collector:
     # Buffers
 
     def _make_room(self, columns: tuple[int, ...]) -> None:
-        """Let go the older half of the samples of some joints."""
-        if self.settings.mode == 'continuous':  # nothing may be held any longer
-            self._round(self._track.newest_ns - self._lateness_ns)
+        """Let go the older half of the samples of some joints; nothing may be held any longer."""
+        self._round(self._track.newest_ns - self._lateness_ns)
         if self._track.full(columns):
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 

@@ -115,7 +115,7 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('calibration_node', **node_options)
         chain_name = self._declare(
-            'chain', '', 'chain file of the robot, or the name of one that calib_ros ships'
+            'chain', '', 'chain file or URDF of the robot, or the name of one that calib_ros ships'
         )
         self._declare('executor', 'events', 'events or single_threaded: how messages are taken')
         self._serial = self._declare('serial', '', 'serial number of the robot, for the record')

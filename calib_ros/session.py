@@ -17,7 +17,7 @@ from calib_ros import messages
 from calib_ros.chain import Chain
 from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
-from calib_ros.delays import Delay
+from calib_ros.delays import Delay, Watch
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
 from calib_ros.live import LiveEstimate, barely_moved
@@ -155,6 +155,7 @@ class CalibrationSession:
         self.samples: list[Sample] = []
         self.received: Counter[str] = Counter()
         """Messages that came so far, by stream."""
+        self._watch = None if continuous else Watch(len(self.chain.joints))
         self.delay: Delay | None = None
         """How late the measurements are stamped, as far as the motion shows."""
         self._dropped: Counter[str] = Counter()
@@ -201,6 +202,8 @@ class CalibrationSession:
         else:
             self._watch_order('joints', reading.stamp_ns)
             self._look_for_delay(reading.stamp_ns)
+            if self._watch is not None and len(columns) == len(self.chain.joints):
+                self._watch_clocks(reading.stamp_ns, values)
             self._collector.add_joints(columns, reading.stamp_ns, values)
             self._take()
         return values if len(columns) == len(self.chain.joints) else None
@@ -225,6 +228,8 @@ class CalibrationSession:
             reading.distance is not None,
             source.eye_in_hand,
         )
+        if self._watch is not None and reading.position is not None and not key.eye_in_hand:
+            self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
 
     def finish(self) -> None:
@@ -253,6 +258,7 @@ class CalibrationSession:
         if not self.samples:
             raise InputError('there is no sample to remove')
         sample = self.samples.pop()
+        self._unused['poses: of a sample that was taken back'] += sample.count
         self._collector.forget(sample)
         self._live.restart()
         return sample
@@ -301,6 +307,19 @@ class CalibrationSession:
             tuple(self._foreign_names),
         )
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what an engineer should know about the measurements."""
+        if self.delay is None or self.settings.mode == 'continuous':
+            return ()  # there it is a parameter of the fit
+        left = self.delay.seconds - self.settings.delay
+        if abs(left) <= self.settings.settle:
+            return ()
+        return (
+            f'measurements are stamped {left:.3f} s later than the joint states of their time: '
+            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
+        )
+
     def status(self) -> str:
         """Return in words how far the samples have come."""
         fitted = [sample for sample in self.samples if not sample.validation]
@@ -321,7 +340,7 @@ class CalibrationSession:
             still = barely_moved(self.chain, np.array([sample.joints for sample in fitted]))
             if still:
                 words.append(f'hardly moved so far: {", ".join(still)}')
-        return f'{", ".join(words)}; {self.state}'
+        return '; '.join([', '.join(words), *self.warnings, self.state])
 
     # Identification
 
@@ -475,6 +494,14 @@ class CalibrationSession:
         if stamp_ns < self._newest[stream]:
             self._notes[f'{stream} with a stamp older than the one before'] += 1
         self._newest[stream] = max(stamp_ns, self._newest[stream])
+
+    def _watch_clocks(self, stamp_ns: int, values: Sequence[float]) -> None:
+        """Look between stops whether the clocks agree, until it shows."""
+        assert self._watch is not None
+        if self._watch.add_joints(stamp_ns, values):
+            self.delay = self._watch.look(self.chain)
+            if self.delay is not None:
+                self._watch = None
 
     def _look_for_delay(self, now_ns: int | None) -> None:
         """Look for the delay of the measurements after some time of motion, until it shows.

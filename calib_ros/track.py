@@ -128,9 +128,18 @@ class Track:
 
     @property
     def newest_ns(self) -> int:
-        """Return the stamp up to which all publishers have been heard."""
-        newest = [int(rows.stamps.max()) for rows in self._parts.values() if rows.count]
-        return min(newest, default=0)
+        """Return the stamp up to which every joint that anybody names has been heard."""
+        heard = self._heard()
+        return int(heard[heard > 0].min(initial=np.iinfo(np.int64).max)) if heard.any() else 0
+
+    def _heard(self) -> Stamps:
+        """Return (n,) the newest stamp of each joint, zero where nobody has named it."""
+        heard = np.zeros(len(self._revolute), dtype=np.int64)
+        for columns, rows in self._parts.items():
+            if rows.count:
+                index = list(columns)
+                heard[index] = np.maximum(heard[index], rows.stamps.max())
+        return heard
 
     def full(self, columns: tuple[int, ...]) -> bool:
         """Tell whether there is no room for another sample of some joints."""
@@ -157,23 +166,33 @@ class Track:
     def at(self, stamps: Stamps) -> Motion:
         """Return the motion at stamps (N,), after `sort`."""
         shape = (len(stamps), len(self._revolute))
-        joints, velocity, acceleration = (np.zeros(shape) for _ in range(3))
-        approach = np.zeros(shape)
-        cause = np.full(shape, 1, dtype=np.intp)
-        # A joint that several publishers name is taken from the one that names the most.
-        for columns, rows in sorted(self._parts.items(), key=lambda item: len(item[0])):
+        joints, velocity, acceleration, approach = (np.zeros(shape) for _ in range(4))
+        for columns, rows in self._by_size():
             index = list(columns)
+            revolute = self._revolute[index]
             why, first, last = self._brackets(rows.stamps, stamps)
-            found = _interpolated(rows, stamps, first, last, self._revolute[index])
-            came = _approach(rows.values, first, found[0], self._came[index])
+            found = _interpolated(rows, stamps, first, last, revolute)
+            came = _approach(rows.values, first, found[0], self._came[index], revolute)
             good = np.ix_(why == 0, index)
             for whole, part in zip(
                 (joints, velocity, acceleration, approach), (*found, came), strict=True
             ):
                 whole[good] = part[why == 0]
+        return Motion(joints, velocity, acceleration, approach, self.causes(stamps))
+
+    def causes(self, stamps: Stamps) -> NDArray[np.intp]:
+        """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
+        cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
+        for columns, rows in self._by_size():
+            index = list(columns)
+            why = self._brackets(rows.stamps, stamps)[0]
             worse = cause[:, index] != 0
             cause[:, index] = np.where(worse, why[:, np.newaxis], cause[:, index])
-        return Motion(joints, velocity, acceleration, approach, cause.max(axis=1, initial=0))
+        return np.asarray(cause.max(axis=1, initial=0))
+
+    def _by_size(self) -> list[tuple[tuple[int, ...], Rows]]:
+        """Return the parts; a joint that several name is taken from the last that has it."""
+        return sorted(self._parts.items(), key=lambda item: len(item[0]))
 
     def _brackets(
         self, known: Stamps, stamps: Stamps
@@ -199,22 +218,33 @@ class Track:
         A joint stands where its value [rad or m] has stayed within `still` during a window [s].
         """
         common: Stamps | None = None
-        for rows in self._parts.values():
-            found = _standing(rows, still, round(window * 1e9), self._max_gap_ns)
+        for columns, rows in self._parts.items():
+            values = _continuous(rows.values, self._revolute[list(columns)])
+            found = _standing(rows.stamps, values, still, round(window * 1e9), self._max_gap_ns)
             common = found if common is None else _intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
 
     def release(self, before_ns: int) -> int:
-        """Let go the samples before a stamp, after `sort`; return how many."""
+        """Let go the samples before a stamp, after `sort`; return how many.
+
+        The last one is kept, unless others name the joints of a publisher that has fallen silent.
+        """
         gone = 0
-        for columns, rows in self._parts.items():
+        heard = self._heard()
+        for columns, rows in tuple(self._parts.items()):
+            index = list(columns)
             cut = int(np.searchsorted(rows.stamps, before_ns))
-            cut = min(cut, max(rows.count - 2, 0))
+            if 0 < cut == rows.count and (heard[index] > rows.stamps[-1]).all():
+                del self._parts[columns]
+                gone += cut
+                continue
+            cut = min(cut, rows.count - 1)
             if cut <= 0:
                 continue
-            index = list(columns)
             here = np.array([cut])
-            came = _approach(rows.values, here, rows.values[here], self._came[index])
+            came = _approach(
+                rows.values, here, rows.values[here], self._came[index], self._revolute[index]
+            )
             self._came[index] = came[0]
             rows.keep(np.arange(cut, rows.count))
             gone += cut
@@ -261,7 +291,7 @@ def _interpolated(
     origin = values[first]
     span = (known[last] - known[first]) * 1e-9
     share = (stamps - known[first]) * 1e-9 / np.maximum(span, 1e-9)
-    step = _unwrapped(values[last] - origin, revolute)
+    step = unwrapped(values[last] - origin, revolute)
     joints = origin + share[:, np.newaxis] * step
     velocity = step / np.maximum(span, 1e-9)[:, np.newaxis]
     before, behind = first - 1, np.maximum(last, first + 1) + 1
@@ -274,7 +304,7 @@ def _interpolated(
     even = np.diff(times, axis=0).max(axis=0) < 3.0 * np.diff(times, axis=0).min(axis=0)
     inner[inner] = even
     near, times = near[:, even], times[:, even]
-    heights = _unwrapped(values[near] - origin[inner], revolute)  # (4, N, n)
+    heights = unwrapped(values[near] - origin[inner], revolute)  # (4, N, n)
     at, slope, bend = _lagrange(times)
     joints[inner] = origin[inner] + np.einsum('kn,knj->nj', at, heights)
     velocity[inner] = np.einsum('kn,knj->nj', slope, heights)
@@ -295,42 +325,81 @@ def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return at, slope, bend
 
 
-def _unwrapped(steps: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+def unwrapped(steps: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
     """Return differences of joint values; a driver may count angles within one turn."""
     turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
     return np.asarray(steps - np.where(revolute, turn, 0.0))
 
 
+def _continuous(values: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+    """Return joint values (M, n) in sequence without jumps of a turn."""
+    steps = unwrapped(np.diff(values, axis=0), revolute)
+    return np.asarray(values[:1] + np.cumsum(np.vstack([0.0 * values[:1], steps]), axis=0))
+
+
 def _approach(
-    values: FloatArray, first: NDArray[np.intp], now: FloatArray, came: FloatArray
+    values: FloatArray,
+    first: NDArray[np.intp],
+    now: FloatArray,
+    came: FloatArray,
+    revolute: NDArray[np.bool_],
 ) -> FloatArray:
     """Return the signs (N, n) of the last move of each joint before it stood as it does now.
 
-    Looked for further and further back among the samples (M, n) before index `first` (N,);
-    `came` (n,) holds the signs from before them.
+    The last of the samples (M, n) up to index `first` (N,) from which a joint has moved tells;
+    where there is none, `came` (n,) holds the signs from before them.
     """
-    signs = np.zeros_like(now)
+    signs = np.tile(came, (len(now), 1))
     if len(values) == 0:
         return signs
-    back = 1
-    while True:
-        change = now - values[np.maximum(first - back, 0)]
-        found = (signs == 0.0) & (np.abs(change) > MOVED)
-        signs[found] = np.sign(change[found])
-        if back > first.max(initial=0):
-            return np.where(signs == 0.0, came, signs)
-        back *= 4
+    path = _continuous(values, revolute)
+    now = path[first] + unwrapped(now - path[first], revolute)
+    for j in range(values.shape[1]):
+        there = _last_outside(path[:, j], first, now[:, j] - MOVED, now[:, j] + MOVED)
+        moved = there >= 0
+        signs[moved, j] = np.sign(now[moved, j] - path[there[moved], j])
+    return signs
 
 
-def _standing(rows: Rows, still: float, window_ns: int, max_gap_ns: int) -> Stamps:
+def _last_outside(
+    values: FloatArray, last: NDArray[np.intp], low: FloatArray, high: FloatArray
+) -> NDArray[np.intp]:
+    """Return the index (N,) of the last value (M,) up to `last` (N,) beyond low or high, or -1.
+
+    By the extremes of blocks of 1, 2, 4, ... values: first over ever larger blocks to the one
+    that holds it, then into the half that does.
+    """
+    lows, highs = [values], [values]
+    while len(lows[-1]) > 1:
+        even = len(lows[-1]) // 2 * 2
+        lows.append(lows[-1][:even].reshape(-1, 2).min(axis=1))
+        highs.append(highs[-1][:even].reshape(-1, 2).max(axis=1))
+    end = last + 1  # what comes before is still to be searched
+    found, sizes = np.full(len(last), -1), np.zeros(len(last), dtype=np.intp)
+    for level in range(len(lows)):
+        here = np.flatnonzero((found < 0) & (end >> level & 1 == 1))
+        block = (end[here] >> level) - 1
+        hit = (lows[level][block] < low[here]) | (highs[level][block] > high[here])
+        found[here[hit]], sizes[here[hit]] = block[hit], level
+        end[here[~hit]] -= 1 << level
+    for level in reversed(range(len(lows) - 1)):
+        here = np.flatnonzero(sizes > level)
+        block = 2 * found[here] + 1
+        hit = (lows[level][block] < low[here]) | (highs[level][block] > high[here])
+        found[here] = np.where(hit, block, block - 1)
+    return found
+
+
+def _standing(
+    stamps: Stamps, values: FloatArray, still: float, window_ns: int, max_gap_ns: int
+) -> Stamps:
     """Return (K, 2) from when to when the joints of one publisher stood."""
-    stamps, values = rows.stamps, rows.values
-    if rows.count == 0:
+    if len(stamps) == 0:
         return np.zeros((0, 2), dtype=np.int64)
-    index = np.arange(rows.count)
+    index = np.arange(len(stamps))
     gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
     begin = index[gap][np.cumsum(gap) - 1]  # where the samples without a gap begin
-    quiet = np.ones(rows.count, dtype=bool)
+    quiet = np.ones(len(stamps), dtype=bool)
     back = begin
     for lag in range(1, LAGS + 1):
         back = np.searchsorted(stamps, stamps - window_ns * lag // LAGS)
@@ -341,7 +410,7 @@ def _standing(rows: Rows, still: float, window_ns: int, max_gap_ns: int) -> Stam
     ends = np.union1d(ends, np.flatnonzero(quiet & np.concatenate([gap[1:], [False]])))
     found = np.stack([stamps[back[starts]], stamps[ends]], axis=1)
     found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch parts two stands
-    return np.asarray(found, dtype=np.int64)
+    return np.asarray(found[found[:, 0] < found[:, 1]], dtype=np.int64)
 
 
 def _intersection(first: Stamps, second: Stamps) -> Stamps:

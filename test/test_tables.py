@@ -148,9 +148,15 @@ def test_a_quaternion_of_another_length_is_named_with_its_line(read, quat):
         read(POSES.replace('0.5,-0.5,0.5,0.5', quat))
 
 
-def test_a_blank_quaternion_is_no_orientation_by_chance(read):
-    with pytest.raises(InputError, match='line 3: qx must be a number'):
-        read(POSES.replace('0.5,-0.5,0.5,0.5', ',,,'))
+def test_a_blank_quaternion_makes_a_position(read):
+    fitted, _ = read(POSES.replace('0.5,-0.5,0.5,0.5', ',,,'))
+    assert fitted.oriented.tolist() == [True, False]
+
+
+@pytest.mark.parametrize('part', ['0.5,-0.5,0.5,', ',,,1', '0.5,,0.5,0.5'])
+def test_a_part_of_a_quaternion_is_no_orientation_by_chance(read, part):
+    with pytest.raises(InputError, match=r'line 3: q[xyzw] must be a number'):
+        read(POSES.replace('0.5,-0.5,0.5,0.5', part))
 
 
 @pytest.mark.parametrize('text', ['', '\n', 'q1,q2,x,y,z\n', 'q1,q2,x,y,z\n\n\n'])

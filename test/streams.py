@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages by their attributes alone, and streams of them from a moving arm."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.sources import Source
+
+MS = 1_000_000
+S = 1_000_000_000
+START = 1_717_171_717 * S  # beyond what a float64 holds to the nanosecond
+POSE = 'geometry_msgs/msg/PoseStamped'
+POINT = 'geometry_msgs/msg/PointStamped'
+TRANSFORM = 'geometry_msgs/msg/TransformStamped'
+RANGE = 'sensor_msgs/msg/Range'
+TRACKER = Source('measured_pose')
+
+
+def header(stamp_ns, frame_id='tracker'):
+    seconds, nanoseconds = divmod(int(stamp_ns), S)
+    return SimpleNamespace(
+        stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=frame_id
+    )
+
+
+def joint_state(stamp_ns, names, values):
+    return SimpleNamespace(header=header(stamp_ns, ''), name=list(names), position=values)
+
+
+def xyz(position):
+    return SimpleNamespace(**dict(zip('xyz', map(float, position), strict=True)))
+
+
+def xyzw(rotation):
+    quat = se3.to_quat(rotation).tolist()
+    return SimpleNamespace(**dict(zip('xyzw', quat, strict=True)))
+
+
+def pose(stamp_ns, position, rotation=None):
+    turn = xyzw(np.eye(3) if rotation is None else rotation)
+    both = SimpleNamespace(position=xyz(position), orientation=turn)
+    return SimpleNamespace(header=header(stamp_ns), pose=both)
+
+
+def point(stamp_ns, position):
+    return SimpleNamespace(header=header(stamp_ns), point=xyz(position))
+
+
+def transform(stamp_ns, position, child, rotation=None):
+    turn = xyzw(np.eye(3) if rotation is None else rotation)
+    both = SimpleNamespace(translation=xyz(position), rotation=turn)
+    return SimpleNamespace(header=header(stamp_ns), child_frame_id=child, transform=both)
+
+
+def distance(stamp_ns, length):
+    return SimpleNamespace(header=header(stamp_ns), range=float(length))
+
+
+def stops(configurations, move=1.0, stand=1.0):
+    """Return a function of times (N,) [s]: joints that stand at each row for a while."""
+    period = move + stand
+
+    def joints(times):
+        times = np.asarray(times, dtype=float)
+        leg = np.clip((times / period).astype(int), 0, len(configurations) - 1)
+        share = np.clip((times - leg * period - stand) / move, 0.0, 1.0)[:, np.newaxis]
+        share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        ahead = np.minimum(leg + 1, len(configurations) - 1)
+        return configurations[leg] + share * (configurations[ahead] - configurations[leg])
+
+    return joints
+
+
+def sweep(count, rng, reach=1.0):
+    """Return a smooth function of times (N,) [s]: each joint by sines of its own."""
+    shape = (4, count)
+    frequency, phase = rng.uniform(0.05, 0.3, shape), rng.uniform(0.0, 2.0 * np.pi, shape)
+    size = rng.uniform(0.2, 1.0, shape) * reach / 2.0
+
+    def joints(times):
+        angle = 2.0 * np.pi * frequency * np.asarray(times)[:, np.newaxis, np.newaxis] + phase
+        return (size * np.sin(angle)).sum(axis=1)
+
+    return joints
+
+
+def stamps(times):
+    return START + np.round(np.asarray(times) * 1e9).astype(np.int64)
