@@ -39,7 +39,7 @@ ONLY = {
     'geometry_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config'},
+    'yaml': {'config', 'export'},
 }
 
 
