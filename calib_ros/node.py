@@ -77,7 +77,7 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('calibration_node', **node_options)
         chain_name = self._declare(
-            'chain', '', 'chain file of the robot, or the name of one that calib_ros ships'
+            'chain', '', 'chain file or URDF of the robot, or the name of one that calib_ros ships'
         )
         self._target = self._declare(
             'target_filename', '', 'file that ~/save writes; default: a new one under ROS_HOME'

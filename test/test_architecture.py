@@ -15,8 +15,9 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 ORDER = [
     {'errors'},
     {'se3', 'files'},
-    {'effects'},
+    {'effects', 'description'},
     {'chain'},
+    {'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'leastsquares', 'messages', 'tables'},
     {'robust', 'simulation'},
