@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,18 +30,17 @@ from calib_ros.track import CAUSES, Motion, Rows, Track, unwrapped
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
-ADVANCE_NS = 200_000_000
+ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
 JUMP = 20
 """So many joint samples in succession from before the buffer mean that the clock jumped back."""
-_POSITION, _QUAT, _COVARIANCE, _DISTANCE = slice(0, 3), slice(3, 7), slice(7, 43), 43
-_WIDTH = 44
+_DISTANCE, _POSITION, _QUAT, _COVARIANCE = slice(0, 1), slice(0, 3), slice(3, 7), slice(7, 43)
+_WIDTH = 43
 _ONE = np.ones(1, dtype=bool)
 _FOREVER = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True, order=True)
-class StreamKey:
+class StreamKey(NamedTuple):
     """What one stream of measurements is of: device, target, and whether it only judges."""
 
     device: str
@@ -133,7 +132,7 @@ class Collector:
         fresh, self._fresh = self._fresh, []
         return fresh
 
-    def add_joints(self, columns: tuple[int, ...], stamp_ns: int, values: FloatArray) -> None:
+    def add_joints(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
         """Take the values of some joints, given by their numbers in the chain."""
         if stamp_ns < self._track.horizon_ns:
             self._backwards += 1
@@ -142,8 +141,8 @@ class Collector:
                 return
             self._start_anew()
         self._backwards = 0
-        if self._track.full:
-            self._make_room()
+        if self._track.full(columns):
+            self._make_room(columns)
         self._track.add(columns, stamp_ns, values)
         if stamp_ns - self._advanced_ns >= ADVANCE_NS:
             self._advanced_ns = stamp_ns
@@ -161,16 +160,7 @@ class Collector:
         if rows.full:
             self.dropped['poses: pose buffer full'] += 1
             return
-        row = np.full(_WIDTH, np.nan)
-        if reading.position is not None:
-            row[_POSITION] = reading.position
-        if reading.quat_xyzw is not None:
-            row[_QUAT] = reading.quat_xyzw
-        if reading.covariance is not None:
-            row[_COVARIANCE] = reading.covariance.ravel()
-        if reading.distance is not None:
-            row[_DISTANCE] = reading.distance
-        rows.append(reading.stamp_ns, row)
+        rows.append(reading.stamp_ns, reading.numbers)
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
@@ -268,7 +258,7 @@ class Collector:
             rotations = np.tile(np.eye(3), (len(values), 1, 1))
             rotations[oriented] = se3.from_quat(values[oriented, _QUAT])
             for k in np.flatnonzero(motion.cause == 0).tolist():
-                value = values[k, [_DISTANCE]] if key.distance else values[k, _POSITION]
+                value = values[k, _DISTANCE if key.distance else _POSITION]
                 mean = Mean(_ONE, value, rotations[k] if oriented[k] else None, 0.0)
                 self._make(key, int(known[k]), mean, values[k : k + 1], motion, k)
             rows.keep(~due)
@@ -344,7 +334,7 @@ class Collector:
         self, key: StreamKey, rows: Rows, good: NDArray[np.intp], motion: Motion
     ) -> None:
         values = rows.values[good]
-        measured = values[:, [_DISTANCE]] if key.distance else values[:, _POSITION]
+        measured = values[:, _DISTANCE if key.distance else _POSITION]
         oriented = not np.isnan(values[:, _QUAT]).any()
         rotations = se3.from_quat(values[:, _QUAT]) if oriented else None
         sigma = self.settings.sigma_position
@@ -440,10 +430,10 @@ class Collector:
 
     # Buffers
 
-    def _make_room(self) -> None:
-        """Let go the older half of the joint samples; nothing may be held any longer."""
+    def _make_room(self, columns: tuple[int, ...]) -> None:
+        """Let go the older half of the samples of some joints; nothing may be held any longer."""
         self._round(self._track.newest_ns - self._lateness_ns)
-        if self._track.full:
+        if self._track.full(columns):
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 
     def _start_anew(self) -> None:

@@ -564,7 +564,6 @@ class CalibrationNode(Node):
         return {
             'robot': self.session.chain.name,
             'recording': self.session.recording,
-            'state': self.session.state,
             'calibrated': self.session.calibration is not None,
             'last identification': self._last,
             'joint states': account.joint_states,

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from operator import itemgetter
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -22,10 +24,12 @@ from calib_ros.live import LiveEstimate, barely_moved
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Frames, Sample, collect
-from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.sources import Source
 from calib_ros.validation import ErrorFigures, compare
+
+Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
+Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
@@ -160,7 +164,7 @@ class CalibrationSession:
         self._newest = {'joints': 0, 'poses': 0}
         self._looked_ns = 0
         self._frame_ids: dict[str, list[str]] = {}
-        self._layouts: dict[tuple[str, ...], tuple[tuple[int, ...], list[int]] | None] = {}
+        self._layouts: dict[tuple[str, ...], Layout] = {}
         self._foreign_names: list[str] = []
         self._live = LiveEstimate(self._problem_of)
 
@@ -180,17 +184,17 @@ class CalibrationSession:
 
     # Messages
 
-    def take_joints(self, message: Any) -> FloatArray | None:
-        """Take a JointState; return its values (n,) in the order of the chain if it has all."""
+    def take_joints(self, message: Any) -> Sequence[float] | None:
+        """Take a JointState; return its values in the order of the chain if it has all."""
         self.received['joints'] += 1
         try:
             reading = messages.joint_state(message)
-            columns, index = self._layout(reading.names)
+            columns, pick = self._layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
             return None
-        values = reading.values[index]
-        if not np.isfinite(values).all():
+        values = pick(reading.values)
+        if not math.isfinite(sum(values)):
             self._dropped['joints: NaN or infinite joint value'] += 1
             return None
         if not self.recording:
@@ -460,21 +464,19 @@ class CalibrationSession:
             self.samples.append(sample)
             self.on_sample(sample)
 
-    def _layout(self, names: Sequence[str]) -> tuple[tuple[int, ...], list[int]]:
-        """Return which joints of the chain a message names, and where in the message."""
+    def _layout(self, names: Sequence[str]) -> Layout:
+        """Return which joints of the chain a message names, and how to pick their values."""
         key = tuple(names)
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
             known = [(k, key.index(n)) for k, n in enumerate(self.joint_names) if n in key]
-            self._layouts[key] = (
-                (tuple(k for k, _ in known), [i for _, i in known]) if known else None
-            )
+            self._layouts[key] = (tuple(k for k, _ in known), _picker([i for _, i in known]))
             named = {name for names in self._layouts for name in names}
             missing = [name for name in self.joint_names if name not in named]
             self._foreign_names = sorted(named) if missing else []
         layout = self._layouts[key]
-        if layout is None:
+        if not layout[0]:
             raise messages.MessageError('none of the joints in the message')
         return layout
 
@@ -514,3 +516,10 @@ class CalibrationSession:
         self._looked_ns = now_ns or 0
         self.delay = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None
+
+
+def _picker(index: Sequence[int]) -> Picker:
+    """Return a function that picks some values of a sequence."""
+    if len(index) > 1:
+        return itemgetter(*index)
+    return lambda values: tuple(values[i] for i in index)
