@@ -24,7 +24,7 @@ from calib_ros.frames import start_frames
 from calib_ros.leastsquares import Fit, System, minimise, triangular_factor
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
-from calib_ros.robust import OUTLIER, Robust, robust_fit
+from calib_ros.robust import OUTLIER, Robust, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
 from calib_ros.validation import Comparison, Parameter, compare, refusals, residuals, validate
 
@@ -188,7 +188,7 @@ def identify(problem: Problem) -> Identification:
     rough = start
     if few.count < system.count // 2:
         rough = minimise(start, names, few, tolerance=1e-2).chain
-    robust = robust_fit(rough, names, system, problem.loss)
+    robust = thorough_fit(rough, names, system, problem.loss)
     fit = robust.fit
     before = minimise(start, [n for n in names if model.owns_frame(n)], system)
     factor = fit.normal.factor()

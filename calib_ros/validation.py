@@ -15,7 +15,7 @@ from calib_ros.chain import DH_KINDS, Chain
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
-from calib_ros.robust import OUTLIER, Robust, distances_of, robust_fit, weights_of
+from calib_ros.robust import OUTLIER, Robust, distances_of, reweighted, weights_of
 from calib_ros.se3 import FloatArray
 
 CONFIDENCE = 0.95
@@ -226,7 +226,7 @@ def _leave_one_place_out(
         own = [name for name in names if name.partition('.')[0] in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
             elsewhere = [name for name in fitted if name not in own]
-            trained = robust_fit(chain, elsewhere, others, problem.loss).fit.chain
+            trained = reweighted(chain, elsewhere, others, problem.loss).fit.chain
             found.append(minimise(trained, own, problem.system(inside)).chain)
     number = {frame: k for k, pair in enumerate(problem.separations) for frame in pair[:2]}
     parts = [
