@@ -53,6 +53,9 @@ class Observations:
         Positions and rotations count for nothing then.
     base, tool : str
         Frames of the chain that hold for these pairs.
+    socket : bool
+        The target, a ball, sat in a socket of unknown place: it was at the origin of the world all
+        the time, and the world's axes are those of the arm's base.
 
     """
 
@@ -66,6 +69,7 @@ class Observations:
     distances: FloatArray | None = None
     base: str = 'base'
     tool: str = 'tool'
+    socket: bool = False
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""

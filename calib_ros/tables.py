@@ -203,7 +203,7 @@ def _observations(path: Path, joints: int, rows: Rows, columns: Sequence[str]) -
     numbers = np.array([_numbers(path, line, row, numeric) for line, row in rows])
     q = numbers[:, :joints]
     if kind == 'location':
-        return Observations.from_arrays(q, np.zeros((len(rows), 3)))
+        return replace(Observations.from_arrays(q, np.zeros((len(rows), 3))), socket=True)
     if kind == 'distance':
         at_origin = Observations.from_arrays(q, np.zeros((len(rows), 3)))
         return replace(at_origin, distances=numbers[:, joints])
