@@ -61,7 +61,7 @@ class Watch:
         self._poses = Rows(7, WATCHED)
         self._begun_ns = 0
 
-    def add_joints(self, stamp_ns: int, values: FloatArray) -> bool:
+    def add_joints(self, stamp_ns: int, values: Sequence[float]) -> bool:
         """Take joint values; return whether it is time to look."""
         if not self._begun_ns:
             self._begun_ns = stamp_ns

@@ -495,7 +495,7 @@ class CalibrationSession:
             self._notes[f'{stream} with a stamp older than the one before'] += 1
         self._newest[stream] = max(stamp_ns, self._newest[stream])
 
-    def _watch_clocks(self, stamp_ns: int, values: FloatArray) -> None:
+    def _watch_clocks(self, stamp_ns: int, values: Sequence[float]) -> None:
         """Look between stops whether the clocks agree, until it shows."""
         assert self._watch is not None
         if self._watch.add_joints(stamp_ns, values):
