@@ -8,7 +8,7 @@ Rows that cannot be written, because the disk is full say, wait in memory until 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -134,6 +134,14 @@ class Archive:
         write_file(path, text)
         write_file(path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
         return path
+
+    def export(self, files: Mapping[str, str]) -> Path:
+        """Write files into a new folder; return its path."""
+        folder = self._new_path('')
+        folder.mkdir(parents=True)
+        for name, content in files.items():
+            write_file(folder / name, content)
+        return folder
 
     def close(self) -> None:
         """Write what can be written, and close the journal."""

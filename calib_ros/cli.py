@@ -100,6 +100,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument('calibration', type=Path, help='calibration.yaml of an identification')
     _add_chain(export)
+    export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
+    export.add_argument('--base-link', help='of the URDF: where the arm starts')
+    export.add_argument('--tip-link', help='of the URDF: where the arm ends')
     export.add_argument('--out', type=Path, required=True, help='folder to write')
     export.add_argument('--force', action='store_true', help='overwrite files in --out')
 
@@ -260,11 +263,17 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from calib_ros.config import load_chain
-    from calib_ros.export import exports
+    from calib_ros.config import load_chain, read_text
+    from calib_ros.export import Export, exports
     from calib_ros.files import write_file
+    from calib_ros.urdf import corrected_urdf
 
-    found = exports(load_chain(options.calibration), load_chain(options.chain))
+    chain = load_chain(options.calibration)
+    found = exports(chain, load_chain(options.chain))
+    if options.urdf is not None:
+        links = (options.base_link, options.tip_link)
+        text = corrected_urdf(read_text(options.urdf), chain, *links)
+        found = (*found, Export(f'{options.urdf.stem}_corrected.urdf', text, 0.0))
     options.out.mkdir(parents=True, exist_ok=True)
     if not options.force:
         there = [each.name for each in found if (options.out / each.name).exists()]

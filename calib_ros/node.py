@@ -47,6 +47,7 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
+from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -57,6 +58,7 @@ from calib_ros.archive import Archive
 from calib_ros.chain import Chain
 from calib_ros.config import (
     STARTUP,
+    URDF_SUFFIXES,
     Settings,
     calibration_record,
     load_chain,
@@ -65,11 +67,13 @@ from calib_ros.config import (
 )
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
+from calib_ros.export import exports
 from calib_ros.problem import Problem
 from calib_ros.samples import Sample
 from calib_ros.selection import identify_model
 from calib_ros.session import Account, CalibrationSession, check_settings
 from calib_ros.sources import STANDARD, Source, parse_sources
+from calib_ros.urdf import chain_from_urdf, corrected_urdf
 
 try:
     from rclpy.experimental import EventsExecutor
@@ -81,6 +85,8 @@ INPUT_QUEUE = 2000
 CORRECTED_POSE_PERIOD = 0.1
 DIAGNOSTICS_PERIOD = 1.0
 JOIN_TIMEOUT = 1.0
+DESCRIPTION_WAIT = 10.0
+"""Time [s] for which the node waits for the robot's description."""
 SILENCE = 5.0
 """A source that has been heard before and is silent for so long [s] is reported."""
 
@@ -115,8 +121,18 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('calibration_node', **node_options)
         chain_name = self._declare(
-            'chain', '', 'chain file or URDF of the robot, or the name of one that calib_ros ships'
+            'chain',
+            '',
+            'chain file or URDF of the robot, the name of one that calib_ros ships, or '
+            'robot_description: the URDF on that topic',
         )
+        links = {
+            name: self._declare(name, '', f'of a URDF: {text}') or None
+            for name, text in (
+                ('base_link', 'where the arm starts; default: its root'),
+                ('tip_link', 'where the arm ends; default: tool0, flange or its only end'),
+            )
+        }
         self._declare('executor', 'events', 'events or single_threaded: how messages are taken')
         self._serial = self._declare('serial', '', 'serial number of the robot, for the record')
         folder = self._declare(
@@ -142,7 +158,8 @@ class CalibrationNode(Node):
                 '--ros-args -p chain:=ur10e'
             )
         home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
-        chain = load_chain(chain_name)
+        chain, self._urdf = self._load_robot(chain_name, links)
+        self._links = links
         self._archive = Archive(
             Path(folder).expanduser() if folder else home / 'calib_ros',
             f'{chain.name}_{self._serial}' if self._serial else chain.name,
@@ -177,6 +194,9 @@ class CalibrationNode(Node):
         self._identify = DeferredTrigger(
             self, '~/identify', self._answer, self._snapshot, self._run
         )
+        self._export = DeferredTrigger(
+            self, '~/export', self._answer, self._to_export, self._write_exports
+        )
         for kind, name, callback in (
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
@@ -200,10 +220,31 @@ class CalibrationNode(Node):
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        finished = self._identify.join(JOIN_TIMEOUT)
+        finished = self._identify.join(JOIN_TIMEOUT) and self._export.join(JOIN_TIMEOUT)
         self._archive.close()
         self.destroy_node()
         return finished
+
+    def _load_robot(self, name: str, links: dict[str, str | None]) -> tuple[Chain, str]:
+        """Return the nominal chain, and the URDF that it comes from if it does."""
+        if name == 'robot_description':
+            qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            found, message = wait_for_message(
+                String, self, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
+            )
+            if not found:
+                raise ConfigError(
+                    f'no robot_description has come within {DESCRIPTION_WAIT:g} s: start '
+                    'robot_state_publisher first, or set chain to a file'
+                )
+            text = message.data
+        elif Path(name).suffix in URDF_SUFFIXES:
+            text = read_text(Path(name))
+        elif any(links.values()):
+            raise ConfigError('base_link and tip_link are of use with a URDF only')
+        else:
+            return load_chain(name), ''
+        return replace(chain_from_urdf(text, **links), base=None, tool=None), text
 
     # Parameters
 
@@ -418,6 +459,23 @@ class CalibrationNode(Node):
             self._calibration_text, Path(target).expanduser() if target else None
         )
         return True, f'saved to {path}'
+
+    def _to_export(self) -> tuple[Chain, Any]:
+        """Return the calibrated chain, and the joint values (N, n) at which it was measured."""
+        if self.session.calibration is None:
+            raise InputError('there is no calibration to export: call ~/identify or ~/load first')
+        joints = [sample.joints for sample in self.session.samples]
+        return self.session.calibration.chain, joints or None
+
+    def _write_exports(self, given: tuple[Chain, Any]) -> tuple[bool, str]:
+        """Write a calibration in all forms, on a thread of its own."""
+        chain, joints = given
+        origin = calibration_record(self._calibration_text)
+        found = exports(chain, self.session.chain, joints, origin)
+        files = {each.name: each.content for each in found}
+        if self._urdf:
+            files['corrected.urdf'] = corrected_urdf(self._urdf, chain, **self._links)
+        return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def _on_load(self, request: Any) -> tuple[bool, str]:
         name = self.get_parameter('calibration_filename').value

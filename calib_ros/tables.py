@@ -225,7 +225,7 @@ class _Reader:
             return replace(plain, distance=self._number(line, row, 'distance'), device=device)
         if kinds == ['socket']:
             place = f'{row["location"]}_{row["socket"]}'
-            sample = replace(plain, position=np.zeros(3), device=place)
+            sample = replace(plain, socket=True, device=place)
             key = (plain.session, str(row['location']), str(row['socket']))
             self._places.setdefault(key, sample)
             return sample

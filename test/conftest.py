@@ -8,6 +8,8 @@ import tempfile
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ['ROS_HOME'] = os.path.join(tempfile.gettempdir(), f'calib_ros_test_{os.getpid()}')
+# As the command line has it: more threads only wait for each other on small matrices.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 import pytest

@@ -20,7 +20,8 @@ ORDER = [
     {'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
-    {'cdr', 'dwells', 'delays', 'robust', 'simulation', 'sources', 'tables'},
+    {'cdr', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
+    {'robust'},
     {'collector', 'export', 'frames', 'journal'},
     {'archive', 'problem'},
     {'live', 'validation'},
@@ -39,7 +40,7 @@ ONLY = {
     'geometry_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config'},
+    'yaml': {'config', 'export'},
 }
 
 
