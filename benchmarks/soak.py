@@ -48,9 +48,9 @@ COUNTS = ('dropped', 'not used', 'note')
 PAGE = os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
-def publisher(rates):
+def publisher(rates, namespace):
     """Publish probes until a line comes on stdin, then the arm until another one does."""
-    node = Node('publisher')
+    node = Node('publisher', namespace=namespace)
     truth = faulty(load_chain('ur10e'), Cell(), np.random.default_rng(0))
     names = list(truth.joint_names)
     out = {
@@ -119,9 +119,9 @@ def poses(truth, goals, begin, rate, wall, rng):
         yield moment, PoseStamped(header=header(wall, moment, 'tracker'), pose=pose)
 
 
-def empty():
+def empty(namespace):
     """Hear the messages with callbacks that only count."""
-    node = Node('empty')
+    node = Node('empty', namespace=namespace)
     counts = [0, 0]
 
     def hear(which):
@@ -177,14 +177,18 @@ class Process:
         return int(Path(f'/proc/{self.process.pid}/statm').read_text().split()[1]) * PAGE
 
 
-def run(seconds, rates, folder):
+def run(options, seconds, folder):
     """Run the soak; return what was found."""
     watch = Node('watch')
     executor = EventsExecutor()
     executor.add_node(watch)
-    heard = []
-    watch.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
-    identify = watch.create_client(Trigger, '/calibration_node/identify')
+    heard, mine = [], str(os.getpid())
+
+    def listen(message):
+        heard.extend(each for each in message.status if each.hardware_id == mine)
+
+    watch.create_subscription(DiagnosticArray, '/diagnostics', listen, 10)
+    identify = watch.create_client(Trigger, f'{options.namespace}/calibration_node/identify')
 
     def spin_until(predicate, timeout=60.0):
         end = time.monotonic() + timeout
@@ -194,12 +198,14 @@ def run(seconds, rates, folder):
             executor.spin_once(timeout_sec=0.1)
 
     def values():
-        return {item.key: item.value for item in heard[-1].status[0].values} if heard else {}
+        return {item.key: item.value for item in heard[-1].values} if heard else {}
 
-    parameters = ('-p', 'chain:=ur10e', '-p', f'data_dir:={folder}')
-    node = Process('-m', 'calib_ros.node', '--ros-args', *parameters)
-    idle = Process(__file__, '--role', 'empty')
-    flood = Process(__file__, '--role', 'publisher', '--rates', *rates)
+    parameters = ('-p', 'chain:=ur10e', '-p', f'data_dir:={folder}', '-p', f"serial:='{mine}'")
+    rules = ('-r', f'__ns:={options.namespace}')
+    node = Process('-m', 'calib_ros.node', '--ros-args', *parameters, *rules)
+    same = ('--namespace', options.namespace)
+    idle = Process(__file__, '--role', 'empty', *same)
+    flood = Process(__file__, '--role', 'publisher', '--rates', *options.rates, *same)
     probes = ('dropped joints: zero stamp', 'dropped poses: zero stamp')
     try:
         spin_until(lambda: all(name in values() for name in probes))
@@ -226,6 +232,9 @@ def run(seconds, rates, folder):
         sent = flood.answer()
         spin_until(lambda: len(heard) > 1 and steady(heard))
         last, other = values(), idle.answer()
+        (journal,) = folder.glob('*Z.csv')  # of now: at its end the node writes what still waits
+        with journal.open() as file:
+            in_samples = sum(int(row['count']) for row in csv.DictReader(file))
     finally:
         for each in (flood, idle, node):
             each.process.terminate()
@@ -236,9 +245,6 @@ def run(seconds, rates, folder):
         'joints': sent['joints'] + probed[probes[0]] - int(last['joint states']),
         'poses': sent['poses'] + probed[probes[1]] - int(last['poses']),
     }
-    (journal,) = folder.glob('*Z.csv')
-    with journal.open() as file:
-        in_samples = sum(int(row['count']) for row in csv.DictReader(file))
     accounted = in_samples + int(last['poses waiting'])
     for key, value in last.items():
         if key.startswith(('dropped poses', 'not used poses')):
@@ -278,8 +284,7 @@ def received(values):
 def steady(heard):
     """Tell whether nothing has changed between the last two diagnostics."""
     first, second = (
-        [v.value for v in each.status[0].values if v.key in ('joint states', 'poses')]
-        for each in heard[-2:]
+        [v.value for v in each.values if v.key in ('joint states', 'poses')] for each in heard[-2:]
     )
     return first == second
 
@@ -291,20 +296,20 @@ def main():
     parser.add_argument('--rates', type=float, nargs=2, default=(1000.0, 1000.0), metavar='HZ')
     parser.add_argument('--quick', action='store_true')
     parser.add_argument('--json', action='store_true')
+    parser.add_argument('--namespace', default=f'/soak_{os.getpid()}', help=argparse.SUPPRESS)
     parser.add_argument('--role', choices=('publisher', 'empty'), help=argparse.SUPPRESS)
     options = parser.parse_args()
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
     rclpy.init(args=[])
     if options.role == 'publisher':
-        publisher(options.rates)
+        publisher(options.rates, options.namespace)
     elif options.role == 'empty':
-        empty()
+        empty(options.namespace)
     else:
         with tempfile.TemporaryDirectory() as folder:
             os.environ['ROS_HOME'] = folder
-            found = run(
-                30.0 if options.quick else 60.0 * options.minutes, options.rates, Path(folder)
-            )
+            seconds = 30.0 if options.quick else 60.0 * options.minutes
+            found = run(options, seconds, Path(folder))
         if options.json:
             print(json.dumps(found))
         else:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -169,23 +170,27 @@ class LiveEstimate:
 
     def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
         """Return the samples that lie where the others predict them."""
-        result, good = self._result(), []
+        chain = self._estimate()
+        covariance, noise = self._uncertainty()
+        groups: dict[tuple[Any, ...], list[Sample]] = {}
         for sample in samples:
-            ((one,), _) = collect([sample], self._sigmas, self._frames)
-            left = residual_arrays(result.chain, one)[0][0]
-            model = ErrorModel(result.chain, self._names, one.base, one.tool)
-            jacobian = model.jacobian(one.joints, one.approach, one.velocity)[0, :3]
-            if one.distances is not None:
-                point = result.chain.forward(one.joints, one.approach, one.base, one.tool)[
-                    0, :3, 3
-                ]
-                jacobian = (point / np.linalg.norm(point))[np.newaxis] @ jacobian
-            spread = jacobian @ result.covariance @ jacobian.T
-            spread += np.eye(len(left)) * result.noise**2 * self._sigmas[0] ** 2
-            if left @ np.linalg.solve(spread, left) > FAR_OFF**2:
-                self.suspicious.append(sample)
-            else:
-                good.append(sample)
+            key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
+            groups.setdefault(key, []).append(sample)
+        good: list[Sample] = []
+        for members in groups.values():
+            ((some,), _) = collect(members, self._sigmas, self._frames)
+            left = residual_arrays(chain, some)[0]
+            model = ErrorModel(chain, self._names, some.base, some.tool)
+            jacobian = model.jacobian(some.joints, some.approach, some.velocity)[:, :3]
+            if some.distances is not None:
+                points = chain.forward(some.joints, some.approach, some.base, some.tool)[:, :3, 3]
+                rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+                jacobian = rays[:, np.newaxis] @ jacobian
+            spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+            spread += np.eye(left.shape[1]) * noise * self._sigmas[0] ** 2
+            size = (left * np.linalg.solve(spread, left[..., np.newaxis])[..., 0]).sum(axis=1)
+            for sample, far in zip(members, (size > FAR_OFF**2).tolist(), strict=True):
+                (self.suspicious if far else good).append(sample)
         return good
 
     def _step(self) -> FloatArray:
@@ -197,16 +202,20 @@ class LiveEstimate:
         assert self._chain is not None
         return self._chain.with_offsets(dict(zip(self._names, self._step(), strict=True)))
 
-    def _result(self) -> Estimate:
-        step, chain = self._step(), self._estimate()
-        left = max(self._cost - float(step @ self._vector), 0.0)
+    def _uncertainty(self) -> tuple[FloatArray, float]:
+        """Return the covariance by the noise that the residuals show, and its variance."""
+        left = max(self._cost - float(self._step() @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
         noise = left / freedom if freedom > 0 else 1.0
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
         matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
-        covariance = noise * np.outer(scale, scale) * np.linalg.inv(matrix)
+        return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
+
+    def _result(self) -> Estimate:
+        chain = self._estimate()
+        covariance, noise = self._uncertainty()
         jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
-        variance = np.einsum('nip,pq,niq->n', jacobian, covariance, jacobian, optimize=True)
+        variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
         sigma = float(np.sqrt(variance.mean()))
         return Estimate(
             chain, self._names, covariance, len(self._added), sigma, float(np.sqrt(noise))

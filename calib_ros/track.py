@@ -349,45 +349,48 @@ def _approach(
     The last of the samples (M, n) up to index `first` (N,) from which a joint has moved tells;
     where there is none, `came` (n,) holds the signs from before them.
     """
-    signs = np.tile(came, (len(now), 1))
     if len(values) == 0:
-        return signs
+        return np.tile(came, (len(now), 1))
     path = _continuous(values, revolute)
     now = path[first] + unwrapped(now - path[first], revolute)
-    for j in range(values.shape[1]):
-        there = _last_outside(path[:, j], first, now[:, j] - MOVED, now[:, j] + MOVED)
-        moved = there >= 0
-        signs[moved, j] = np.sign(now[moved, j] - path[there[moved], j])
-    return signs
+    there = _last_outside(path, first, now - MOVED, now + MOVED)
+    signs = np.sign(now - np.take_along_axis(path, there, axis=0))
+    return np.asarray(np.where(there >= 0, signs, came))
 
 
 def _last_outside(
     values: FloatArray, last: NDArray[np.intp], low: FloatArray, high: FloatArray
 ) -> NDArray[np.intp]:
-    """Return the index (N,) of the last value (M,) up to `last` (N,) beyond low or high, or -1.
+    """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high.
 
-    By the extremes of blocks of 1, 2, 4, ... values: first over ever larger blocks to the one
-    that holds it, then into the half that does.
+    It is -1 where there is none. By the extremes of blocks of 1, 2, 4, ... values: first over
+    ever larger blocks to the one that holds it, then into the half that does.
     """
     lows, highs = [values], [values]
     while len(lows[-1]) > 1:
         even = len(lows[-1]) // 2 * 2
-        lows.append(lows[-1][:even].reshape(-1, 2).min(axis=1))
-        highs.append(highs[-1][:even].reshape(-1, 2).max(axis=1))
-    end = last + 1  # what comes before is still to be searched
-    found, sizes = np.full(len(last), -1), np.zeros(len(last), dtype=np.intp)
+        lows.append(np.minimum(lows[-1][:even:2], lows[-1][1:even:2]))
+        highs.append(np.maximum(highs[-1][:even:2], highs[-1][1:even:2]))
+    shape, low, high = low.shape, low.ravel(), high.ravel()
+    column = np.tile(np.arange(shape[1]), shape[0])
+    end = np.repeat(last + 1, shape[1])  # what comes before is still to be searched
+    found, sizes = np.full(len(end), -1), np.zeros(len(end), dtype=np.intp)
+
+    def outside(level: int, block: NDArray[np.intp], here: NDArray[np.intp]) -> NDArray[np.bool_]:
+        where = (block, column[here])
+        return np.asarray((lows[level][where] < low[here]) | (highs[level][where] > high[here]))
+
     for level in range(len(lows)):
         here = np.flatnonzero((found < 0) & (end >> level & 1 == 1))
         block = (end[here] >> level) - 1
-        hit = (lows[level][block] < low[here]) | (highs[level][block] > high[here])
+        hit = outside(level, block, here)
         found[here[hit]], sizes[here[hit]] = block[hit], level
         end[here[~hit]] -= 1 << level
     for level in reversed(range(len(lows) - 1)):
         here = np.flatnonzero(sizes > level)
         block = 2 * found[here] + 1
-        hit = (lows[level][block] < low[here]) | (highs[level][block] > high[here])
-        found[here] = np.where(hit, block, block - 1)
-    return found
+        found[here] = np.where(outside(level, block, here), block, block - 1)
+    return found.reshape(shape)
 
 
 def _standing(
@@ -400,11 +403,12 @@ def _standing(
     gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
     begin = index[gap][np.cumsum(gap) - 1]  # where the samples without a gap begin
     quiet = np.ones(len(stamps), dtype=bool)
+    joints = values.T.copy()  # numpy is slow over a short last axis
     back = begin
     for lag in range(1, LAGS + 1):
         back = np.searchsorted(stamps, stamps - window_ns * lag // LAGS)
         back = np.maximum(np.minimum(back, index - 1), begin)
-        quiet &= np.abs(values - values[back]).max(axis=1) <= still
+        quiet &= np.abs(joints - np.take(joints, back, axis=1)).max(axis=0) <= still
     starts = np.flatnonzero(quiet & ~np.concatenate([[False], quiet[:-1]]) | (quiet & gap))
     ends = np.flatnonzero(quiet & ~(np.concatenate([quiet[1:], [False]])))
     ends = np.union1d(ends, np.flatnonzero(quiet & np.concatenate([gap[1:], [False]])))

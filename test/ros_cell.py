@@ -5,12 +5,15 @@
 The nodes run in the test's process, in a context of their own, or in a child process.
 """
 
+import fcntl
 import itertools
 import os
+import random
 import select
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 
 import numpy as np
@@ -39,6 +42,7 @@ from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
+from calib_ros import node as node_module
 from calib_ros import se3
 from calib_ros.config import Settings, load_chain
 from calib_ros.node import CalibrationNode
@@ -51,11 +55,11 @@ from calib_ros.sources import STANDARD
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+node_module.TAKING_PERIOD = 0.005
 BURST_NS = 370_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
 START = 1_700_000_000_000_000_000
 STOPS = 24
-_count = itertools.count()
 
 
 class Cell:
@@ -65,7 +69,7 @@ class Cell:
     """
 
     def __init__(self, executor_type=EventsExecutor, **parameters):
-        self.domain = 1 + (os.getpid() + 7 * next(_count)) % 101
+        self._lock, self.domain = free_domain()
         self.context = rclpy.Context()
         rclpy.init(
             context=self.context,
@@ -101,6 +105,7 @@ class Cell:
         assert all(ended)
         self.peer.destroy_node()
         self.context.try_shutdown()
+        self._lock.close()
 
     def __enter__(self):
         return self
@@ -197,7 +202,9 @@ class Child:
             for name, value in os.environ.items()
             if name not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')
         }
-        domain = domain or 1 + (os.getpid() + 7 * next(_count)) % 101
+        self._lock = None
+        if domain is None:
+            self._lock, domain = free_domain()
         given = [word for name, v in parameters.items() for word in ('-p', f'{name}:={v}')]
         self.process = subprocess.Popen(
             [sys.executable, *command, '--ros-args', *arguments, *given],
@@ -214,6 +221,8 @@ class Child:
         if self.process.poll() is None:
             self.process.kill()
         self.process.communicate()
+        if self._lock is not None:
+            self._lock.close()
 
     def wait_for(self, text, timeout=20.0):
         """Wait until it has printed a text; return all that it has printed."""
@@ -235,6 +244,22 @@ class Child:
 
     def kill(self):
         assert self.end(signal.SIGKILL) == -signal.SIGKILL
+
+
+def free_domain():
+    """Return a domain that no other test on this machine uses, and the lock that keeps it."""
+    first = random.SystemRandom().randrange(101)
+    for k in range(101):
+        domain = 1 + (first + k) % 101
+        path = os.path.join(tempfile.gettempdir(), f'calib_ros_domain_{domain}')
+        lock = open(path, 'w')  # noqa: SIM115
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            lock.close()
+        else:
+            return lock, domain
+    raise AssertionError('no ROS domain is free')
 
 
 def stamp_ns(message):

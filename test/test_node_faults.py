@@ -99,7 +99,7 @@ def test_a_killed_node_goes_on_with_all_its_samples(tmp_path, recording):
     with cell_and_child(data_dir=tmp_path) as (cell, child):
         cell.play(part(recording, 0.0, 12.0))
         cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 11)
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 10)
         child.kill()
     (path,) = tmp_path.glob('*Z.csv')
     with path.open('a') as file:
@@ -107,15 +107,15 @@ def test_a_killed_node_goes_on_with_all_its_samples(tmp_path, recording):
     with cell_and_child(data_dir=tmp_path, resume='true') as (cell, child):
         output = child.wait_for('ready to calibrate')
         assert 'was cut off and is left out' in output
-        assert f'resumed 11 samples of {path}' in output
+        assert f'resumed 10 samples of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 22)
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 20)
         answer = cell.call('identify')
         assert answer.success, answer.message
-        assert '23 pairs' in answer.message  # the last stop had not ended
+        assert '22 pairs' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
     expected.finish()
-    survived = [s for s in expected.samples if not 11.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
+    survived = [s for s in expected.samples if not 10.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
     for kept, sample in zip(samples_in(tmp_path), survived, strict=True):
         assert kept.stamp_ns == sample.stamp_ns
         np.testing.assert_array_equal(kept.joints, sample.joints)
@@ -200,6 +200,13 @@ def test_ended_while_an_identification_runs(journal, number):
         assert 'Traceback' not in child.output
 
 
+def test_the_last_stop_is_kept_at_the_end(tmp_path, recording):
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        cell.play(topics(recording))
+        assert len(cell.node.session.samples) == STOPS - 2
+    assert len(samples_in(tmp_path)) == STOPS
+
+
 # A full disk
 
 
@@ -208,7 +215,7 @@ def test_a_full_disk(tmp_path, recording):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         cell.play(part(recording, 0.0, 6.0))
         cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 5)
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 4)
         (path,) = tmp_path.glob('*Z.csv')
         _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
         full = path.stat().st_size + 100  # there is room for a part of the next row
@@ -220,8 +227,8 @@ def test_a_full_disk(tmp_path, recording):
             assert said in heard[-1].status[0].message
 
         level(DiagnosticStatus.ERROR, 'samples are in memory only')
-        cell.spin_until(lambda: values_of(heard[-1])['samples'] == '23')
-        assert len(samples_in(tmp_path)) == 5
+        cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
+        assert len(samples_in(tmp_path)) == 4
         answer = cell.call('identify')
         assert answer.success, answer.message
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
@@ -318,8 +325,22 @@ def test_a_tracker_that_is_too_late_is_counted(cell, recording):
     account = cell.node.session.account()
     late = account.dropped['poses: later than lateness allows']
     assert late + account.waiting == len(recording.poses)
-    cell.spin_until(lambda: heard and heard[-1].status[0].level == DiagnosticStatus.WARN)
-    assert 'later than lateness allows' in heard[-1].status[0].message
+    said = 'messages are dropped (poses: later than lateness allows)'
+    cell.spin_until(lambda: any(said in message.status[0].message for message in heard))
+
+
+def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
+    some = pose_messages(recording.poses)
+    for message in some[80:]:
+        message.pose.position.z += 0.02
+    words = cell.listen(String, 'calibration_node/status')
+    cell.play(part(recording, 0.0, 20.0))
+    cell.spin_until(lambda: words and words[-1].data.startswith('18 samples'))
+    assert 'fit' not in words[-1].data
+    joints = topics(recording)['joint_states'][1000:]
+    cell.play({'joint_states': joints, 'measured_pose': some[80:]})
+    said = 'does not fit to the others, was the target moved?'
+    cell.spin_until(lambda: said in words[-1].data)
 
 
 # Messages that do not fit
