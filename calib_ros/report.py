@@ -13,10 +13,10 @@ import numpy as np
 
 import calib_ros
 from calib_ros import effects
-from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import dump_chain
 from calib_ros.identification import Identification
-from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
+from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
