@@ -14,11 +14,11 @@ import numpy as np
 
 import calib_ros
 from calib_ros import effects
-from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import Settings, dump_chain, dump_yaml
 from calib_ros.identification import Identification
 from calib_ros.session import Calibration
-from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
+from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
 HOLDS = 1.5
 """A calibration whose error on new samples has grown by more does not hold."""
