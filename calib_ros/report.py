@@ -29,7 +29,7 @@ WEAK = 0.01
 def summary(result: Identification) -> str:
     """Return the one line that an operator reads."""
     before, after = (result.validation or result.fitted).figures
-    text = f'{len(result.fitted.judged)} pairs, RMS {before.rms_mm:.3f} -> '
+    text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
@@ -67,7 +67,7 @@ def provenance(result: Identification) -> dict[str, Any]:
         'software': f'calib_ros {calib_ros.__version__}',
         'accepted': result.accepted,
         'world_frame': result.world_frame,
-        'pairs': len(result.fitted.judged),
+        'samples': len(result.fitted.judged),
         'outliers': len(result.outliers),
         'validated_by': result.validated_by,
         'rms_mm_before': round(before.rms_mm, 6),
@@ -170,7 +170,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
     }
 
 
-BEFORE = 'the nominal chain with its base and tool frames fitted to the same pairs'
+BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
 
 
 def unit(name: str) -> str:

@@ -146,7 +146,7 @@ def validate(
         if problem.loss != 'none':
             distances = distances_of(after, names, problem.system(problem.judging))
             comparison = replace(comparison, judged=np.concatenate(distances) <= OUTLIER)
-        return comparison, f'{len(comparison.judged)} held-out pairs'
+        return comparison, f'{len(comparison.judged)} held-out samples'
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
