@@ -292,11 +292,14 @@ def identifiability_in_words(result: Identification) -> list[str]:
         f'one sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
         f'(median), {sigma["max"]:.3f} mm at most'
     )
-    o = result.observability
-    lines.append(
-        f'observability O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
-    )
+    lines.append(f'observability {observability_in_words(result)}')
     return lines
+
+
+def observability_in_words(result: Identification) -> str:
+    """Return the observability indices."""
+    o = result.observability
+    return f'O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
 
 
 def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
