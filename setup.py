@@ -27,10 +27,12 @@ setup(
             'colcon-python-setup-py',
             'colcon-ros',
             'hypothesis',
+            'kinpy',
             'mypy',
             'pytest',
             'ruff',
             'types-PyYAML',
+            'yourdfpy',
         ],
     },
     data_files=[

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | simulate | csv2bag | demo`.
+"""The command line: `calib_ros identify | simulate | csv2bag | chain | demo`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
 result is not accepted.
@@ -95,11 +95,29 @@ def _parser() -> argparse.ArgumentParser:
     _add_chain(csv2bag)
     _add_storage(csv2bag)
 
+    export = command(
+        'export', _export, 'write a calibration in the forms that controllers and others read'
+    )
+    export.add_argument('calibration', type=Path, help='calibration.yaml of an identification')
+    _add_chain(export)
+    export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
+    export.add_argument('--base-link', help='of the URDF: where the arm starts')
+    export.add_argument('--tip-link', help='of the URDF: where the arm ends')
+    export.add_argument('--out', type=Path, required=True, help='folder to write')
+    export.add_argument('--force', action='store_true', help='overwrite files in --out')
+
+    chain = command('chain', _chain, 'print the chain file of a robot, to read and to edit')
+    chain.add_argument('robot', help='URDF, chain file, or a robot by its name (ur10e, ...)')
+    chain.add_argument('--base-link', help='of a URDF: where the arm starts, else its root')
+    chain.add_argument('--tip-link', help='of a URDF: where the arm ends, such as tool0')
+    chain.add_argument('--convention', help='of the table from a URDF: standard or modified')
+    chain.add_argument('--out', type=Path, help='file to write instead')
+
     demo = command(
         'demo', _demo, 'simulate an arm, identify it, and compare the result with the truth'
     )
     demo.add_argument('--out', type=Path, default=Path('demo'), help='folder for what it writes')
-    demo.add_argument('--chain', default='ur10e', help='chain file, or a robot by its name')
+    demo.add_argument('--chain', default='ur10e', help='chain file, URDF, or a robot by its name')
     demo.add_argument('--force', action='store_true', help='overwrite an earlier demo')
     _add_simulation(demo)
     return parser
@@ -107,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_chain(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        '--chain', required=True, help='chain file, or a robot by its name (ur10e, ...)'
+        '--chain', required=True, help='chain file, URDF, or a robot by its name (ur10e, ...)'
     )
 
 
@@ -241,6 +259,66 @@ def _csv2bag(options: argparse.Namespace) -> int:
     judging = np.arange(len(rows)) >= len(fitted)
     write_bag(options.bag, Recording.of_dwells(chain.joint_names, rows, judging), options.storage)
     print(f'wrote {options.bag}: {len(fitted)} poses to fit, {len(held_out)} held out')
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from calib_ros.config import load_chain, read_text
+    from calib_ros.export import Export, exports
+    from calib_ros.files import write_file
+    from calib_ros.urdf import corrected_urdf
+
+    chain = load_chain(options.calibration)
+    found = exports(chain, load_chain(options.chain))
+    if options.urdf is not None:
+        links = (options.base_link, options.tip_link)
+        text = corrected_urdf(read_text(options.urdf), chain, *links)
+        found = (*found, Export(f'{options.urdf.stem}_corrected.urdf', text, 0.0))
+    options.out.mkdir(parents=True, exist_ok=True)
+    if not options.force:
+        there = [each.name for each in found if (options.out / each.name).exists()]
+        if there:
+            raise InputError(
+                f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
+            )
+    for each in found:
+        write_file(options.out / each.name, each.content, overwrite=options.force)
+        exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
+        print(f'{options.out / each.name}: {exact}')
+    return 0
+
+
+def _chain(options: argparse.Namespace) -> int:
+    from dataclasses import replace
+
+    from calib_ros.config import (
+        URDF_SUFFIXES,
+        chain_document,
+        dump_chain,
+        load_chain,
+        read_urdf,
+    )
+    from calib_ros.files import write_file
+
+    names = ('base_link', 'tip_link', 'convention')
+    given = {name: getattr(options, name) for name in names if getattr(options, name)}
+    path = Path(options.robot)
+    if path.suffix in URDF_SUFFIXES:
+        chain = read_urdf(path, **given)
+        frames = chain_document(chain)
+        text = dump_chain(replace(chain, base=None, tool=None))
+        text += '# Known in the URDF: take a line in where the device measures in the base link,\n'
+        text += '# or the tip link itself. Without it that frame is found from the poses.\n'
+        for key in ('base', 'tool'):
+            text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
+    elif given:
+        raise InputError(f'--{next(iter(given)).replace("_", "-")} is of use with a URDF only')
+    else:
+        text = dump_chain(load_chain(options.robot))
+    if options.out is None:
+        print(text, end='')
+    else:
+        write_file(options.out, text)
     return 0
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +30,17 @@ from calib_ros.track import CAUSES, Motion, Rows, Track, unwrapped
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
-ADVANCE_NS = 200_000_000
+ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
 JUMP = 20
 """So many joint samples in succession from before the buffer mean that the clock jumped back."""
-_POSITION, _QUAT, _COVARIANCE, _DISTANCE = slice(0, 3), slice(3, 7), slice(7, 43), 43
-_WIDTH = 44
+_DISTANCE, _POSITION, _QUAT, _COVARIANCE = slice(0, 1), slice(0, 3), slice(3, 7), slice(7, 43)
+_WIDTH = 43
 _ONE = np.ones(1, dtype=bool)
+_FOREVER = np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True, order=True)
-class StreamKey:
+class StreamKey(NamedTuple):
     """What one stream of measurements is of: device, target, and whether it only judges."""
 
     device: str
@@ -93,19 +93,33 @@ class Collector:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
 
-    def find_delay(self, chain: Chain) -> Delay | None:
-        """Return how late the waiting measurements are, and take it into account from now on."""
+    def find_delay(self, chain: Chain, now_ns: int | None) -> Delay | None:
+        """Return how late the waiting measurements are, and take it into account from now on.
+
+        Only what is older by `lateness` than the stamp `now_ns` counts, of which all has come;
+        None: everything counts.
+        """
         self._sort()
         stamps, joints = self._track.samples()
+        until = _FOREVER if now_ns is None else now_ns - self._lateness_ns
+        complete = stamps <= until
         found = []
         for key, rows in self._waiting.items():
             if key.distance or key.eye_in_hand:
                 continue
-            values = rows.values
+            known = rows.stamps <= until
+            values = rows.values[known]
             oriented = not np.isnan(values[:, _QUAT]).any()
-            rotations = se3.from_quat(values[:, _QUAT]) if oriented and rows.count else None
+            rotations = se3.from_quat(values[:, _QUAT]) if oriented and len(values) else None
             found.append(
-                find_delay(chain, stamps, joints, rows.stamps, values[:, _POSITION], rotations)
+                find_delay(
+                    chain,
+                    stamps[complete],
+                    joints[complete],
+                    rows.stamps[known],
+                    values[:, _POSITION],
+                    rotations,
+                )
             )
         convincing = [delay for delay in found if delay is not None]
         if not convincing:
@@ -119,7 +133,7 @@ class Collector:
         fresh, self._fresh = self._fresh, []
         return fresh
 
-    def add_joints(self, columns: tuple[int, ...], stamp_ns: int, values: FloatArray) -> None:
+    def add_joints(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
         """Take the values of some joints, given by their numbers in the chain."""
         if stamp_ns < self._track.horizon_ns:
             self._backwards += 1
@@ -128,8 +142,8 @@ class Collector:
                 return
             self._start_anew()
         self._backwards = 0
-        if self._track.full:
-            self._make_room()
+        if self._track.full(columns):
+            self._make_room(columns)
         self._track.add(columns, stamp_ns, values)
         if stamp_ns - self._advanced_ns >= ADVANCE_NS:
             self._advanced_ns = stamp_ns
@@ -147,16 +161,7 @@ class Collector:
         if rows.full:
             self.dropped['poses: pose buffer full'] += 1
             return
-        row = np.full(_WIDTH, np.nan)
-        if reading.position is not None:
-            row[_POSITION] = reading.position
-        if reading.quat_xyzw is not None:
-            row[_QUAT] = reading.quat_xyzw
-        if reading.covariance is not None:
-            row[_COVARIANCE] = reading.covariance.ravel()
-        if reading.distance is not None:
-            row[_DISTANCE] = reading.distance
-        rows.append(reading.stamp_ns, row)
+        rows.append(reading.stamp_ns, reading.numbers)
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
@@ -247,7 +252,7 @@ class Collector:
 
     def _take_each(self, until: int) -> None:
         """Make a sample of every measurement up to a stamp of the joints."""
-        for key, rows in self._waiting.items():
+        for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= until
             if not due.any():
@@ -259,7 +264,7 @@ class Collector:
             rotations = np.tile(np.eye(3), (len(values), 1, 1))
             rotations[oriented] = se3.from_quat(values[oriented, _QUAT])
             for k in np.flatnonzero(motion.cause == 0).tolist():
-                value = values[k, [_DISTANCE]] if key.distance else values[k, _POSITION]
+                value = values[k, _DISTANCE if key.distance else _POSITION]
                 mean = Mean(_ONE, value, rotations[k] if oriented[k] else None, 0.0)
                 self._make(key, int(known[k]), mean, values[k : k + 1], motion, k)
             rows.keep(~due)
@@ -334,7 +339,7 @@ class Collector:
     def _average(self, begin: int, end: int) -> None:
         """Make one sample of each stream from what was measured in a stop."""
         calm = begin + round(self.settings.settle * 1e9)
-        for key, rows in self._waiting.items():
+        for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= end
             inside = due & (stamps >= calm)
@@ -352,7 +357,7 @@ class Collector:
         self, key: StreamKey, rows: Rows, good: NDArray[np.intp], motion: Motion
     ) -> None:
         values = rows.values[good]
-        measured = values[:, [_DISTANCE]] if key.distance else values[:, _POSITION]
+        measured = values[:, _DISTANCE if key.distance else _POSITION]
         oriented = not np.isnan(values[:, _QUAT]).any()
         rotations = se3.from_quat(values[:, _QUAT]) if oriented else None
         sigma = self.settings.sigma_position
@@ -431,16 +436,14 @@ class Collector:
             )
         )
 
+    def remember(self, samples: Sequence[Sample]) -> None:
+        """Allow no other samples of the stamps of these."""
+        for sample in samples:
+            self._taken.setdefault(_key(sample), set()).add(sample.stamp_ns)
+
     def forget(self, sample: Sample) -> None:
         """Allow a sample of the same stamp again."""
-        key = StreamKey(
-            sample.device,
-            sample.target,
-            sample.validation,
-            sample.distance is not None,
-            sample.eye_in_hand,
-        )
-        self._taken.get(key, set()).discard(sample.stamp_ns)
+        self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
         since = sample.stamp_ns - round(1e9 * sample.delay) - self._stops.stamps
         self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
 
@@ -452,10 +455,10 @@ class Collector:
 
     # Buffers
 
-    def _make_room(self) -> None:
-        """Let go the older half of the joint samples; nothing may be held any longer."""
+    def _make_room(self, columns: tuple[int, ...]) -> None:
+        """Let go the older half of the samples of some joints; nothing may be held any longer."""
         self._round(self._complete_ns)
-        if self._track.full:
+        if self._track.full(columns):
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 
     def _start_anew(self) -> None:
@@ -464,3 +467,13 @@ class Collector:
         self.notes['the clock jumped back'] += 1
         self._track.clear()
         self._advanced_ns = self._settled_ns = self._sampled_ns = 0
+
+
+def _key(sample: Sample) -> StreamKey:
+    return StreamKey(
+        sample.device,
+        sample.target,
+        sample.validation,
+        sample.distance is not None,
+        sample.eye_in_hand,
+    )

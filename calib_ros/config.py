@@ -3,7 +3,7 @@
 """Settings, and chain files: YAML to chain and back.
 
 One schema for nominal and corrected chains, so that an output is an input. `docs/formats.md`
-describes it.
+describes it. A URDF is read as a nominal chain.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ import math
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.chain import DH_KINDS, Chain, Frame, Joint
+from calib_ros.chain import DH_KINDS, Chain, Convention, Frame, Joint
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.urdf import chain_from_urdf
 
 CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
@@ -30,6 +31,7 @@ FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 MODES = ('dwell', 'continuous', 'triggered')
 """How samples are taken."""
+URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
 
@@ -154,18 +156,38 @@ class Settings:
 
 
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
-    """Read a chain file, or a robot that calib_ros ships by its name, for example "ur10e"."""
+    """Read a chain file, a URDF, or a robot that calib_ros ships by its name, such as "ur10e".
+
+    Base and tool frame of a URDF are left out: they lead to its links, and neither the world of a
+    measuring device nor its target is one.
+    """
     path = Path(name_or_path)
+    if path.suffix in URDF_SUFFIXES:
+        return replace(read_urdf(path), base=None, tool=None)
     if not path.suffix and not path.is_file():
         robots = shipped_robots()
         if str(name_or_path) not in robots:
             raise UnknownNameError('robot', str(name_or_path), robots)
         path = robots[path.name]
+    return parse_chain(read_text(path), str(path))
+
+
+def read_urdf(
+    path: Path,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    convention: Convention = 'standard',
+) -> Chain:
+    """Read the chain between two links of a URDF, with its frames (`urdf.chain_from_urdf`)."""
+    return chain_from_urdf(read_text(path), base_link, tip_link, convention)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a chain file."""
     try:
-        text = path.read_text(encoding='utf-8')
+        return path.read_text(encoding='utf-8')
     except (OSError, UnicodeDecodeError) as err:
         raise ConfigError(f'cannot read chain file {path}: {err}') from err
-    return parse_chain(text, str(path))
 
 
 def shipped_robots() -> dict[str, Path]:
@@ -240,6 +262,14 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
                 raise
             raise UnknownNameError(f'{where}: {err.what}', err.name, err.alternatives) from err
         raise ConfigError(f'{where}: {err}') from err
+
+
+def calibration_record(text: str) -> dict[str, Any]:
+    """Return what a chain file says about where its numbers come from."""
+    import yaml
+
+    record = yaml.safe_load(text).get('calibration')
+    return record if isinstance(record, dict) else {}
 
 
 def chain_document(chain: Chain) -> dict[str, Any]:

@@ -10,6 +10,7 @@ parabola; the identification then fits the rest as a parameter (`base.delay`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from calib_ros import se3
 from calib_ros.chain import Chain
 from calib_ros.se3 import FloatArray
-from calib_ros.track import Stamps
+from calib_ros.track import Rows, Stamps
 
 STEP = 5e-3
 """Time between two values of the speeds [s]."""
@@ -29,6 +30,10 @@ CONVINCING = 0.8
 """Least correlation."""
 MOVING = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
+WATCH_NS = 15_000_000_000
+"""Time over which a watch looks."""
+WATCHED = 20_000
+"""Samples that it keeps at most."""
 SMOOTHING = 0.05
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
 
@@ -39,6 +44,56 @@ class Delay:
 
     seconds: float
     correlation: float
+
+
+class Watch:
+    """Joint values and poses while the arm moves between stops, to see whether the clocks agree.
+
+    Parameters
+    ----------
+    joints : int
+        Number of joints.
+
+    """
+
+    def __init__(self, joints: int) -> None:
+        self._joints = Rows(joints, WATCHED)
+        self._poses = Rows(7, WATCHED)
+        self._begun_ns = 0
+
+    def add_joints(self, stamp_ns: int, values: Sequence[float]) -> bool:
+        """Take joint values; return whether it is time to look."""
+        if not self._begun_ns:
+            self._begun_ns = stamp_ns
+        if not self._joints.full:
+            self._joints.append(stamp_ns, values)
+        return abs(stamp_ns - self._begun_ns) > WATCH_NS
+
+    def add_pose(
+        self, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float] | None
+    ) -> None:
+        """Take a measured pose or position."""
+        if not self._poses.full:
+            self._poses.append(stamp_ns, [*position, *(quat_xyzw or [np.nan] * 4)])
+
+    def look(self, chain: Chain) -> Delay | None:
+        """Return the delay if it shows, and begin anew."""
+        self._joints.sort()
+        self._poses.sort()
+        values = self._poses.values
+        oriented = len(values) > 0 and not np.isnan(values).any()
+        found = find_delay(
+            chain,
+            self._joints.stamps,
+            self._joints.values,
+            self._poses.stamps,
+            values[:, :3],
+            se3.from_quat(values[:, 3:]) if oriented else None,
+        )
+        for rows in (self._joints, self._poses):
+            rows.keep(np.zeros(rows.count, dtype=bool))
+        self._begun_ns = 0
+        return found
 
 
 def find_delay(

@@ -81,7 +81,7 @@ def _start_one(
     ]
     if not names:
         return chain
-    if not observations.positions.any() and observations.distances is None:
+    if observations.socket:
         return _in_socket(chain, observations)
     index = np.unique(np.linspace(0, len(observations) - 1, SUBSET).round().astype(int))
     subset = observations.select(index)

@@ -57,6 +57,7 @@ class Kind:
     moving: bool = False
     base: str = 'base'
     tool: str = 'tool'
+    socket: bool = False
 
     @property
     def rows(self) -> int:
@@ -75,7 +76,9 @@ def structurally_independent(
     What is left out is a gauge freedom of the chain, not a lack of measurements. Frames that are
     not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
-    by full pose (Everett, Driels and Mooring 1987). `extra` returns further equations at a chain.
+    by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
+    poses: turning the whole cell about it shows nowhere else than in residuals. `extra` returns
+    further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -85,21 +88,51 @@ def structurally_independent(
     )
     approach = rng.choice([-1.0, 1.0], joints.shape)
     rows = np.zeros((0, len(names)))
-    if extra is not None:
-        rows = extra(anywhere, names)[0]
     velocity = rng.normal(size=joints.shape)
-    for kind in kinds:
+    for number, kind in enumerate(kinds):
+        posed = joints
+        if kind.socket:
+            posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
+            shift = {f'{kind.base}.{axis}': -x for axis, x in zip('xyz', place, strict=True)}
+            anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
-        jacobian = model.jacobian(joints, approach, velocity if kind.moving else None)
+        jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
         if kind.distance:
-            line = anywhere.forward(joints, approach, kind.base, kind.tool)[:, :3, 3]
+            line = anywhere.forward(posed, approach, kind.base, kind.tool)[:, :3, 3]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
             jacobian = jacobian[:, :3]
         rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
+    if extra is not None:
+        rows = np.concatenate([rows, extra(anywhere, names)[0]])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
+
+
+MEETING = 1e-10
+"""Distance [m] from which two places are one."""
+MEETING_STEPS = 100
+
+
+def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
+    """Return joint values (N, n) that bring the target to one place, and that place (3,) [m].
+
+    It is that of the first; the others are led there by damped Gauss-Newton steps.
+    """
+    driven = [f'{j.name}.{"theta" if j.type == "revolute" else "d"}' for j in chain.joints]
+    model = ErrorModel(chain, driven, kind.base, kind.tool)
+    signs = np.array([joint.sign for joint in chain.joints], dtype=float)
+    wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]
+    for _ in range(MEETING_STEPS):
+        left = wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+        if np.abs(left).max() < MEETING:
+            break
+        jacobian = model.jacobian(joints)[:, :3] * signs
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        step = np.linalg.solve(square, left[..., np.newaxis])
+        joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
+    return joints, wanted
 
 
 def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:

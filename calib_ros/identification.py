@@ -24,9 +24,17 @@ from calib_ros.frames import start_frames
 from calib_ros.leastsquares import Fit, System, minimise, triangular_factor
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
-from calib_ros.robust import OUTLIER, Robust, robust_fit
+from calib_ros.robust import OUTLIER, Robust, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
-from calib_ros.validation import Comparison, Parameter, compare, refusals, residuals, validate
+from calib_ros.validation import (
+    Comparison,
+    Parameter,
+    compare,
+    is_length,
+    refusals,
+    residuals,
+    validate,
+)
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
@@ -90,6 +98,9 @@ class Identification:
     converged : bool
     refusals : tuple of str
         Rules of acceptance that failed, in words; none when the result is accepted.
+    weak : tuple of str
+        Parameters that the poses hardly determine, held near their nominal values by priors of a
+        third of `largest_length` or `largest_angle`.
     verdicts : tuple of Verdict
         Where the model was chosen: what paid for itself and what did not.
 
@@ -112,6 +123,7 @@ class Identification:
     iterations: int
     converged: bool
     refusals: tuple[str, ...]
+    weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
 
     @property
@@ -175,12 +187,13 @@ def identify(problem: Problem) -> Identification:
     structural = identifiability.structurally_independent(
         model, problem.free, problem.kinds, system.separation_rows
     )
-    determined = [name for name in structural if name not in problem.prior_sigmas]
+    priors = problem.prior_sigmas
+    determined = [name for name in structural if name not in priors]
     _require_enough(problem, determined)
     start = start_frames(
         model, problem.sets, problem.sigma_position, problem.sigma_orientation, problem.loss
     )
-    wanted = [n for n in problem.free if n in structural or n in problem.prior_sigmas]
+    wanted = [n for n in problem.free if n in structural or n in priors]
     few = problem.system([_some(each) for each in problem.sets])
     names = identifiability.independent(triangular_factor(start, wanted, few), wanted)
     if len(names) < len(wanted):  # more samples may determine more
@@ -188,13 +201,18 @@ def identify(problem: Problem) -> Identification:
     rough = start
     if few.count < system.count // 2:
         rough = minimise(start, names, few, tolerance=1e-2).chain
-    robust = robust_fit(rough, names, system, problem.loss)
+    robust = thorough_fit(rough, names, system, problem.loss)
     fit = robust.fit
     before = minimise(start, [n for n in names if model.owns_frame(n)], system)
     factor = fit.normal.factor()
     if factor is None:
         factor = triangular_factor(fit.chain, names, system)
     noise, covariance = _noise(fit, names, system, factor)
+    weak = _weak(problem, names, covariance)
+    if weak:
+        return replace(
+            identify(replace(problem, priors=weak | dict(problem.priors))), weak=tuple(weak)
+        )
     validation, validated_by = validate(problem, before.chain, fit.chain, names, robust)
     parameters = _parameters(problem, fit.chain, structural, names, covariance)
     converged = before.converged and fit.converged and robust.settled
@@ -265,6 +283,21 @@ def _noise(
     return found, identifiability.covariance(factor, middle)
 
 
+def _weak(problem: Problem, names: Sequence[str], covariance: FloatArray) -> dict[str, float]:
+    """Return priors for parameters that the poses tell no better than common sense does.
+
+    Those are DH parameters without a prior that are uncertain by more than a third of what no
+    faulty robot exceeds: its three standard deviations are the limit then.
+    """
+    known = problem.prior_sigmas
+    found = {}
+    for name, std in zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True):
+        third = (problem.largest_length if is_length(name) else problem.largest_angle) / 3.0
+        if std > third > 0.0 and name not in known and not problem.model.owns_frame(name):
+            found[name] = third
+    return found
+
+
 def _some(observations: Observations) -> Observations:
     """Return enough pairs, evenly spread, to come close to the result and to see its rank."""
     return observations.select(np.arange(0, len(observations), 1 + len(observations) // SOME))
@@ -294,11 +327,11 @@ def _outliers(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
 def _require_enough(problem: Problem, names: Sequence[str]) -> None:
     rows = configurations = 0
     for each, kind in zip(problem.sets, problem.kinds, strict=True):
+        if not len(each):
+            raise InputError(f'there are no pairs to fit between {each.base} and {each.tool}')
         count = len(np.unique(each.configurations))
         rows += count * kind.rows
         configurations += count
-    if not len(problem.observations):
-        raise InputError('there are no pairs to fit')
     if rows < len(names):
         width = problem.kinds[0].rows
         raise TooFewObservationsError(

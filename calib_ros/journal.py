@@ -15,6 +15,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from calib_ros.errors import InputError
 from calib_ros.samples import Sample
 from calib_ros.tables import cells, columns
 
@@ -29,17 +30,24 @@ class Journal:
     joints : int
         Number of joints.
 
+    Raises
+    ------
+    InputError
+        When the file is that of another robot.
+    OSError
+        When it cannot be written.
+
     """
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-        size = os.fstat(self._file).st_size
-        if size == 0:
-            self._write(columns(joints))
-        elif os.pread(self._file, 1, size - 1) != b'\n':
-            os.ftruncate(self._file, _last_line(self._file, size))
+        try:
+            self._begin(columns(joints))
+        except BaseException:
+            self.close()
+            raise
 
     def add(self, sample: Sample) -> None:
         """Write a sample.
@@ -63,6 +71,21 @@ class Journal:
     def close(self) -> None:
         """Close the file."""
         os.close(self._file)
+
+    def _begin(self, header: Sequence[str]) -> None:
+        """Write the header into a new file; leave out the row that a crash cut off."""
+        size = os.fstat(self._file).st_size
+        if size and os.pread(self._file, 1, size - 1) != b'\n':
+            size = _last_line(self._file, size)
+            os.ftruncate(self._file, size)
+        if size == 0:
+            self._write(header)
+            return
+        expected = ','.join(header).encode() + b'\n'
+        if os.pread(self._file, len(expected), 0) != expected:
+            raise InputError(
+                f'{self.path} has not the columns of a journal of this robot: move it away'
+            )
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()

@@ -124,6 +124,20 @@ class Samples:
             turn /= self.sigmas[1]
             yield flat, turn.reshape(len(turn), -1), model
 
+    def rows_of(self, chain: Chain, names: Sequence[str]) -> FloatArray:
+        """Return (N, 6, 3 or 1, P + 1) the weighted rows sample by sample, the residual last."""
+        width = 1 if self.distances is not None else 6 if self.whitening is not None else 3
+        found = []
+        for shift, turn, model in self.blocks(chain, names):
+            rows = shift.reshape(len(shift), width, -1)
+            if len(turn):
+                oriented = np.zeros_like(rows)
+                oriented[: model.rotations] = turn[:-1].reshape(model.rotations, width, -1)
+                oriented[-1] = turn[-1].reshape(width, -1)
+                rows = np.concatenate([rows, oriented], axis=1)
+            found.append(rows[[*model.order, len(names)]].transpose(2, 1, 0))
+        return np.concatenate(found)
+
     def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
         """Return (P + 1, 6 B): position and orientation rows mixed by each sample's whitening."""
         assert self.whitening is not None

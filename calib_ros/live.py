@@ -91,6 +91,7 @@ class LiveEstimate:
         self._chain: Chain | None = None
         self._added: list[Sample] = []
         self._taken = 0
+        self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
         """Samples that lie too far from what the others predict; they are left out here."""
 
@@ -99,6 +100,8 @@ class LiveEstimate:
 
         Returns None while there are too few.
         """
+        if self._latest is not None and len(samples) == self._taken:
+            return self._latest
         fresh = [sample for sample in samples[self._taken :] if not sample.validation]
         if self._chain is None or any(not self._knows(sample) for sample in fresh):
             if len(samples) < START or not self._begin(samples):
@@ -110,7 +113,8 @@ class LiveEstimate:
                     break
                 self._linearise(self._estimate())
         self._taken = len(samples)
-        return self._result()
+        self._latest = self._result()
+        return self._latest
 
     def _knows(self, sample: Sample) -> bool:
         assert self._chain is not None

@@ -8,15 +8,15 @@ which the message is counted.
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError
-from calib_ros.se3 import FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 
@@ -29,12 +29,12 @@ class JointReading(NamedTuple):
     """Joint values of one JointState, in the message's own order [rad or m]."""
 
     stamp_ns: int
-    names: list[str]
-    values: FloatArray
+    names: Sequence[str]
+    values: Sequence[float]
 
 
 class Reading(NamedTuple):
-    """One measurement: position [m], quaternion and covariance as far as they were measured.
+    """One measurement: position [m], quaternion and covariance (36) as far as they were measured.
 
     A measured distance [m] comes without a position. `child` names the target where the message
     does.
@@ -44,17 +44,24 @@ class Reading(NamedTuple):
     frame_id: str
     position: tuple[float, float, float] | None = None
     quat_xyzw: tuple[float, float, float, float] | None = None
-    covariance: FloatArray | None = None
+    covariance: tuple[float, ...] | None = None
     distance: float | None = None
     child: str = ''
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Return what was measured in one row; what comes last may be missing."""
+        if self.distance is not None:
+            return (self.distance,)
+        return (self.position or ()) + (self.quat_xyzw or ()) + (self.covariance or ())
 
 
 def joint_state(message: Any) -> JointReading:
     """Decode a sensor_msgs/JointState."""
-    values = np.asarray(message.position, dtype=np.float64)
-    if len(message.name) != len(values):
+    names, values = message.name, message.position
+    if len(names) != len(values):
         raise MessageError('names and positions differ in number')
-    return JointReading(stamp(message.header.stamp), message.name, values)
+    return JointReading(stamp(message.header.stamp), names, values)
 
 
 def pose_stamped(message: Any) -> Reading:
@@ -107,28 +114,33 @@ DECODERS: dict[str, Callable[[Any], Reading]] = {
 
 def stamp(time: Any) -> int:
     """Turn a builtin_interfaces/Time into nanoseconds."""
-    stamp_ns = time.sec * 1_000_000_000 + time.nanosec
+    stamp_ns: int = time.sec * 1_000_000_000 + time.nanosec
     if stamp_ns <= 0:
         raise MessageError('zero stamp')
-    return int(stamp_ns)
+    return stamp_ns
 
 
 def _pose(header: Any, point: Any, quaternion: Any) -> Reading:
     stamp_ns = stamp(header.stamp)
-    position = (float(point.x), float(point.y), float(point.z))
-    if not all(map(math.isfinite, position)):
+    position = x, y, z = point.x, point.y, point.z
+    if not math.isfinite(x + y + z):
         raise MessageError('NaN or infinite position')
     quat = None
     if quaternion is not None:
-        quat = (quaternion.x, quaternion.y, quaternion.z, quaternion.w)
-        length = math.sqrt(sum(part * part for part in quat))
+        quat = qx, qy, qz, qw = quaternion.x, quaternion.y, quaternion.z, quaternion.w
+        length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
         if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
             raise MessageError('quaternion not of length 1')
     return Reading(stamp_ns, header.frame_id, position, quat)
 
 
-def _covariance(numbers: Any) -> FloatArray | None:
-    covariance = np.array(numbers, dtype=np.float64).reshape(6, 6)
+def _covariance(numbers: Any) -> tuple[float, ...] | None:
+    return _checked_covariance(np.asarray(numbers, dtype=np.float64).tobytes())
+
+
+@functools.lru_cache(maxsize=16)  # most devices send the same one for ever
+def _checked_covariance(data: bytes) -> tuple[float, ...] | None:
+    covariance = np.frombuffer(data).reshape(6, 6)
     if not covariance.any():
         return None
     if not np.isfinite(covariance).all():
@@ -137,4 +149,4 @@ def _covariance(numbers: Any) -> FloatArray | None:
         raise MessageError('covariance not symmetric')
     if np.linalg.eigvalsh(covariance)[0] <= 0.0:
         raise MessageError('covariance not positive definite')
-    return covariance
+    return tuple(covariance.ravel().tolist())

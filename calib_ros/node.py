@@ -15,10 +15,8 @@ import sys
 import threading
 import time
 import traceback
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
-from datetime import datetime, timezone
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +33,8 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rclpy._rclpy_pybind11 import RCLError  # has no public name in Jazzy
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -47,37 +47,72 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
+from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros import outgoing, report
-from calib_ros.config import STARTUP, Settings, load_chain
+from calib_ros.archive import Archive
+from calib_ros.chain import Chain
+from calib_ros.config import (
+    STARTUP,
+    URDF_SUFFIXES,
+    Settings,
+    calibration_record,
+    load_chain,
+    parse_chain,
+    read_text,
+)
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
-from calib_ros.files import write_file
-from calib_ros.identification import Identification
-from calib_ros.journal import Journal
-from calib_ros.messages import DECODERS
+from calib_ros.export import exports
 from calib_ros.problem import Problem
 from calib_ros.samples import Sample
 from calib_ros.selection import identify_model
-from calib_ros.session import CalibrationSession
+from calib_ros.session import Account, CalibrationSession, check_settings
 from calib_ros.sources import STANDARD, Source, parse_sources
-from calib_ros.tables import read_table
+from calib_ros.urdf import chain_from_urdf, corrected_urdf
 
 try:
     from rclpy.experimental import EventsExecutor
 except ImportError:  # an rclpy from before it had one
     EventsExecutor = None
 
-INPUT_QUEUE = 200
+INPUT_QUEUE = 2000
+"""Messages of a topic that may wait while the node is busy; what comes on top is lost."""
 CORRECTED_POSE_PERIOD = 0.1
 DIAGNOSTICS_PERIOD = 1.0
 JOIN_TIMEOUT = 1.0
+DESCRIPTION_WAIT = 10.0
+"""Time [s] for which the node waits for the robot's description."""
 SILENCE = 5.0
 """A source that has been heard before and is silent for so long [s] is reported."""
+
+
+@dataclass
+class Hearing:
+    """What has been heard on one topic; times [s] are those of the monotonic clock."""
+
+    count: int = 0
+    before: int = 0
+    rate: float = 0.0
+    last: float | None = None
+    deaf: bool = False
+    """True when a publisher offers a QoS that is not asked for."""
+
+    def look(self, now: float, span: float) -> None:
+        """Note how many messages came in the last `span`."""
+        fresh, self.before = self.count - self.before, self.count
+        self.rate = fresh / span
+        if fresh:
+            self.last = now
+
+    @property
+    def silent(self) -> bool:
+        """Tell whether it has been heard before and is not any more."""
+        return self.last is not None and time.monotonic() - self.last > SILENCE
 
 
 class CalibrationNode(Node):
@@ -86,8 +121,18 @@ class CalibrationNode(Node):
     def __init__(self, **node_options: Any) -> None:
         super().__init__('calibration_node', **node_options)
         chain_name = self._declare(
-            'chain', '', 'chain file of the robot, or the name of one that calib_ros ships'
+            'chain',
+            '',
+            'chain file or URDF of the robot, the name of one that calib_ros ships, or '
+            'robot_description: the URDF on that topic',
         )
+        links = {
+            name: self._declare(name, '', f'of a URDF: {text}') or None
+            for name, text in (
+                ('base_link', 'where the arm starts; default: its root'),
+                ('tip_link', 'where the arm ends; default: tool0, flange or its only end'),
+            )
+        }
         self._declare('executor', 'events', 'events or single_threaded: how messages are taken')
         self._serial = self._declare('serial', '', 'serial number of the robot, for the record')
         folder = self._declare(
@@ -113,24 +158,27 @@ class CalibrationNode(Node):
                 '--ros-args -p chain:=ur10e'
             )
         home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
-        self._folder = Path(folder).expanduser() if folder else home / 'calib_ros'
-        self.session = CalibrationSession(load_chain(chain_name), settings, self._on_sample)
-        self._journal: Journal | None = None
-        self._unwritten: list[Sample] = []
-        self._journal_error = ''
+        chain, self._urdf = self._load_robot(chain_name, links)
+        self._links = links
+        self._archive = Archive(
+            Path(folder).expanduser() if folder else home / 'calib_ros',
+            f'{chain.name}_{self._serial}' if self._serial else chain.name,
+            len(chain.joints),
+            lambda: report.configuration_yaml(chain_name, self.session.settings),
+        )
+        self.session = CalibrationSession(chain, settings, self._on_sample)
         self._last = 'nothing identified yet'
         self._calibration_text = ''
-        self._dropped_before = 0
-        self._heard: Counter[str] = Counter()
-        self._heard_before: Counter[str] = Counter()
-        self._heard_at: dict[str, float] = {}
+        self._dropped_before: dict[str, int] = {}
+        self._heard: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
         self._status_text = ''
         self._joints: tuple[Any, Any] | None = None
         self._sources = parse_sources(settings.sources) or STANDARD
         if resume:
             self._resume()
-        self.add_on_set_parameters_callback(self._on_parameters)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
         self._subscribe()
         latched = QoSProfile(
             depth=1,
@@ -144,7 +192,10 @@ class CalibrationNode(Node):
         self._corrected_pose = self.create_publisher(PoseStamped, '~/corrected_pose', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self._identify = DeferredTrigger(
-            self, '~/identify', self._answer, self.session.problem, self._run
+            self, '~/identify', self._answer, self._snapshot, self._run
+        )
+        self._export = DeferredTrigger(
+            self, '~/export', self._answer, self._to_export, self._write_exports
         )
         for kind, name, callback in (
             (Trigger, '~/capture', self._on_capture),
@@ -156,22 +207,44 @@ class CalibrationNode(Node):
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(callback))
-        self.create_timer(DIAGNOSTICS_PERIOD, self._guarded(self._on_second))
-        self.create_timer(CORRECTED_POSE_PERIOD, self._guarded(self._publish_corrected_pose))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
+        for period, work in (
+            (DIAGNOSTICS_PERIOD, self._on_second),
+            (CORRECTED_POSE_PERIOD, self._publish_corrected_pose),
+        ):
+            self.create_timer(period, self._guarded(work), clock=steady)
         self.get_logger().info(
             f'ready to calibrate {self.session.chain.name}: joints '
-            f'{", ".join(self.session.joint_names)}; samples are kept in {self._folder}'
+            f'{", ".join(self.session.joint_names)}; samples are kept in {self._archive.folder}'
         )
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        finished = self._identify.join(JOIN_TIMEOUT)
-        self._write_journal()
-        if self._journal is not None:
-            self._journal.close()
-            self._journal = None
+        finished = self._identify.join(JOIN_TIMEOUT) and self._export.join(JOIN_TIMEOUT)
+        self._archive.close()
         self.destroy_node()
         return finished
+
+    def _load_robot(self, name: str, links: dict[str, str | None]) -> tuple[Chain, str]:
+        """Return the nominal chain, and the URDF that it comes from if it does."""
+        if name == 'robot_description':
+            qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            found, message = wait_for_message(
+                String, self, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
+            )
+            if not found:
+                raise ConfigError(
+                    f'no robot_description has come within {DESCRIPTION_WAIT:g} s: start '
+                    'robot_state_publisher first, or set chain to a file'
+                )
+            text = message.data
+        elif Path(name).suffix in URDF_SUFFIXES:
+            text = read_text(Path(name))
+        elif any(links.values()):
+            raise ConfigError('base_link and tip_link are of use with a URDF only')
+        else:
+            return load_chain(name), ''
+        return replace(chain_from_urdf(text, **links), base=None, tool=None), text
 
     # Parameters
 
@@ -212,22 +285,28 @@ class CalibrationNode(Node):
             if name not in known and not name.startswith(('qos_overrides.', 'use_sim_time')):
                 raise UnknownNameError('parameter', name, known)
 
-    def _on_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
-        """Take over settings that change while the node runs, all or none."""
+    def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
+        """Refuse settings that no identification could use."""
+        try:
+            check_settings(self.session.chain, self._changed(changes))
+        except CalibrationError as err:
+            return SetParametersResult(successful=False, reason=str(err))
+        return SetParametersResult(successful=True)
+
+    def _take_parameters(self, changes: Sequence[Any]) -> None:
+        """Take over settings that have changed while the node runs."""
+        settings = self._changed(changes)
+        if settings != self.session.settings:
+            self.session.change(settings)
+
+    def _changed(self, changes: Sequence[Any]) -> Settings:
         known = {item.name: item.default for item in fields(Settings)}
         values = {
             each.name: _names(each.value) if isinstance(known[each.name], tuple) else each.value
             for each in changes
             if each.name in known
         }
-        try:
-            settings = replace(self.session.settings, **values)
-            settings.for_problem()
-        except CalibrationError as err:
-            return SetParametersResult(successful=False, reason=str(err))
-        if values:
-            self.session.change(settings)
-        return SetParametersResult(successful=True)
+        return replace(self.session.settings, **values)
 
     # Topics in
 
@@ -248,13 +327,26 @@ class CalibrationNode(Node):
             name = source.type or 'geometry_msgs/msg/PoseStamped'
             taking.append((_message_type(name), source.topic, self._taking(source, name)))
         for kind, topic, callback in taking:
+            heard = self._heard[self.resolve_topic_name(topic)]
             self.create_subscription(
-                kind, topic, self._guarded(callback), qos, qos_overriding_options=overriding
+                kind,
+                topic,
+                self._guarded(callback),
+                qos,
+                qos_overriding_options=overriding,
+                event_callbacks=SubscriptionEventCallbacks(
+                    incompatible_qos=self._guarded(self._noting(heard))
+                ),
             )
 
+    def _hearing(self, topic: str) -> Hearing:
+        return self._heard.setdefault(self.resolve_topic_name(topic), Hearing())
+
     def _taking_joints(self, topic: str) -> Callable[[Any], None]:
+        heard = self._hearing(topic)
+
         def take(message: Any) -> None:
-            self._heard[topic] += 1
+            heard.count += 1
             values = self.session.take_joints(message)
             if values is not None:
                 self._joints = (message.header.stamp, values)
@@ -262,63 +354,58 @@ class CalibrationNode(Node):
         return take
 
     def _taking(self, source: Source, name: str) -> Callable[[Any], None]:
-        assert name in DECODERS
+        heard = self._hearing(source.topic)
 
         def take(message: Any) -> None:
-            self._heard[source.topic] += 1
+            heard.count += 1
             self.session.take(source, name, message)
 
         return take
 
+    def _noting(self, heard: Hearing) -> Callable[[Any], None]:
+        def note(event: Any) -> None:
+            heard.deaf = True
+
+        return note
+
     # The journal
 
     def _on_sample(self, sample: Sample) -> None:
-        self._unwritten.append(sample)
-        self._write_journal()
-
-    def _write_journal(self) -> None:
-        """Write the samples that are not on disk yet; those that cannot be are kept."""
-        try:
-            while self._unwritten:
-                if self._journal is None:
-                    self._journal = self._new_journal()
-                self._journal.add(self._unwritten[0])
-                del self._unwritten[0]
-        except OSError as err:
-            if not self._journal_error:
-                self.get_logger().error(f'samples are kept in memory only: {err}')
-            self._journal_error = str(err)
-        else:
-            self._journal_error = ''
-
-    def _new_journal(self) -> Journal:
-        path = self._folder / f'{self.session.chain.name}_{_moment()}.csv'
-        journal = Journal(path, len(self.session.chain.joints))
-        write_file(path.with_suffix('.settings.yaml'), self._configuration())
-        return journal
-
-    def _configuration(self) -> str:
-        chain = self.get_parameter('chain').value
-        return report.configuration_yaml(chain, self.session.settings)
+        before = self._archive.error
+        self._archive.add(sample)
+        if self._archive.error and not before:
+            self.get_logger().error(f'samples are kept in memory only: {self._archive.error}')
 
     def _resume(self) -> None:
         """Go on with the newest journal of this robot."""
-        found = sorted(self._folder.glob(f'{self.session.chain.name}_*Z.csv'))
-        if not found:
-            self.get_logger().warning(f'nothing to resume in {self._folder}: a new session begins')
-            return
-        joints = len(self.session.chain.joints)
-        self._journal = Journal(found[-1], joints)
-        table = read_table(found[-1], joints)
-        self.session.restore(table.samples)
-        for warning in table.warnings:
+        samples, warnings = self._archive.resume()
+        self.session.restore(samples)
+        for warning in warnings:
             self.get_logger().warning(warning)
-        self.get_logger().info(f'resumed {len(table.samples)} samples of {found[-1]}')
+        if self._archive.journal is not None:
+            self.get_logger().info(f'resumed {len(samples)} samples of {self._archive.journal}')
 
     # Services
 
-    def _run(self, problem: Problem) -> tuple[bool, str]:
+    def _snapshot(self) -> tuple[Problem, tuple[Sample, ...], dict[str, Any]]:
+        """Return the problem, its samples and where they come from, as they are now."""
+        problem = self.session.problem()
+        samples = tuple(self.session.samples)
+        origin = {
+            'robot_serial': self._serial,
+            'topics': [topic for topic, heard in self._heard.items() if heard.count],
+            'first_stamp_ns': min(sample.stamp_ns for sample in samples),
+            'last_stamp_ns': max(sample.stamp_ns for sample in samples),
+            'samples': len(samples),
+            'journal': str(self._archive.journal or ''),
+        }
+        return problem, samples, origin
+
+    def _run(
+        self, snapshot: tuple[Problem, tuple[Sample, ...], dict[str, Any]]
+    ) -> tuple[bool, str]:
         """Identify, on a thread of its own; publish only what is accepted."""
+        problem, samples, origin = snapshot
         result = identify_model(problem, self.session.settings.model)
         self._last = report.summary(result)
         self._residuals.publish(
@@ -330,8 +417,8 @@ class CalibrationNode(Node):
             )
         )
         if result.accepted:
-            self.session.adopt(result)
-            self._publish_calibration(result)
+            self.session.adopt(result, samples)
+            self._publish_calibration(result.chain, report.calibration_yaml(result, origin))
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
@@ -347,11 +434,7 @@ class CalibrationNode(Node):
         return True, f'sample {len(self.session.samples)} taken ({words})'
 
     def _on_remove_last(self, request: Any) -> tuple[bool, str]:
-        sample = self.session.remove_last()
-        if sample in self._unwritten:
-            self._unwritten.remove(sample)
-        elif self._journal is not None:
-            self._journal.remove(sample)
+        self._archive.remove(self.session.remove_last())
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
@@ -360,12 +443,8 @@ class CalibrationNode(Node):
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)
         self.session.clear()
-        self._write_journal()
-        kept = ''
-        if self._journal is not None:
-            kept = f'; they stay in {self._journal.path}'
-            self._journal.close()
-            self._journal = None
+        old = self._archive.begin_anew()
+        kept = f'; they stay in {old}' if old else ''
         return True, f'{count} samples cleared{kept}; the calibration stays'
 
     def _on_record(self, request: Any) -> tuple[bool, str]:
@@ -376,52 +455,49 @@ class CalibrationNode(Node):
         if not self._calibration_text:
             return False, 'there is no accepted calibration to save: call ~/identify first'
         target = self.get_parameter('target_filename').value
-        if target:
-            path = Path(target).expanduser()
-        else:
-            path = self._folder / f'{self.session.chain.name}_{_moment()}.yaml'
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, self._calibration_text)
-        write_file(path.with_suffix('.settings.yaml'), self._configuration(), overwrite=True)
+        path = self._archive.save(
+            self._calibration_text, Path(target).expanduser() if target else None
+        )
         return True, f'saved to {path}'
+
+    def _to_export(self) -> tuple[Chain, Any]:
+        """Return the calibrated chain, and the joint values (N, n) at which it was measured."""
+        if self.session.calibration is None:
+            raise InputError('there is no calibration to export: call ~/identify or ~/load first')
+        joints = [sample.joints for sample in self.session.samples]
+        return self.session.calibration.chain, joints or None
+
+    def _write_exports(self, given: tuple[Chain, Any]) -> tuple[bool, str]:
+        """Write a calibration in all forms, on a thread of its own."""
+        chain, joints = given
+        origin = calibration_record(self._calibration_text)
+        found = exports(chain, self.session.chain, joints, origin)
+        files = {each.name: each.content for each in found}
+        if self._urdf:
+            files['corrected.urdf'] = corrected_urdf(self._urdf, chain, **self._links)
+        return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def _on_load(self, request: Any) -> tuple[bool, str]:
         name = self.get_parameter('calibration_filename').value
-        if name:
-            path = Path(name).expanduser()
-        else:
-            saved = sorted(self._folder.glob(f'{self.session.chain.name}_*Z.yaml'))
-            if not saved:
-                raise InputError(
-                    f'there is no saved calibration of {self.session.chain.name} in '
-                    f'{self._folder}: set calibration_filename'
-                )
-            path = saved[-1]
-        chain = load_chain(path)
-        self.session.load(chain)
-        self._calibration_text = path.read_text(encoding='utf-8')
-        self._dh_parameters.publish(outgoing.dh_parameters(chain))
-        self._calibration.publish(String(data=self._calibration_text))
-        return True, f'loaded {path}'
+        path = Path(name).expanduser() if name else self._archive.newest_calibration()
+        if path is None:
+            raise InputError(
+                f'there is no saved calibration of {self.session.chain.name} in '
+                f'{self._archive.folder}: set calibration_filename'
+            )
+        text = read_text(path)
+        chain, record = parse_chain(text, str(path)), calibration_record(text)
+        self.session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
+        self._last = f'loaded {path}'
+        self._publish_calibration(chain, text)
+        return True, self._last
 
     # Topics out
 
-    def _publish_calibration(self, result: Identification) -> None:
-        self._dh_parameters.publish(outgoing.dh_parameters(result.chain))
-        self._calibration_text = report.calibration_yaml(result, self._origin())
-        self._calibration.publish(String(data=self._calibration_text))
-
-    def _origin(self) -> dict[str, Any]:
-        """Return where the samples come from, for the record."""
-        samples = list(self.session.samples)  # others are taken meanwhile
-        return {
-            'robot_serial': self._serial,
-            'topics': [topic for topic, count in self._heard.items() if count],
-            'first_stamp_ns': min(sample.stamp_ns for sample in samples),
-            'last_stamp_ns': max(sample.stamp_ns for sample in samples),
-            'samples': len(samples),
-            'journal': '' if self._journal is None else str(self._journal.path),
-        }
+    def _publish_calibration(self, chain: Chain, text: str) -> None:
+        self._calibration_text = text
+        self._dh_parameters.publish(outgoing.dh_parameters(chain))
+        self._calibration.publish(String(data=text))
 
     def _publish_corrected_pose(self) -> None:
         calibration = self.session.calibration
@@ -434,38 +510,60 @@ class CalibrationNode(Node):
         )
 
     def _on_second(self) -> None:
-        self._write_journal()
+        self._archive.write()
         text = self.session.status()
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
         now = time.monotonic()
         span, self._looked_at = now - self._looked_at, now
-        rates = {}
-        for topic, count in self._heard.items():
-            fresh = count - self._heard_before[topic]
-            rates[topic] = fresh / span
-            if fresh:
-                self._heard_at[topic] = now
-        self._heard_before = self._heard.copy()
-        silent = [topic for topic, last in self._heard_at.items() if now - last > SILENCE]
+        for heard in self._heard.values():
+            heard.look(now, span)
         account = self.session.account()
-        dropped = sum(account.dropped.values())
-        fresh_drops = dropped > self._dropped_before
-        self._dropped_before = dropped
-        level, words = DiagnosticStatus.OK, text
-        if fresh_drops:
-            level, words = DiagnosticStatus.WARN, f'messages are dropped; {text}'
-        if silent:
-            level, words = DiagnosticStatus.WARN, f'nothing heard on {", ".join(silent)}; {text}'
-        if self._journal_error:
+        name = f'{self.get_name()}: calibration'
+        level, words = self._judged(account)
+        message = DiagnosticArray(
+            status=[
+                outgoing.status(
+                    name, self._serial, level, f'{words}{text}', self._figures(account)
+                )
+            ]
+        )
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _judged(self, account: Account) -> tuple[bytes, str]:
+        """Return how grave what is wrong is, and what it is in words."""
+        wrong = [
+            f'nothing is heard on {topic} any more'
+            for topic, heard in self._heard.items()
+            if heard.silent
+        ]
+        wrong += [
+            f'{topic} is published best effort, but reliable is asked for'
+            for topic, heard in self._heard.items()
+            if heard.deaf and not heard.count
+        ]
+        fresh = {
+            cause: count
+            for cause, count in account.dropped.items()
+            if count > self._dropped_before.get(cause, 0)
+        }
+        self._dropped_before = account.dropped
+        if fresh:
+            wrong.append(f'messages are dropped ({", ".join(fresh)})')
+        level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
+        if self._archive.error:
+            wrong.insert(0, f'samples are in memory only: {self._archive.error}')
             level = DiagnosticStatus.ERROR
-            words = f'samples are in memory only: {self._journal_error}'
-        delay = self.session.delay
-        values = {
+        return level, ''.join(f'{text}; ' for text in wrong)
+
+    def _figures(self, account: Account) -> dict[str, Any]:
+        now, delay = time.monotonic(), self.session.delay
+        heard = {topic: heard for topic, heard in self._heard.items() if heard.last is not None}
+        return {
             'robot': self.session.chain.name,
             'recording': self.session.recording,
-            'state': self.session.state,
             'calibrated': self.session.calibration is not None,
             'last identification': self._last,
             'joint states': account.joint_states,
@@ -474,22 +572,14 @@ class CalibrationNode(Node):
             'samples': account.samples,
             'held-out samples': account.held_out,
             'configurations': account.configurations,
+            'journal': self._archive.journal or '',
             'delay [s]': 'not known' if delay is None else f'{delay.seconds:.4f}',
-            **{f'rate of {topic} [Hz]': f'{rate:.1f}' for topic, rate in rates.items()},
-            **{
-                f'age of {topic} [s]': f'{now - last:.1f}'
-                for topic, last in self._heard_at.items()
-            },
+            **{f'rate of {topic} [Hz]': f'{each.rate:.1f}' for topic, each in heard.items()},
+            **{f'age of {topic} [s]': f'{now - each.last:.1f}' for topic, each in heard.items()},
             **{f'not used {cause}': count for cause, count in account.unused.items()},
             **{f'dropped {cause}': count for cause, count in account.dropped.items()},
             **{f'note {cause}': count for cause, count in account.notes.items()},
         }
-        name = f'{self.get_name()}: calibration'
-        message = DiagnosticArray(
-            status=[outgoing.status(name, self._serial, level, words, values)]
-        )
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
 
     # One boundary around every callback: an exception would end the spinning
 
@@ -528,10 +618,6 @@ def _names(values: Sequence[str] | None) -> tuple[str, ...]:
 def _message_type(name: str) -> Any:
     package, _, kind = name.partition('/msg/')
     return getattr(importlib.import_module(f'{package}.msg'), kind)
-
-
-def _moment() -> str:
-    return datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
 
 
 def _executor(kind: str) -> Executor:

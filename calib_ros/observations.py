@@ -51,6 +51,9 @@ class Observations:
         How much earlier than the stamps the joints had these values [s].
     base, tool : str
         Frames of the chain that hold for these pairs.
+    socket : bool
+        The target, a ball, sat in a socket of unknown place: it was at the origin of the world all
+        the time, and the world's axes are those of the arm's base.
 
     """
 
@@ -67,6 +70,7 @@ class Observations:
     delay: FloatArray | None = None
     base: str = 'base'
     tool: str = 'tool'
+    socket: bool = False
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""

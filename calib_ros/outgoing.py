@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from calib_ros.chain import DH_KINDS, Chain
 from calib_ros.identification import Identification, residuals
 from calib_ros.observations import Observations
-from calib_ros.se3 import FloatArray, to_quat
+from calib_ros.se3 import to_quat
 
 MOST_ARROWS = 1000
 
@@ -37,9 +37,9 @@ def dh_parameters(chain: Chain) -> Float64MultiArray:
     return array
 
 
-def pose(chain: Chain, joints: FloatArray, stamp: Any, frame_id: str) -> PoseStamped:
-    """Return the pose of the target at joint values (n,)."""
-    matrix = chain.forward(joints[np.newaxis])[0]
+def pose(chain: Chain, joints: Sequence[float], stamp: Any, frame_id: str) -> PoseStamped:
+    """Return the pose of the target at joint values (n)."""
+    matrix = chain.forward(np.array([joints]))[0]
     message = PoseStamped()
     message.header.stamp = stamp
     message.header.frame_id = frame_id

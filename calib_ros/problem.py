@@ -117,7 +117,11 @@ class Problem:
         for pattern in self.priors:
             if pattern.partition('.')[0] in self.model.frame_names:
                 raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
-        for *_, distance in self.separations:
+        sockets = {each.base for each in self.sets if each.socket}
+        for *pair, distance in self.separations:
+            for base in pair:
+                if base not in sockets:
+                    raise UnknownNameError('socket that is a known distance away', base, sockets)
             if not distance > 0.0:
                 raise ConfigError(f'the distance of sockets must be positive, not {distance}')
         for pattern in self.fixed:
@@ -151,6 +155,7 @@ class Problem:
                 each.velocity is not None,
                 each.base,
                 each.tool,
+                each.socket,
             )
             for each in self.sets
         )
@@ -205,7 +210,7 @@ class Problem:
         model = self.model
         used = {name for each in self.sets for name in (each.base, each.tool)}
         held = [f'{k}.*' for k in model.frame_names if model.frame(k).fixed or k not in used]
-        held += [f'{name}.r?' for pair in self.separations for name in pair[:2]]
+        held += [f'{each.base}.r?' for each in self.sets if each.socket]
         known = dict(model.effects)
         ordered = sorted(
             model.parameter_names, key=lambda name: 2 * (name in known) + name.endswith('.d')

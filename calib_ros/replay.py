@@ -138,8 +138,11 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         if found is not None:
             count, _ = _feed(session, topics, iter(found.messages))
     if problem is None:
-        return ()
-    return (f'{path} is damaged ({problem}): {expected - count} of {expected} messages are lost',)
+        return session.warnings
+    return (
+        *session.warnings,
+        f'{path} is damaged ({problem}): {expected - count} of {expected} messages are lost',
+    )
 
 
 def _feed(

@@ -38,12 +38,15 @@ def summary(result: Identification) -> str:
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
         text += f'; with {len(result.chain.effects)} effects ({", ".join(groups)})'
-    if result.priors:
-        text += f'; priors on {len(result.priors)} parameters'
+    given = set(result.priors) - set(result.weak)
+    if given:
+        text += f'; priors on {len(given)} parameters'
     sigma = sigma_over_range(result)['max']
     if sigma > before.rms_mm:
         text += f'; trust it only near the measured poses, elsewhere sigma is up to {sigma:.1f} mm'
-    weak = weakly_determined(result)
+    if result.weak:
+        text += f'; hardly determined, held near nominal by priors: {", ".join(result.weak)}'
+    weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
         text += f'; weakly determined: {", ".join(weak)}'
     if result.accepted:
@@ -134,6 +137,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'unidentifiable': list(result.unidentifiable),
         'not_excited': list(result.not_excited),
         'weakly_determined': list(weakly_determined(result)),
+        'held_near_nominal': list(result.weak),
         'parameters': {
             p.name: {
                 'value': p.value,
@@ -238,8 +242,9 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
 def priors_in_words(result: Identification) -> list[str]:
     """Return the priors, those of effects by group."""
     known = dict(result.chain.effects)
+    why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
     lines = [
-        f'prior on {name}: {sigma:g} {unit(name)}'
+        f'prior on {name}: {sigma:.3g} {unit(name)}{why.get(name, "")}'
         for name, sigma in result.priors.items()
         if name not in known
     ]

@@ -11,12 +11,17 @@ is repeated until they stand still (iteratively reweighted least squares; Hollan
     huber        w = min(1, INNER / distance)              (Huber 1964)
 
 Clean data keep the weight 1 throughout, so nothing is lost against least squares.
+
+Gross errors that agree with each other, as from a target that was bumped, are a second model that
+the first fit may settle between or even at. Where it names outliers, or leaves more than the
+sigmas given explain, the fit is repeated from the best half of the samples (`trimmed.py`), and
+counts when half of the residuals shrink by it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -27,6 +32,7 @@ from calib_ros.chain import Chain
 from calib_ros.errors import UnknownNameError
 from calib_ros.leastsquares import Fit, System, minimise
 from calib_ros.se3 import FloatArray
+from calib_ros.trimmed import trimmed_start, trimmed_sum
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
@@ -36,6 +42,10 @@ errors in three directions 2 of 100,000 lie beyond the first."""
 OUTLIER = 6.0
 """Distance beyond which a sample is named as an outlier."""
 REWEIGHTINGS = 40
+SUSPICIOUS = 1.2
+"""RMS residual [sigma] from which gross errors may hide in it."""
+SHRUNK = 0.5
+"""Ratio of half of the residuals from which a fit is another one, not a detail of the first."""
 NOISE_FREE = 1e-6
 """Least scale [sigma]: below, residuals are rounding errors and no outliers."""
 
@@ -54,6 +64,25 @@ class Robust:
     def outliers(self) -> NDArray[np.bool_]:
         """Return (N,) which samples of all sets, one after the other, are of gross error."""
         return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')
+
+
+def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious.
+
+    The weights of the sets are left as they were used last.
+    """
+    first = robust_fit(chain, names, system, loss)
+    suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
+    if loss != 'redescending' or not suspicious:
+        return first
+    weights = [samples.weights for samples in system.sets]
+    second = reweighted(trimmed_start(chain, names, system), names, system, loss)
+    sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
+    if sums[1] < SHRUNK**2 * sums[0]:
+        return replace(second, iterations=first.iterations + second.iterations)
+    for samples, weight in zip(system.sets, weights, strict=True):
+        samples.weights = weight
+    return first
 
 
 def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
@@ -80,6 +109,17 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
             np.allclose(d, b, rtol=0.1, atol=0.1) for d, b in zip(distances, before, strict=True)
         ):
             break
+    robust = reweighted(fit.chain, names, system, loss)
+    return replace(robust, iterations=iterations + robust.iterations)
+
+
+def reweighted(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+    """Fit with the weights of a loss from a start that is good enough to tell gross errors.
+
+    The weights of the sets are left as they were used last.
+    """
+    distances = distances_of(chain, names, system)
+    iterations = 0
     settled = False
     weights = [np.ones(0)] * len(system.sets)
     for _ in range(REWEIGHTINGS):
@@ -91,10 +131,10 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
         if settled:
             break
         _weigh(system, weights)
-        fit = minimise(fit.chain, names, system, tolerance=1e-3)
-        iterations += fit.iterations
-        distances = distances_of(fit.chain, names, system)
-    fit = minimise(fit.chain, names, system)
+        fit = minimise(chain, names, system, tolerance=1e-3)
+        chain, iterations = fit.chain, iterations + fit.iterations
+        distances = distances_of(chain, names, system)
+    fit = minimise(chain, names, system)
     return Robust(fit, distances, settled, iterations + fit.iterations, loss)
 
 

@@ -38,6 +38,8 @@ class Sample:
         Of the joints, where the arm was moving.
     session, device, target : str
         Each session and device has a base frame of its own, each session and target a tool frame.
+    socket : bool
+        A ball at the target sat in a socket, whose place is not known.
     eye_in_hand : bool
         The pose is that of a fixed target in a camera on the flange.
     validation : bool
@@ -63,6 +65,7 @@ class Sample:
     session: str = ''
     device: str = ''
     target: str = ''
+    socket: bool = False
     eye_in_hand: bool = False
     validation: bool = False
     delay: float = 0.0
@@ -119,14 +122,15 @@ def collect(
     without a covariance of their own. `frames` remembers the names given to earlier samples.
     """
     frames = Frames() if frames is None else frames
-    groups: dict[tuple[str, str, bool, bool, bool], list[Sample]] = {}
+    groups: dict[tuple[str, str, bool, bool, bool, bool], list[Sample]] = {}
     for sample in samples:
         base, tool = frames.of(sample)
-        key = (base, tool, sample.distance is not None, sample.eye_in_hand, sample.validation)
+        distance = sample.distance is not None
+        key = (base, tool, distance, sample.socket, sample.eye_in_hand, sample.validation)
         groups.setdefault(key, []).append(sample)
     fitted: list[Observations] = []
     held_out: list[Observations] = []
-    for (base, tool, _, eye_in_hand, validation), members in groups.items():
+    for (base, tool, _, _, eye_in_hand, validation), members in groups.items():
         observations = replace(_observations(members), base=base, tool=tool)
         if eye_in_hand:
             observations = observations.inverted(sigmas)
@@ -168,4 +172,5 @@ def _observations(samples: Sequence[Sample]) -> Observations:
         optional('velocity'),
         optional('acceleration'),
         optional('delay'),
+        socket=samples[0].socket,
     )

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from operator import itemgetter
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -15,17 +17,19 @@ from calib_ros import messages
 from calib_ros.chain import Chain
 from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
-from calib_ros.delays import Delay
+from calib_ros.delays import Delay, Watch
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
 from calib_ros.live import LiveEstimate, barely_moved
-from calib_ros.observations import configurations
+from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Frames, Sample, collect
-from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.sources import Source
 from calib_ros.validation import ErrorFigures, compare
+
+Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
+Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
@@ -82,14 +86,28 @@ class Calibration:
     """A corrected chain in use.
 
     `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
-    the error that it was judged to have, and `taken` counts the samples there were.
+    the error that it was judged to have, and `known` holds the samples that were there by then.
     """
 
     chain: Chain
     before: Chain | None
     world_frame: str
     rms_mm: float | None
-    taken: int
+    known: frozenset[Sample]
+
+
+def check_settings(chain: Chain, settings: Settings) -> None:
+    """Refuse settings that no identification of a chain could use, before anything is measured.
+
+    Raises
+    ------
+    ConfigError
+        When a name is unknown to this chain, say.
+
+    """
+    nothing = np.zeros((0, len(chain.joints)))
+    empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
+    Problem(chain, empty, **settings.for_problem())
 
 
 class CalibrationSession:
@@ -121,6 +139,7 @@ class CalibrationSession:
                 f'joint_names must be {count} different names, one for each of '
                 f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
             )
+        check_settings(chain, self.settings)
         self.recording = True
         self.calibration: Calibration | None = None
         """The last one that was accepted or loaded."""
@@ -136,6 +155,7 @@ class CalibrationSession:
         self.samples: list[Sample] = []
         self.received: Counter[str] = Counter()
         """Messages that came so far, by stream."""
+        self._watch = None if continuous else Watch(len(self.chain.joints))
         self.delay: Delay | None = None
         """How late the measurements are stamped, as far as the motion shows."""
         self._dropped: Counter[str] = Counter()
@@ -144,31 +164,37 @@ class CalibrationSession:
         self._newest = {'joints': 0, 'poses': 0}
         self._looked_ns = 0
         self._frame_ids: dict[str, list[str]] = {}
-        self._layouts: dict[tuple[str, ...], tuple[tuple[int, ...], list[int]] | None] = {}
+        self._layouts: dict[tuple[str, ...], Layout] = {}
         self._foreign_names: list[str] = []
         self._live = LiveEstimate(self._problem_of)
-        if self.calibration is not None:
-            self.calibration = replace(self.calibration, taken=0)
 
     def change(self, settings: Settings) -> None:
-        """Go on with other settings; the buffers and samples stay."""
+        """Go on with other settings; the buffers and samples stay.
+
+        Raises
+        ------
+        ConfigError
+            When no identification could use them; nothing is changed then.
+
+        """
+        check_settings(self.chain, settings)
         self.settings = settings
         self._collector.settings = settings
         self._live.restart()
 
     # Messages
 
-    def take_joints(self, message: Any) -> FloatArray | None:
-        """Take a JointState; return its values (n,) in the order of the chain if it has all."""
+    def take_joints(self, message: Any) -> Sequence[float] | None:
+        """Take a JointState; return its values in the order of the chain if it has all."""
         self.received['joints'] += 1
         try:
             reading = messages.joint_state(message)
-            columns, index = self._layout(reading.names)
+            columns, pick = self._layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
             return None
-        values = reading.values[index]
-        if not np.isfinite(values).all():
+        values = pick(reading.values)
+        if not math.isfinite(sum(values)):
             self._dropped['joints: NaN or infinite joint value'] += 1
             return None
         if not self.recording:
@@ -176,6 +202,8 @@ class CalibrationSession:
         else:
             self._watch_order('joints', reading.stamp_ns)
             self._look_for_delay(reading.stamp_ns)
+            if self._watch is not None and len(columns) == len(self.chain.joints):
+                self._watch_clocks(reading.stamp_ns, values)
             self._collector.add_joints(columns, reading.stamp_ns, values)
             self._take()
         return values if len(columns) == len(self.chain.joints) else None
@@ -200,6 +228,8 @@ class CalibrationSession:
             reading.distance is not None,
             source.eye_in_hand,
         )
+        if self._watch is not None and reading.position is not None and not key.eye_in_hand:
+            self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
 
     def finish(self) -> None:
@@ -241,12 +271,19 @@ class CalibrationSession:
                     f'samples to go on with have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
+        self._collector.remember(samples)
         self.samples = [*samples, *self.samples]
         self._live.restart()
 
     @property
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
+        missing = [self.joint_names[k] for k in self._collector.track.missing]
+        if missing and self._foreign_names:
+            return (
+                f'waiting for joint states of {", ".join(missing)}; those that come name '
+                f'{", ".join(self._foreign_names)}: set joint_names?'
+            )
         return self._collector.state()
 
     def account(self) -> Account:
@@ -270,6 +307,19 @@ class CalibrationSession:
             tuple(self._foreign_names),
         )
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what an engineer should know about the measurements."""
+        if self.delay is None or self.settings.mode == 'continuous':
+            return ()  # there it is a parameter of the fit
+        left = self.delay.seconds - self.settings.delay
+        if abs(left) <= self.settings.settle:
+            return ()
+        return (
+            f'measurements are stamped {left:.3f} s later than the joint states of their time: '
+            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
+        )
+
     def status(self) -> str:
         """Return in words how far the samples have come."""
         fitted = [sample for sample in self.samples if not sample.validation]
@@ -290,7 +340,7 @@ class CalibrationSession:
             still = barely_moved(self.chain, np.array([sample.joints for sample in fitted]))
             if still:
                 words.append(f'hardly moved so far: {", ".join(still)}')
-        return f'{", ".join(words)}; {self.state}'
+        return '; '.join([', '.join(words), *self.warnings, self.state])
 
     # Identification
 
@@ -336,15 +386,19 @@ class CalibrationSession:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
             raise InputError(f'{err} ({self.account()})') from err
-        self.adopt(result)
+        self.adopt(result, self.samples)
         return result
 
-    def adopt(self, result: Identification) -> None:
-        """Keep a result as the calibration if it is accepted, else the last good one stays."""
+    def adopt(self, result: Identification, samples: Iterable[Sample]) -> None:
+        """Keep a result as the calibration if it is accepted, else the last good one stays.
+
+        `samples` are those there were when the identification began.
+        """
         if result.accepted:
             after = (result.validation or result.fitted).figures[1]
             self.calibration = Calibration(
-                result.chain, result.before, result.world_frame, after.rms_mm, len(self.samples)
+                *(result.chain, result.before, result.world_frame, after.rms_mm),
+                known=frozenset(samples),
             )
 
     def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:
@@ -361,7 +415,7 @@ class CalibrationSession:
                 f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
             )
-        self.calibration = Calibration(chain, None, world_frame, rms_mm, len(self.samples))
+        self.calibration = Calibration(chain, None, world_frame, rms_mm, frozenset(self.samples))
 
     def validate(self) -> tuple[ErrorFigures, ErrorFigures | None]:
         """Judge the calibration on the samples taken since; nothing is fitted.
@@ -387,7 +441,7 @@ class CalibrationSession:
         for sample in self.samples:
             frames.of(sample)
         sigmas = (self.settings.sigma_position, self.settings.sigma_orientation)
-        since = self.samples[self.calibration.taken :]
+        since = [each for each in self.samples if each not in self.calibration.known]
         sets = [each for part in collect(since, sigmas, frames) for each in part]
         if not sets:
             raise InputError('no samples have been taken since: measure some new poses first')
@@ -410,21 +464,19 @@ class CalibrationSession:
             self.samples.append(sample)
             self.on_sample(sample)
 
-    def _layout(self, names: Sequence[str]) -> tuple[tuple[int, ...], list[int]]:
-        """Return which joints of the chain a message names, and where in the message."""
+    def _layout(self, names: Sequence[str]) -> Layout:
+        """Return which joints of the chain a message names, and how to pick their values."""
         key = tuple(names)
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
             known = [(k, key.index(n)) for k, n in enumerate(self.joint_names) if n in key]
-            self._layouts[key] = (
-                (tuple(k for k, _ in known), [i for _, i in known]) if known else None
-            )
+            self._layouts[key] = (tuple(k for k, _ in known), _picker([i for _, i in known]))
             named = {name for names in self._layouts for name in names}
             missing = [name for name in self.joint_names if name not in named]
             self._foreign_names = sorted(named) if missing else []
         layout = self._layouts[key]
-        if layout is None:
+        if not layout[0]:
             raise messages.MessageError('none of the joints in the message')
         return layout
 
@@ -443,6 +495,14 @@ class CalibrationSession:
             self._notes[f'{stream} with a stamp older than the one before'] += 1
         self._newest[stream] = max(stamp_ns, self._newest[stream])
 
+    def _watch_clocks(self, stamp_ns: int, values: Sequence[float]) -> None:
+        """Look between stops whether the clocks agree, until it shows."""
+        assert self._watch is not None
+        if self._watch.add_joints(stamp_ns, values):
+            self.delay = self._watch.look(self.chain)
+            if self.delay is not None:
+                self._watch = None
+
     def _look_for_delay(self, now_ns: int | None) -> None:
         """Look for the delay of the measurements after some time of motion, until it shows.
 
@@ -454,5 +514,12 @@ class CalibrationSession:
         if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
             return
         self._looked_ns = now_ns or 0
-        self.delay = collector.find_delay(self.chain)
+        self.delay = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None
+
+
+def _picker(index: Sequence[int]) -> Picker:
+    """Return a function that picks some values of a sequence."""
+    if len(index) > 1:
+        return itemgetter(*index)
+    return lambda values: tuple(values[i] for i in index)

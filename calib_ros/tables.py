@@ -78,22 +78,18 @@ def read_table(
     """
     header, rows, warnings = _read(path, columns(joints))
     reader = _Reader(path, joints, header)
-    chosen = _of_sessions(path, header, rows, sessions)
-    samples: dict[tuple[int, str, str, str], Sample] = {}
-    for line, row in chosen:
-        sample = reader.sample(line, row)
-        key = (sample.stamp_ns, sample.session, sample.device, sample.target)
-        if row.get('split') == 'removed':
-            samples.pop(key, None)
-        elif key in samples:
-            raise InputError(f'{path}, line {line}: stamp_ns {sample.stamp_ns} is there already')
-        else:
-            samples[key] = sample
-    found = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples.values()]
+    samples = reader.samples(_of_sessions(path, header, rows, sessions))
+    found = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples]
     if not any(not sample.validation for sample in found):
         raise InputError(f'{path} has no rows to fit, only such that are marked test')
     fitted, kept_out = collect(found, sigmas)
     return Table(tuple(found), fitted, kept_out, reader.pairs(found), warnings)
+
+
+def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
+    """Return the samples of a journal, of which there may be none, and warnings."""
+    header, rows, warnings = _read(path, columns(joints))
+    return _Reader(path, joints, header).samples(rows), warnings
 
 
 def columns(joints: int) -> list[str]:
@@ -160,6 +156,28 @@ class _Reader:
                 f'distance, or location and socket); found {", ".join(header) or "nothing"}'
             )
 
+    def samples(self, rows: Sequence[tuple[int, Row]]) -> tuple[Sample, ...]:
+        """Return the samples of rows with their lines, without those that were taken back."""
+        found: dict[tuple[object, ...], Sample] = {}
+        for line, row in rows:
+            sample = self.sample(line, row)
+            what = (
+                *(sample.stamp_ns, sample.session, sample.device, sample.target),
+                *(sample.eye_in_hand, sample.distance is None),
+            )
+            if row.get('split') == 'removed':  # the last one, to fit or held out
+                same = [key for key in found if key[:-1] == what]
+                for key in same[-1:]:
+                    del found[key]
+                continue
+            key = (*what, sample.validation)
+            if key in found:
+                raise InputError(
+                    f'{self._path}, line {line}: stamp_ns {sample.stamp_ns} is there already'
+                )
+            found[key] = sample
+        return tuple(found.values())
+
     def sample(self, line: int, row: Row) -> Sample:
         """Return the sample of a row."""
         joints = self._optional(line, row, 'q')
@@ -207,7 +225,7 @@ class _Reader:
             return replace(plain, distance=self._number(line, row, 'distance'), device=device)
         if kinds == ['socket']:
             place = f'{row["location"]}_{row["socket"]}'
-            sample = replace(plain, position=np.zeros(3), device=place)
+            sample = replace(plain, socket=True, device=place)
             key = (plain.session, str(row['location']), str(row['socket']))
             self._places.setdefault(key, sample)
             return sample

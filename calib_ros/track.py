@@ -57,14 +57,15 @@ class Rows:
         """Return the rows (M, width) in the order of arrival."""
         return self._values[: self.count]
 
-    def append(self, stamp_ns: int, row: Sequence[float] | FloatArray) -> None:
-        """Add a row; the caller has seen that there is room."""
+    def append(self, stamp_ns: int, row: Sequence[float]) -> None:
+        """Add a row, NaN where it is shorter; the caller has seen that there is room."""
         if self.count == len(self._stamps):
             size = min(2 * self.count, self.capacity)
             self._stamps = np.resize(self._stamps, size)
             self._values = np.resize(self._values, (size, self._values.shape[1]))
         self._stamps[self.count] = stamp_ns
-        self._values[self.count] = row
+        self._values[self.count, : len(row)] = row
+        self._values[self.count, len(row) :] = np.nan
         self.count += 1
 
     def keep(self, index: NDArray[np.generic]) -> None:
@@ -140,10 +141,10 @@ class Track:
                 heard[index] = np.maximum(heard[index], rows.stamps.max())
         return heard
 
-    @property
-    def full(self) -> bool:
-        """Tell whether some part has no room for another sample."""
-        return any(rows.full for rows in self._parts.values())
+    def full(self, columns: tuple[int, ...]) -> bool:
+        """Tell whether there is no room for another sample of some joints."""
+        rows = self._parts.get(columns)
+        return rows is not None and rows.full
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -151,7 +152,7 @@ class Track:
         named = {column for part in self._parts for column in part}
         return tuple(k for k in range(len(self._revolute)) if k not in named)
 
-    def add(self, columns: tuple[int, ...], stamp_ns: int, values: FloatArray) -> None:
+    def add(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
         """Take the values of some joints, given by their numbers in the chain."""
         rows = self._parts.get(columns)
         if rows is None:

@@ -15,7 +15,7 @@ from calib_ros.chain import DH_KINDS, Chain
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
-from calib_ros.robust import OUTLIER, Robust, distances_of, robust_fit, weights_of
+from calib_ros.robust import OUTLIER, Robust, distances_of, reweighted, weights_of
 from calib_ros.se3 import FloatArray
 
 CONFIDENCE = 0.95
@@ -150,8 +150,9 @@ def validate(
             distances = distances_of(after, names, problem.system(problem.judging))
             comparison = replace(comparison, judged=np.concatenate(distances) <= OUTLIER)
         return comparison, f'{len(comparison.judged)} held-out pairs'
-    if len(problem.separations) > 1:
-        return _leave_one_place_out(problem, before, after, names, robust)
+    places = _places(problem)
+    if len(places) > 1 and all(each.socket for each in problem.sets):
+        return _leave_one_place_out(problem, places, before, after, names, robust)
     groups = [each.configurations for each in problem.sets]
     counts = [len(np.unique(group)) for group in groups]
     folds = min(problem.folds, sum(counts))
@@ -210,8 +211,24 @@ def _joined(
     )
 
 
+def _places(problem: Problem) -> list[set[str]]:
+    """Return the base frames of sockets, together those that are a known distance apart."""
+    places = [{base} for base in dict.fromkeys(each.base for each in problem.sets)]
+    for first, second, _ in problem.separations:
+        one, other = (next(p for p in places if base in p) for base in (first, second))
+        if one is not other:
+            one |= other
+            places.remove(other)
+    return places
+
+
 def _leave_one_place_out(
-    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust
+    problem: Problem,
+    places: Sequence[set[str]],
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
 ) -> tuple[Comparison, str]:
     """Judge both chains on places of sockets that were not fitted.
 
@@ -220,15 +237,15 @@ def _leave_one_place_out(
     """
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]
-    for *place, _ in problem.separations:
+    for place in places:
         inside = [each for each in problem.sets if each.base in place]
         others = problem.system([each for each in problem.sets if each.base not in place])
         own = [name for name in names if name.partition('.')[0] in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
             elsewhere = [name for name in fitted if name not in own]
-            trained = robust_fit(chain, elsewhere, others, problem.loss).fit.chain
+            trained = reweighted(chain, elsewhere, others, problem.loss).fit.chain
             found.append(minimise(trained, own, problem.system(inside)).chain)
-    number = {frame: k for k, pair in enumerate(problem.separations) for frame in pair[:2]}
+    number = {base: k for k, place in enumerate(places) for base in place}
     parts = [
         compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])
         for each in problem.sets
@@ -241,7 +258,7 @@ def _leave_one_place_out(
             _joined([part.after for part in parts], groups, index),
             ~robust.outliers,
         ),
-        f'leaving out one of {len(problem.separations)} places at a time',
+        f'leaving out one of {len(places)} places at a time',
     )
 
 

@@ -16,7 +16,7 @@ def generate_launch_description() -> LaunchDescription:
         [FindPackageShare('calib_ros'), 'config', 'calibration_node.yaml']
     )
     arguments = {
-        'chain': ('', 'chain file of the robot, or the name of one that calib_ros ships'),
+        'chain': ('', 'chain file or URDF of the robot, or the name of one that calib_ros ships'),
         'params_file': (parameters, 'parameter file of the node'),
         'namespace': ('', 'namespace of the node and of its topics'),
         'joint_states': ('joint_states', 'topic of the joint states'),

@@ -1,10 +1,15 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import os
+import shutil
+import tempfile
 
 # Read by rclpy and its messages when they are imported.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+os.environ['ROS_HOME'] = os.path.join(tempfile.gettempdir(), f'calib_ros_test_{os.getpid()}')
+# As the command line has it: more threads only wait for each other on small matrices.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 import pytest
@@ -19,3 +24,7 @@ settings.load_profile('calib_ros')
 @pytest.fixture
 def rng():
     return np.random.default_rng(20240607)
+
+
+def pytest_unconfigure():
+    shutil.rmtree(os.environ['ROS_HOME'], ignore_errors=True)

@@ -1,11 +1,19 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot cell in one process: the node under test and its peers, in a context of their own."""
+"""A robot cell: nodes under test and a peer that publishes, listens and calls.
+
+The nodes run in the test's process, in a context of their own, or in a child process.
+"""
 
 import itertools
 import os
+import select
+import signal
+import subprocess
+import sys
 import time
 
+import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
@@ -20,51 +28,77 @@ from geometry_msgs.msg import (
     TransformStamped,
     Vector3,
 )
-from rclpy.executors import SingleThreadedExecutor
+from nav_msgs.msg import Odometry
+from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from calib_ros import se3
+from calib_ros.config import Settings, load_chain
 from calib_ros.node import CalibrationNode
+from calib_ros.replay import Recording
+from calib_ros.session import CalibrationSession
+from calib_ros.simulation import Cell as SimulatedCell
+from calib_ros.simulation import drive, faulty, measure
+from calib_ros.sources import STANDARD
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+BURST_NS = 370_000_000
+"""Time of the stamps that are published at once; less than measurements may be late."""
+START = 1_700_000_000_000_000_000
+STOPS = 24
 _count = itertools.count()
 
 
 class Cell:
-    """The node, and a peer that publishes, listens and calls; the test's thread spins both."""
+    """A peer, and the nodes under test if any; the test's thread spins them all.
 
-    def __init__(self, executor_type=SingleThreadedExecutor, **parameters):
+    With parameters the first node is started at once.
+    """
+
+    def __init__(self, executor_type=EventsExecutor, **parameters):
+        self.domain = 1 + (os.getpid() + 7 * next(_count)) % 101
         self.context = rclpy.Context()
         rclpy.init(
             context=self.context,
             args=[],
-            domain_id=1 + (os.getpid() + next(_count)) % 101,
+            domain_id=self.domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self.executor = executor_type(context=self.context)
-        self.node = CalibrationNode(
+        self.peer = Node('peer', context=self.context)
+        self.executor.add_node(self.peer)
+        self.nodes = []
+        self._publishers = {}
+        self.node = self.start(**parameters) if parameters else None
+
+    def start(self, remap=(), namespace=None, **parameters):
+        """Start a node in this process; `remap` holds rules such as a:=b."""
+        rules = [word for rule in remap for word in ('-r', rule)]
+        node = CalibrationNode(
             context=self.context,
+            namespace=namespace,
+            cli_args=['--ros-args', *rules],
             parameter_overrides=[Parameter(name, value=v) for name, v in parameters.items()],
         )
-        self.peer = Node('peer', context=self.context)
-        for node in (self.node, self.peer):
-            self.executor.add_node(node)
-        self.heard = {}
-        self._publishers = {}
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
 
     def close(self):
-        for node in (self.node, self.peer):
+        for node in (*self.nodes, self.peer):
             self.executor.remove_node(node)
         self.executor.shutdown()
-        assert self.node.close()
+        ended = [node.close() for node in self.nodes]
+        assert all(ended)
         self.peer.destroy_node()
         self.context.try_shutdown()
 
@@ -80,37 +114,131 @@ class Cell:
             assert time.monotonic() < end, 'timed out'
             self.executor.spin_once(timeout_sec=0.02)
 
-    def start_call(self, name, request=None):
-        kind = Trigger if request is None else SetBool
-        client = self.peer.create_client(kind, f'calibration_node/{name}')
+    def start_call(self, name, request=None, node='/calibration_node'):
+        """Call a service of a node; return the future answer."""
+        kind = {Trigger.Request: Trigger, SetBool.Request: SetBool}.get(type(request), Trigger)
+        client = self.peer.create_client(kind, f'{node}/{name}')
         self.spin_until(client.service_is_ready)
         return client.call_async(request or Trigger.Request())
 
-    def call(self, name, request=None):
-        future = self.start_call(name, request)
+    def call(self, name, request=None, node='/calibration_node'):
+        """Call a service of a node; return what the client receives."""
+        future = self.start_call(name, request, node)
         self.spin_until(future.done)
         return future.result()
 
+    def set_parameters(self, values, node='/calibration_node'):
+        """Set parameters of a node; return the results that the client receives."""
+        client = AsyncParameterClient(self.peer, node)
+        self.spin_until(client.services_are_ready)
+        future = client.set_parameters([Parameter(name, value=v) for name, v in values.items()])
+        self.spin_until(future.done)
+        return future.result().results
+
     def listen(self, kind, topic, qos=LATCHED):
-        heard = self.heard.setdefault(topic, [])
+        heard = []
         self.peer.create_subscription(kind, topic, heard.append, qos)
         return heard
 
-    def publish(self, topic, messages, reliability=ReliabilityPolicy.RELIABLE, burst=100):
-        """Publish messages and wait until the node has taken them all."""
+    def publisher(self, kind, topic, reliability=ReliabilityPolicy.RELIABLE):
+        """Return a publisher that somebody listens to."""
         key = topic, reliability
         if key not in self._publishers:
             qos = QoSProfile(depth=1000, reliability=reliability)
-            publisher = self.peer.create_publisher(type(messages[0]), topic, qos)
+            publisher = self.peer.create_publisher(kind, topic, qos)
             self.spin_until(lambda: publisher.get_subscription_count() > 0)
             self._publishers[key] = publisher
-        stream = 'joints' if isinstance(messages[0], JointState) else 'poses'
-        for start in range(0, len(messages), burst):
-            part = messages[start : start + burst]
-            wanted = self.node.session.received[stream] + len(part)
-            for message in part:
-                self._publishers[key].publish(message)
-            self.spin_until(lambda end=wanted: self.node.session.received[stream] >= end)
+        return self._publishers[key]
+
+    def play(
+        self,
+        streams,
+        reliability=ReliabilityPolicy.RELIABLE,
+        node=None,
+        late_ns=0,
+        jitter=None,
+    ):
+        """Publish messages by topic in the order of their stamps, as a bag or a robot does.
+
+        All but joint states come `late_ns` later than their stamps; a generator `jitter` makes
+        everything come up to 0.3 s late. Returns when the node has taken all; a node in a child
+        process is not waited for.
+        """
+        node = node or self.node
+        queue = []
+        for topic, messages in streams.items():
+            publisher = self.publisher(type(messages[0]), topic, reliability)
+            stream = 'joints' if isinstance(messages[0], JointState) else 'poses'
+            late = 0 if stream == 'joints' else late_ns
+            queue += [(stamp_ns(m) + late, stream, publisher, m) for m in messages]
+        if jitter is not None:
+            late = jitter.integers(0, 300_000_000, len(queue))
+            queue = [
+                (item[0] + int(more), *item[1:]) for item, more in zip(queue, late, strict=True)
+            ]
+        queue.sort(key=lambda item: item[0])
+        for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
+            wanted = node.session.received.copy() if node else {}
+            for _, stream, publisher, message in burst:
+                publisher.publish(message)
+                if node:
+                    wanted[stream] += 1
+            self.spin_until(
+                lambda end=wanted: all(node.session.received[k] >= n for k, n in end.items())
+            )
+
+
+class Child:
+    """The node in a process of its own, and what it prints."""
+
+    def __init__(self, *arguments, domain=None, command=('-m', 'calib_ros.node'), **parameters):
+        environment = {
+            name: value
+            for name, value in os.environ.items()
+            if name not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')
+        }
+        domain = domain or 1 + (os.getpid() + 7 * next(_count)) % 101
+        given = [word for name, v in parameters.items() for word in ('-p', f'{name}:={v}')]
+        self.process = subprocess.Popen(
+            [sys.executable, *command, '--ros-args', *arguments, *given],
+            env=environment | {'ROS_DOMAIN_ID': str(domain), 'PYTHONUNBUFFERED': '1'},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        self.output = ''
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.communicate()
+
+    def wait_for(self, text, timeout=20.0):
+        """Wait until it has printed a text; return all that it has printed."""
+        end = time.monotonic() + timeout
+        while text not in self.output:
+            ready, _, _ = select.select([self.process.stdout], [], [], end - time.monotonic())
+            part = os.read(self.process.stdout.fileno(), 1 << 16) if ready else b''
+            assert part, f'it never said "{text}" but: {self.output}'
+            self.output += part.decode()
+        return self.output
+
+    def end(self, number=None, timeout=20.0):
+        """Send a signal and wait for the end; return the exit status."""
+        if number is not None:
+            self.process.send_signal(number)
+        output, _ = self.process.communicate(timeout=timeout)
+        self.output += output.decode()
+        return self.process.returncode
+
+    def kill(self):
+        assert self.end(signal.SIGKILL) == -signal.SIGKILL
+
+
+def stamp_ns(message):
+    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def header(stamp_ns, frame_id=''):
@@ -118,22 +246,23 @@ def header(stamp_ns, frame_id=''):
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
 
 
-def joint_messages(recording):
+def joint_messages(recording, names=None):
+    names = list(names or recording.joint_names)
     return [
-        JointState(
-            header=header(stamp), name=list(recording.joint_names), position=values.tolist()
-        )
+        JointState(header=header(stamp), name=names, position=values.tolist())
         for stamp, values in zip(recording.joint_stamps_ns, recording.joints, strict=True)
     ]
 
 
-def pose_messages(observations, kind=PoseStamped, covariance=None):
+def pose_messages(
+    observations, kind=PoseStamped, covariance=None, frame_id='tracker', child='', distances=None
+):
     quats = se3.to_quat(observations.rotations)
     messages = []
-    for stamp, position, quat in zip(
-        observations.stamps_ns, observations.positions.tolist(), quats.tolist(), strict=True
+    for k, (stamp, position, quat) in enumerate(
+        zip(observations.stamps_ns, observations.positions.tolist(), quats.tolist(), strict=True)
     ):
-        head = header(stamp, 'tracker')
+        head = header(stamp, frame_id)
         x, y, z = position
         turn = Quaternion(x=quat[0], y=quat[1], z=quat[2], w=quat[3])
         pose = Pose(position=Point(x=x, y=y, z=z), orientation=turn)
@@ -144,10 +273,68 @@ def pose_messages(observations, kind=PoseStamped, covariance=None):
         elif kind is TransformStamped:
             shift = Vector3(x=x, y=y, z=z)
             message = TransformStamped(
-                header=head, transform=Transform(translation=shift, rotation=turn)
+                header=head,
+                child_frame_id=child,
+                transform=Transform(translation=shift, rotation=turn),
             )
+        elif kind is Range:
+            message = Range(header=head, range=float(distances[k]))
         else:
             with_covariance = PoseWithCovariance(pose=pose, covariance=covariance)
-            message = PoseWithCovarianceStamped(header=head, pose=with_covariance)
+            message = kind(header=head, pose=with_covariance)
+            if kind is Odometry:
+                message.child_frame_id = child
         messages.append(message)
     return messages
+
+
+KINDS = {
+    'measured_pose': PoseStamped,
+    'measured_pose_with_covariance': PoseWithCovarianceStamped,
+    'measured_point': PointStamped,
+    'measured_transform': TransformStamped,
+    'measured_odometry': Odometry,
+    'measured_distance': Range,
+}
+
+
+def true_arm():
+    return faulty(load_chain('ur10e'), SimulatedCell(), np.random.default_rng(1))
+
+
+def shift(truth):
+    """Return a recording: the arm moves to 24 configurations and is measured at each."""
+    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=4)
+    rng = np.random.default_rng(2)
+    configurations = truth.random_joints(STOPS, rng)
+    stamps, joints, pose_stamps = drive(configurations, cell, START)
+    poses = measure(truth, np.repeat(configurations, 4, axis=0), rng, 2e-5, 1e-4).at(pose_stamps)
+    return Recording(truth.joint_names, stamps, joints, poses, np.zeros(len(poses), bool))
+
+
+def assert_same(first, second):
+    for name in ('stamps_ns', 'joints', 'positions', 'oriented', 'approach', 'delay'):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    np.testing.assert_allclose(first.rotations, second.rotations, rtol=0, atol=1e-15)
+
+
+def direct(recording, **settings):
+    """Return a session that has taken a recording without ROS."""
+    session = CalibrationSession(load_chain('ur10e'), Settings(**settings))
+    messages = [*joint_messages(recording), *pose_messages(recording.poses)]
+    for message in sorted(messages, key=stamp_ns):
+        if isinstance(message, PoseStamped):
+            session.take(STANDARD[0], STANDARD[0].type, message)
+        else:
+            session.take_joints(message)
+    return session
+
+
+def topics(recording, **more):
+    """Return the messages of a recording by topic."""
+    joints, poses = joint_messages(recording), pose_messages(recording.poses)
+    return {'joint_states': joints, 'measured_pose': poses, **more}
+
+
+def values_of(message):
+    return {item.key: item.value for item in message.status[0].values}

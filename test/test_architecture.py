@@ -15,13 +15,15 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 ORDER = [
     {'errors'},
     {'se3', 'files'},
-    {'effects'},
+    {'effects', 'description'},
     {'chain'},
+    {'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
-    {'dwells', 'delays', 'robust', 'simulation', 'sources', 'tables'},
-    {'collector', 'frames', 'journal'},
-    {'problem'},
+    {'cdr', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
+    {'robust'},
+    {'collector', 'export', 'frames', 'journal'},
+    {'archive', 'problem'},
     {'live', 'validation'},
     {'identification'},
     {'selection', 'salvage'},
@@ -38,7 +40,7 @@ ONLY = {
     'geometry_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config'},
+    'yaml': {'config', 'export'},
 }
 
 

@@ -1,13 +1,17 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-import os
+"""A real node in real rclpy: what it hears, keeps, answers and publishes."""
+
+import ast
 import signal
-import subprocess
-import sys
 import threading
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import (
     PointStamped,
@@ -15,79 +19,114 @@ from geometry_msgs.msg import (
     PoseWithCovarianceStamped,
     TransformStamped,
 )
+from nav_msgs.msg import Odometry
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
+from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from ros_cell import Cell, joint_messages, pose_messages
+from ros_cell import (
+    KINDS,
+    STOPS,
+    Cell,
+    Child,
+    assert_same,
+    direct,
+    joint_messages,
+    pose_messages,
+    shift,
+    stamp_ns,
+    topics,
+    true_arm,
+    values_of,
+)
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool
+from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
-from calib_ros.config import load_chain, parse_chain
+from calib_ros.config import Settings, calibration_record, load_chain, parse_chain
+from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
-from calib_ros.replay import Recording, replay, write_bag
+from calib_ros.replay import replay, write_bag
 from calib_ros.session import CalibrationSession
 from calib_ros.simulation import Cell as SimulatedCell
-from calib_ros.simulation import drive, faulty, measure
+from calib_ros.simulation import faulty, measure, random_frame
+from calib_ros.sources import STANDARD
+
+SHIPPED = Path(__file__).parents[1] / 'config' / 'calibration_node.yaml'
 
 
 @pytest.fixture(scope='module')
 def truth():
-    return faulty(load_chain('ur10e'), SimulatedCell(), np.random.default_rng(1))
+    return true_arm()
 
 
 @pytest.fixture(scope='module')
 def recording(truth):
-    """Return a short shift: the arm moves to 24 configurations and is measured at each."""
-    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.2, poses_per_dwell=2)
-    rng = np.random.default_rng(2)
-    configurations = truth.random_joints(24, rng)
-    stamps, joints, pose_stamps = drive(configurations, cell, 1_700_000_000_000_000_000)
-    poses = measure(truth, np.repeat(configurations, 2, axis=0), rng, 2e-5, 1e-4).at(pose_stamps)
-    return Recording(truth.joint_names, stamps, joints, poses, np.zeros(len(poses), bool))
+    return shift(truth)
 
 
-def assert_same(first, second):
-    for name in ('stamps_ns', 'joints', 'positions', 'oriented'):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    np.testing.assert_allclose(first.rotations, second.rotations, rtol=0, atol=1e-15)
+@pytest.fixture(scope='module')
+def motion(truth, recording):
+    """Return the same shift measured all the time, by a device that stamps 30 ms late."""
+    rng = np.random.default_rng(6)
+    some = slice(5, -5, 2)
+    poses = measure(truth, recording.joints[some], rng, 2e-5, 1e-4)
+    stamps = recording.joint_stamps_ns[some] + 30_000_000
+    none = np.zeros(len(poses), bool)
+    return replace(recording, poses=poses.at(stamps), held_out=none)
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-def test_direct_bag_and_live_give_equal_observations(tmp_path, recording, storage, executor):
-    joints, poses = joint_messages(recording), pose_messages(recording.poses)
-    direct = CalibrationSession(load_chain('ur10e'))
-    for message in joints:
-        direct.take_joints(message)
-    for message in poses:
-        direct.take_pose('geometry_msgs/msg/PoseStamped', message)
-    replayed = CalibrationSession(load_chain('ur10e'))
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, executor, storage):
+    recording = request.getfixturevalue('recording' if mode == 'dwell' else 'motion')
+    expected = direct(recording, mode=mode)
+    replayed = CalibrationSession(load_chain('ur10e'), Settings(mode=mode))
     write_bag(tmp_path / 'bag', recording, storage)
     assert replay(tmp_path / 'bag', replayed) == ()
-    with Cell(executor, chain='ur10e') as cell:
-        cell.publish('measured_pose', poses)
-        cell.publish('joint_states', joints, ReliabilityPolicy.BEST_EFFORT)
+    parameters = {'chain': 'ur10e', 'mode': mode, 'data_dir': str(tmp_path)}
+    with Cell(executor, **parameters) as cell:
+        cell.play(
+            {
+                'measured_pose': pose_messages(recording.poses),
+                'joint_states': joint_messages(recording),
+            },
+            ReliabilityPolicy.BEST_EFFORT,
+        )
         live = cell.node.session
-        expected = direct.problem().observations
-        assert len(expected) == len(recording.poses)
-        assert_same(expected, replayed.problem().observations)
-        assert_same(expected, live.problem().observations)
-        assert live.account() == direct.account() == replayed.account()
+        observations = expected.problem().observations
+        assert len(observations) == (STOPS if mode == 'dwell' else len(recording.poses))
+        assert_same(observations, replayed.problem().observations)
+        assert_same(observations, live.problem().observations)
+        assert live.account() == expected.account()
+        assert live.delay == expected.delay == replayed.delay
+        if mode == 'continuous':
+            assert abs(live.delay.seconds - 0.03) < 0.002
+
+
+@pytest.fixture
+def cell(tmp_path):
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        yield cell
 
 
 @pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-def test_identify_answers_and_publishes(tmp_path, recording, truth, executor):
-    target = tmp_path / 'saved.yaml'
-    with Cell(executor, chain='ur10e', target_filename=str(target)) as cell:
+def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth, executor):
+    target = tmp_path / 'sub' / 'saved.yaml'
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'target_filename': str(target)}
+    with Cell(executor, **parameters) as cell:
         refused = cell.call('save')
         assert not refused.success
         assert 'identify' in refused.message
-        cell.publish('joint_states', joint_messages(recording))
-        cell.publish('measured_pose', pose_messages(recording.poses))
+        cell.play(topics(recording))
         answer = cell.call('identify')
         assert answer.success, answer.message
-        assert '48 pairs' in answer.message
+        assert f'{STOPS} pairs' in answer.message
         assert 'wrist_3_joint.theta' in answer.message
         # Heard although the subscriptions come after the publishing: the topics are latched.
         tables = cell.listen(Float64MultiArray, 'calibration_node/dh_parameters')
@@ -102,6 +141,9 @@ def test_identify_answers_and_publishes(tmp_path, recording, truth, executor):
         unseen = truth.random_joints(200, np.random.default_rng(3))
         error = np.linalg.norm((chain.forward(unseen) - truth.forward(unseen))[:, :3, 3], axis=1)
         assert error.max() < 1e-4
+        record = calibration_record(texts[0].data)
+        assert record['topics'] == ['/joint_states', '/measured_pose']
+        assert record['samples'] == STOPS
         saved = cell.call('save')
         assert saved.success
         assert str(target) in saved.message
@@ -112,66 +154,236 @@ def test_identify_answers_and_publishes(tmp_path, recording, truth, executor):
         assert target.read_text() == texts[0].data
 
 
-def test_live_result_equals_the_one_from_arrays(recording):
-    expected = identify_arrays(recording)
-    with Cell(chain='ur10e') as cell:
-        cell.publish('joint_states', joint_messages(recording))
-        cell.publish('measured_pose', pose_messages(recording.poses))
-        texts = cell.listen(String, 'calibration_node/calibration')
-        assert cell.call('identify').success
-        cell.spin_until(lambda: texts)
-        chain = parse_chain(texts[0].data)
+def test_live_result_equals_the_one_from_arrays(cell, recording):
+    expected = identify(direct(recording).problem()).chain
+    cell.play(topics(recording))
+    texts = cell.listen(String, 'calibration_node/calibration')
+    assert cell.call('identify').success
+    cell.spin_until(lambda: texts)
+    chain = parse_chain(texts[0].data)
     np.testing.assert_allclose(chain.table, expected.table, rtol=0, atol=1e-9)
 
 
-def identify_arrays(recording):
-    session = CalibrationSession(load_chain('ur10e'))
-    for message in joint_messages(recording):
-        session.take_joints(message)
-    for message in pose_messages(recording.poses):
-        session.take_pose('geometry_msgs/msg/PoseStamped', message)
-    return identify(session.problem()).chain
+# What it hears
 
 
 @pytest.mark.parametrize(
     'reliability', [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT]
 )
-@pytest.mark.parametrize(
-    ('topic', 'kind'),
-    [
-        ('measured_pose', PoseStamped),
-        ('measured_pose_with_covariance', PoseWithCovarianceStamped),
-        ('measured_point', PointStamped),
-        ('measured_transform', TransformStamped),
-    ],
-)
-def test_every_kind_of_measurement_is_heard(recording, topic, kind, reliability):
+def test_every_kind_of_measurement_is_heard(cell, recording, reliability):
     covariance = np.diag([1e-8, 2e-8, 3e-8, 4e-8, 5e-8, 6e-8]).ravel().tolist()
-    with Cell(chain='ur10e') as cell:
-        cell.publish('joint_states', joint_messages(recording)[:40], reliability)
-        some = recording.poses.select(np.arange(2))
-        cell.publish(topic, pose_messages(some, kind, covariance), reliability)
-        taken = cell.node.session.problem().observations
-    assert len(taken) == 2
-    np.testing.assert_array_equal(taken.positions, some.positions)
-    assert taken.oriented.all() == (kind is not PointStamped)
-    if kind is PoseWithCovarianceStamped:
-        np.testing.assert_array_equal(taken.covariance[0].ravel(), covariance)
+    lengths = np.linalg.norm(recording.poses.positions, axis=1)
+    stop = np.arange(len(lengths)) // 4
+    streams = {'joint_states': joint_messages(recording)}
+    for k, (topic, kind) in enumerate(KINDS.items()):
+        some = np.isin(stop, (2 * k, 2 * k + 1))
+        streams[topic] = pose_messages(
+            *(recording.poses.select(some), kind, covariance),
+            child=topic,
+            distances=lengths[some],
+        )
+    cell.play(streams, reliability)
+    cell.node.session.problem()  # has taken what was waiting
+    assert cell.node.session.account().dropped == {}
+    taken = sorted(cell.node.session.samples, key=lambda sample: sample.stamp_ns)
+    assert len(taken) == 2 * len(KINDS)
+    for k, sample in enumerate(taken):
+        kind = list(KINDS.values())[k // 2]
+        assert (sample.rotation is None) == (kind in (PointStamped, Range))
+        if kind is Range:
+            assert sample.device == 'distance'
+            assert abs(sample.distance - lengths[stop == k].mean()) < 1e-6
+            continue
+        mean = recording.poses.positions[stop == k].mean(axis=0)
+        np.testing.assert_allclose(sample.position, mean, rtol=0, atol=1e-12)
+        named = kind in (TransformStamped, Odometry)
+        assert sample.target == (list(KINDS)[k // 2] if named else '')
+        if kind in (PoseWithCovarianceStamped, Odometry):
+            np.testing.assert_allclose(sample.covariance.ravel(), covariance, rtol=1e-12)
+        else:
+            assert sample.covariance is None
 
 
-def test_validation_topics_are_never_fitted(recording):
-    with Cell(chain='ur10e') as cell:
-        cell.publish('joint_states', joint_messages(recording))
-        cell.publish('measured_pose', pose_messages(recording.poses.select(np.arange(40))))
-        cell.publish('validation_pose', pose_messages(recording.poses.select(np.arange(40, 48))))
+def test_two_children_of_a_transform_are_two_targets(cell, recording, truth):
+    other = replace(truth, tool=random_frame(np.random.default_rng(8), 0.2))
+    rng = np.random.default_rng(9)
+    poses = recording.poses
+    second = measure(other, poses.joints, rng, 2e-5, 1e-4).at(poses.stamps_ns)
+    both = pose_messages(poses, TransformStamped, child='left')
+    both += pose_messages(second, TransformStamped, child='right')
+    cell.play({'joint_states': joint_messages(recording), 'measured_transform': both})
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    chain = cell.node.session.calibration.chain
+    assert {'base', 'tool', 'tool_right'} <= set(chain.frame_names)
+    unseen = truth.random_joints(100, rng)
+    for tool, true in (('tool', truth), ('tool_right', other)):
+        error = (chain.forward(unseen, tool=tool) - true.forward(unseen))[:, :3, 3]
+        assert np.linalg.norm(error, axis=1).max() < 1e-4
+
+
+def test_a_camera_on_the_flange_and_a_draw_wire_as_sources(tmp_path, recording, truth):
+    poses = recording.poses
+    seen = poses.inverted()
+    lengths = np.linalg.norm(poses.positions - [0.5, 0.2, -0.3], axis=1)
+    sources = ['camera/target type=PoseStamped eye_in_hand=true target=board', 'wire type=Range']
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'sources': sources}
+    with Cell(**parameters) as cell:
+        cell.play(
+            {
+                'joint_states': joint_messages(recording),
+                'camera/target': pose_messages(seen, frame_id='camera'),
+                'wire': pose_messages(poses, Range, distances=lengths, frame_id='wire'),
+            }
+        )
         answer = cell.call('identify')
         assert answer.success, answer.message
-        assert '40 pairs' in answer.message
-        assert '8 held-out pairs' in answer.message
+        kinds = [
+            (each.distances is not None, len(each)) for each in cell.node.session.problem().sets
+        ]
+        assert kinds == [(False, STOPS), (True, STOPS)]
+        chain = cell.node.session.calibration.chain
+    unseen = truth.random_joints(200, np.random.default_rng(3))
+    found, true = chain.forward(unseen), truth.forward(unseen)
+    # The board's frame is the world; only what two poses have between them can be compared.
+    error = np.linalg.inv(found[0]) @ found[1:] - np.linalg.inv(true[0]) @ true[1:]
+    assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 3e-4
+
+
+def test_joint_states_in_two_parts(tmp_path, recording):
+    whole = joint_messages(recording)
+    parts = [
+        [JointState(header=m.header, name=m.name[some], position=m.position[some]) for m in whole]
+        for some in (slice(0, 2), slice(2, 6))
+    ]
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
+    with Cell(**parameters, joint_topics=['base/joints', 'arm/joints']) as cell:
+        cell.play(
+            {
+                'base/joints': parts[0],
+                'arm/joints': parts[1],
+                'measured_pose': pose_messages(recording.poses),
+            }
+        )
+        assert_same(
+            direct(recording).problem().observations, cell.node.session.problem().observations
+        )
+
+
+def test_validation_topics_are_never_fitted(cell, recording):
+    poses = pose_messages(recording.poses)
+    last = STOPS - 6
+    cell.play(
+        topics(recording, measured_pose=poses[: 4 * last], validation_pose=poses[4 * last :])
+    )
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    assert f'{last} pairs' in answer.message
+    assert '6 held-out pairs' in answer.message
+
+
+# What it answers
+
+
+def test_errors_are_answers(cell, recording):
+    for name, said in (
+        ('identify', 'no samples to fit'),
+        ('capture', 'no joint states have come'),
+        ('remove_last', 'no sample to remove'),
+        ('validate', 'identify or load one first'),
+        ('load', 'no saved calibration of ur10e'),
+    ):
+        empty = cell.call(name)
+        assert not empty.success
+        assert said in empty.message
+    some = topics(recording)
+    cell.play(
+        {'joint_states': some['joint_states'][:120], 'measured_pose': some['measured_pose'][:8]}
+    )
+    few = cell.call('identify')
+    assert not few.success
+    assert '2 measured configurations are too few, at least 5' in few.message
+
+
+def test_record_remove_last_and_clear(cell, recording):
+    joints, poses = topics(recording).values()
+    assert cell.call('record', SetBool.Request(data=False)).success
+    cell.play({'joint_states': joints[:10], 'measured_pose': poses[:2]})
+    account = cell.node.session.account()
+    assert account.unused == {'joints: not recording': 10, 'poses: not recording': 2}
+    assert cell.call('record', SetBool.Request(data=True)).success
+    cell.play({'joint_states': joints[10:300], 'measured_pose': poses[2:20]})
+    assert len(cell.node.session.samples) == 5
+    removed = cell.call('remove_last')
+    assert removed.success
+    assert removed.message == 'sample 5 removed'
+    assert len(cell.node.session.samples) == 4
+    cleared = cell.call('clear')
+    assert cleared.success
+    assert '4 samples cleared; they stay in' in cleared.message
+    assert cell.node.session.account().samples == 0
+    assert cell.node.session.account().joint_states == 0
+
+
+def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
+    joints, poses = topics(recording).values()
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'mode': 'triggered'}
+    with Cell(**parameters) as cell:
+        cell.play({'joint_states': joints[:28], 'measured_pose': poses[:4]})
+        taken = cell.call('capture')
+        assert taken.success, taken.message
+        assert taken.message.startswith('sample 1 taken (4 measurements, spread 0.0')
+        twice = cell.call('capture')
+        assert not twice.success
+        assert 'no measurements have come since the last sample' in twice.message
+        cell.play({'joint_states': joints[28:40], 'measured_pose': poses[4:5]})
+        moving = cell.call('capture')
+        assert not moving.success
+        assert 'the arm has not stood for 0.2 s yet' in moving.message
+        cell.play({'joint_states': joints[40:], 'measured_pose': poses[5:]})
+        assert len(cell.node.session.samples) == 1
+
+
+def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recording):
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    other = tmp_path / 'ur10e_on_linear_axis_20990101T000000000000Z.yaml'
+    other.write_text('of another robot, whose name begins alike')
+    with Cell(**parameters) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        nothing = cell.call('validate')
+        assert not nothing.success
+        assert 'measure some new poses' in nothing.message
+        assert cell.call('save').success
+        chain = cell.node.session.calibration.chain
+    with Cell(**parameters) as cell:
+        loaded = cell.call('load')
+        assert loaded.success, loaded.message
+        np.testing.assert_array_equal(cell.node.session.calibration.chain.table, chain.table)
+        assert cell.node.session.calibration.world_frame == 'tracker'
+        texts = cell.listen(String, 'calibration_node/calibration')
+        cell.spin_until(lambda: texts)
+        np.testing.assert_array_equal(parse_chain(texts[0].data).table, chain.table)
+        cell.play(topics(recording))
+        holds = cell.call('validate')
+        assert holds.success, holds.message
+        assert 'the calibration holds: RMS 0.0' in holds.message
+        assert f'{STOPS} samples taken since' in holds.message
+        cell.call('clear')
+        moved = pose_messages(recording.poses)
+        for message in moved:
+            message.pose.position.x += 0.003
+        cell.play(topics(recording, measured_pose=moved))
+        broken = cell.call('validate')
+        assert not broken.success
+        assert 'does not hold any more' in broken.message
+        assert 'RMS 3.0' in broken.message
 
 
 @pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-def test_messages_are_taken_while_an_identification_runs(monkeypatch, recording, executor):
+def test_messages_are_taken_while_an_identification_runs(
+    monkeypatch, tmp_path, recording, executor
+):
     release, problems = threading.Event(), []
 
     def slow(problem, model):
@@ -180,162 +392,353 @@ def test_messages_are_taken_while_an_identification_runs(monkeypatch, recording,
         return identify(problem)
 
     monkeypatch.setattr(node_module, 'identify_model', slow)
-    joints, poses = joint_messages(recording), pose_messages(recording.poses)
-    with Cell(executor, chain='ur10e') as cell:
-        cell.publish('joint_states', joints)
-        cell.publish('measured_pose', poses[:40])
+    joints, poses = topics(recording).values()
+    with Cell(executor, chain='ur10e', data_dir=str(tmp_path)) as cell:
+        cell.play({'joint_states': joints[:1000], 'measured_pose': poses[:80]})
         first = cell.start_call('identify')
         cell.spin_until(lambda: problems)
         second = cell.call('identify')
         assert not second.success
         assert 'running' in second.message
-        cell.publish('measured_pose', poses[40:])
-        assert cell.node.session.account().pairs == 48
+        unsaved = cell.call('save')
+        assert not unsaved.success
+        assert 'no accepted calibration' in unsaved.message
+        cell.play({'joint_states': joints[1000:], 'measured_pose': poses[80:]})
+        assert cell.node.session.account().poses == len(poses)
         assert not first.done()
         release.set()
         cell.spin_until(first.done)
         assert first.result().success, first.result().message
-        assert len(problems[0].observations) == 40
+        assert len(problems[0].observations) == 20
+        # The samples that came meanwhile were not fitted, so they may judge.
+        judged = cell.call('validate')
+        assert judged.success
+        assert '4 samples taken since' in judged.message
         assert cell.call('identify').success
 
 
-def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(recording, truth):
-    with Cell(chain='ur10e') as cell:
-        joints = joint_messages(recording)
-        cell.publish('joint_states', joints)
-        cell.publish('measured_pose', pose_messages(recording.poses))
-        texts = cell.listen(String, 'calibration_node/calibration')
-        assert cell.call('identify').success
-        cell.spin_until(lambda: texts)
-        good = cell.node.session.calibration
-        assert cell.call('clear').success
-        nominal = load_chain('ur10e')
-        configurations = recording.poses.joints
-        noisy = measure(nominal, configurations, np.random.default_rng(5), 1e-4, 1e-4)
-        cell.publish('joint_states', joints)
-        cell.publish('measured_pose', pose_messages(noisy.at(recording.poses.stamps_ns)))
-        answer = cell.call('identify')
-        assert not answer.success
-        assert 'no gain' in answer.message
-        assert 'last good calibration stays' in answer.message
-        assert cell.node.session.calibration is good
-        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
-        cell.spin_until(lambda: heard)
-        assert len(texts) == 1
+def test_clear_while_an_identification_runs(monkeypatch, cell, recording):
+    release, problems = threading.Event(), []
+
+    def slow(problem, model):
+        problems.append(problem)
+        assert release.wait(20.0)
+        return identify(problem)
+
+    monkeypatch.setattr(node_module, 'identify_model', slow)
+    cell.play(topics(recording))
+    running = cell.start_call('identify')
+    cell.spin_until(lambda: problems)
+    assert cell.call('clear').success
+    release.set()
+    cell.spin_until(running.done)
+    assert running.result().success, running.result().message
+    cell.play(topics(recording))
+    judged = cell.call('validate')
+    assert f'{STOPS} samples taken since' in judged.message
 
 
-def test_errors_are_answers(recording):
-    with Cell(chain='ur10e') as cell:
-        empty = cell.call('identify')
-        assert not empty.success
-        assert 'no matched pairs' in empty.message
-        cell.publish('joint_states', joint_messages(recording))
-        cell.publish('measured_pose', pose_messages(recording.poses)[:4])
-        few = cell.call('identify')
-        assert not few.success
-        assert '2 measured configurations are too few, at least 5' in few.message
+def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cell, recording):
+    cell.play(topics(recording))
+    texts = cell.listen(String, 'calibration_node/calibration')
+    assert cell.call('identify').success
+    cell.spin_until(lambda: texts)
+    good = cell.node.session.calibration
+    assert cell.call('clear').success
+    nominal = load_chain('ur10e')
+    noisy = measure(nominal, recording.poses.joints, np.random.default_rng(5), 1e-4, 1e-4)
+    noisy = noisy.at(recording.poses.stamps_ns)
+    cell.play(topics(recording, measured_pose=pose_messages(noisy)))
+    answer = cell.call('identify')
+    assert not answer.success
+    assert 'no gain' in answer.message
+    assert 'last good calibration stays' in answer.message
+    assert cell.node.session.calibration is good
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: heard)
+    assert len(texts) == 1
 
 
-def test_record_and_clear(recording):
+# What it publishes
+
+
+def test_diagnostics_status_and_corrected_pose(monkeypatch, tmp_path, recording, truth):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
     joints = joint_messages(recording)
-    with Cell(chain='ur10e') as cell:
-        assert cell.call('record', SetBool.Request(data=False)).success
-        cell.publish('joint_states', joints[:10])
-        account = cell.node.session.account()
-        assert account.dropped == {'joints: not recording': 10}
-        assert cell.call('record', SetBool.Request(data=True)).success
-        cell.publish('joint_states', joints[:40])
-        cell.publish('measured_pose', pose_messages(recording.poses)[:3])
-        cleared = cell.call('clear')
-        assert cleared.success
-        assert '3 pairs' in cleared.message
-        assert cell.node.session.account().pairs == 0
-
-
-def test_diagnostics_and_corrected_pose(recording, truth):
-    joints = joint_messages(recording)
-    joints.append(joint_messages(recording)[0])
-    with Cell(chain='ur10e') as cell:
+    twice = joints[:1000] + joints[900:901] + joints[1000:]
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': 'A7'}
+    with Cell(**parameters) as cell:
         diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
         corrected = cell.listen(PoseStamped, 'calibration_node/corrected_pose', 10)
-        cell.publish('joint_states', joints)
-        cell.publish('measured_pose', pose_messages(recording.poses))
+        cell.play(topics(recording, joint_states=twice))
         assert cell.call('identify').success
-        cell.publish('joint_states', joints[-1:])
+        cell.play({'joint_states': joints[-1:]})
         cell.spin_until(
             lambda: [m for m in corrected if m.header.stamp == joints[-1].header.stamp]
         )
         message = corrected[-1]
         assert message.header.frame_id == 'tracker'
-        true = truth.forward(recording.joints[:1])[0, :3, 3]
+        true = truth.forward(recording.joints[-1:])[0, :3, 3]
         point = message.pose.position
         np.testing.assert_allclose([point.x, point.y, point.z], true, rtol=0, atol=1e-4)
         diagnostics.clear()
         cell.spin_until(lambda: diagnostics)
         status = diagnostics[0].status[0]
-        values = {item.key: item.value for item in status.values}
-        assert values['pairs'] == '48'
+        assert (status.name, status.hardware_id) == ('calibration_node: calibration', 'A7')
+        values = values_of(diagnostics[0])
+        assert values['samples'] == str(STOPS)
         assert values['calibrated'] == 'True'
         assert values['dropped joints: same stamp twice'] == '2'
         assert values['last identification'].startswith('accepted')
+        assert float(values['rate of /joint_states [Hz]']) >= 0.0
+        assert float(values['age of /measured_pose [s]']) < 20.0
+        words = cell.listen(String, 'calibration_node/status')
+        cell.spin_until(lambda: words)
+        assert words[0].data.startswith(f'{STOPS} samples, 0.0')
+        assert 'enough for the accuracy wanted; the arm' in words[0].data
 
 
-def start_node(*arguments):
-    environment = {
-        name: value
-        for name, value in os.environ.items()
-        if name not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')
+def test_the_status_tells_what_the_arm_does(monkeypatch, cell, recording):
+    joints = joint_messages(recording)
+    session = cell.node.session
+    assert session.state == 'waiting for joint states'
+    cell.play({'joint_states': joints[:15]})
+    assert session.state.startswith('the arm stands for 0.')
+    cell.play({'joint_states': joints[15:40]})
+    assert session.state == 'the arm is moving'
+    few = cell.listen(String, 'calibration_node/status')
+    cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
+    assert few[-1].data.startswith('0 samples')
+
+
+def test_residual_markers_are_well_formed(cell, recording):
+    cell.play(topics(recording))
+    assert cell.call('identify').success
+    heard = cell.listen(MarkerArray, 'calibration_node/residuals')
+    cell.spin_until(lambda: heard)
+    (lines,) = heard[0].markers
+    assert (lines.type, lines.action) == (Marker.LINE_LIST, Marker.ADD)
+    assert lines.header.frame_id == 'tracker'
+    assert lines.pose.orientation.w == 1.0
+    assert lines.scale.x > 0.0
+    assert len(lines.points) == len(lines.colors) == 2 * STOPS
+    assert all(color.a == 1.0 and 0.0 <= color.r <= 1.0 for color in lines.colors)
+    begins = np.array([[p.x, p.y, p.z] for p in lines.points[::2]])
+    ends = np.array([[p.x, p.y, p.z] for p in lines.points[1::2]])
+    measured = cell.node.session.problem().observations
+    np.testing.assert_array_equal(begins, measured.positions)
+    predicted = cell.node.session.calibration.chain.forward(measured.joints)[:, :3, 3]
+    np.testing.assert_allclose(ends - begins, 200.0 * (predicted - measured.positions), atol=1e-9)
+
+
+# Parameters
+
+
+def declared(node):
+    return {name: parameter.value for name, parameter in node._parameters.items()}
+
+
+def test_the_parameter_file_holds_every_parameter_with_its_default(cell):
+    with open(SHIPPED) as file:
+        (content,) = yaml.safe_load(file).values()
+    shipped = content['ros__parameters']
+    foreign = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+    plain = {
+        name: value for name, value in declared(cell.node).items() if not name.startswith(foreign)
     }
-    return subprocess.Popen(
-        [sys.executable, '-m', 'calib_ros.node', '--ros-args', *arguments],
-        env=environment | {'ROS_DOMAIN_ID': str(1 + os.getpid() % 101)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
+    assert list(shipped) == list(plain)
+    of_this_test = {'chain': '', 'data_dir': ''}
+    assert shipped == plain | of_this_test
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'said'),
+    [
+        ('model', 'nonsense', 'unknown effect or joint "nonsense"'),
+        ('model', 'gear', 'nothing to fit in "gear"'),
+        ('loss', 'hubert', 'did you mean "huber"'),
+        ('fixed', ['joint_7.a'], 'unknown parameter "joint_7.a"'),
+        ('priors', ['*.a=much'], 'must be a finite number'),
+        ('sigma_position', -1.0, 'sigma_position'),
+        ('sigma_position', 1, "expected 'Type.DOUBLE'"),
+        ('folds', 1, 'folds'),
+        ('mode', 'continuous', 'read-only'),
+        ('joint_names', ['a'], 'read-only'),
+        ('serial', 'A8', 'read-only'),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_and_changes_nothing(cell, name, value, said):
+    before, settings = declared(cell.node), cell.node.session.settings
+    (result,) = cell.set_parameters({name: value})
+    assert not result.successful
+    assert said in result.reason
+    assert declared(cell.node) == before
+    assert cell.node.session.settings == settings
+
+
+def test_settings_change_at_run_time(cell, recording):
+    cell.play(topics(recording))
+    assert cell.call('identify').success
+    before = cell.node.session.calibration.chain
+    changes = {
+        'model': 'ratio',
+        'sigma_position': 2e-4,
+        'wanted_accuracy': 1e-6,
+        'fixed': ['elbow_joint.a'],
+        'marker_scale': 10.0,
+        'still': 1e-3,
+    }
+    results = cell.set_parameters(changes)
+    assert all(result.successful for result in results), results
+    assert cell.node.session.settings == replace(
+        Settings(),
+        model='ratio',
+        sigma_position=2e-4,
+        wanted_accuracy=1e-6,
+        still=1e-3,
+        fixed=('elbow_joint.a',),
     )
+    assert 'more expected for 0.001 mm' in cell.node.session.status()
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    after = cell.node.session.calibration.chain
+    assert after.table[2, 0] == load_chain('ur10e').table[2, 0] != before.table[2, 0]
+    assert len(after.effects) == 6
+
+
+def test_all_of_an_atomic_change_or_nothing(cell):
+    settings = cell.node.session.settings
+    changes = [Parameter('sigma_position', value=5e-4), Parameter('model', value='nonsense')]
+    assert not cell.node.set_parameters_atomically(changes).successful
+    assert cell.node.session.settings == settings
+    assert cell.node.get_parameter('sigma_position').value == settings.sigma_position
+
+
+# Names, time, several robots, the end
+
+
+def test_namespace_and_remapping(tmp_path, recording):
+    with Cell() as cell:
+        node = cell.start(
+            ['__node:=arm', 'measured_pose:=/tracker/pose', 'joint_states:=ur/joint_states'],
+            namespace='/cell_2',
+            chain='ur10e',
+            data_dir=str(tmp_path),
+        )
+        joints, poses = topics(recording).values()
+        cell.play({'/cell_2/ur/joint_states': joints, '/tracker/pose': poses}, node=node)
+        answer = cell.call('identify', node='/cell_2/arm')
+        assert answer.success, answer.message
+        texts = cell.listen(String, '/cell_2/arm/calibration')
+        cell.spin_until(lambda: texts)
+        record = calibration_record(texts[0].data)
+        assert record['topics'] == ['/cell_2/ur/joint_states', '/tracker/pose']
+
+
+def test_stamps_follow_simulated_time(monkeypatch, tmp_path):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    with Cell(chain='ur10e', data_dir=str(tmp_path), use_sim_time=True) as cell:
+        diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        cell.spin_until(lambda: diagnostics)  # it speaks although the clock stands still
+        assert stamp_ns(diagnostics[0]) == 0
+        clock = cell.publisher(Clock, '/clock')
+        for seconds in (1000, 2000, 500):  # and when it jumps back
+            clock.publish(Clock(clock=Time(sec=seconds)))
+            cell.spin_until(lambda now=seconds: stamp_ns(diagnostics[-1]) == now * 10**9)
+
+
+def test_several_robots_in_one_process(tmp_path, recording, truth):
+    rng = np.random.default_rng(12)
+    small = faulty(load_chain('meca500'), SimulatedCell(), rng)
+    other = shift(small)
+    with Cell() as cell:
+        for namespace, chain, played in (('/a', 'ur10e', recording), ('/b', 'meca500', other)):
+            node = cell.start(namespace=namespace, chain=chain, data_dir=str(tmp_path))
+            messages = {f'{namespace}/{name}': m for name, m in topics(played).items()}
+            cell.play(messages, node=node)
+        first = cell.start_call('identify', node='/a/calibration_node')
+        second = cell.start_call('identify', node='/b/calibration_node')
+        cell.spin_until(lambda: first.done() and second.done())
+        assert first.result().success, first.result().message
+        assert second.result().success, second.result().message
+        for node, true in zip(cell.nodes, (truth, small), strict=True):
+            unseen = true.random_joints(100, rng)
+            error = node.session.calibration.chain.forward(unseen) - true.forward(unseen)
+            assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 1e-4
+            assert node.session.account().dropped == {}
+    journals = sorted(path.name.partition('_')[0] for path in tmp_path.glob('*Z.csv'))
+    assert journals == ['meca500', 'ur10e']
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('executor', ['events', 'single_threaded'])
-def test_signals_end_the_node_cleanly(number, executor):
-    process = start_node('-p', 'chain:=ur10e', '-p', 'max_gap:=1', '-p', f'executor:={executor}')
-    assert 'ready to calibrate ur10e' in process.stdout.readline()
-    process.send_signal(number)
-    output, _ = process.communicate(timeout=20)
-    assert process.returncode == 0, output
-    assert 'Traceback' not in output
+def test_signals_end_the_node_cleanly(tmp_path, number, executor):
+    with Child(chain='ur10e', max_gap=1, executor=executor, data_dir=tmp_path) as child:
+        child.wait_for('ready to calibrate ur10e')
+        assert child.end(number) == 0, child.output
+        assert 'Traceback' not in child.output
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'said'),
+    ('parameters', 'said'),
     [
-        ((), 'parameter "chain" is not set'),
-        (('-p', 'chain:=ur10f'), 'did you mean "ur10"?'),
-        (('-p', 'chain:=ur10e', '-p', 'max_gap:=fast'), 'parameter "max_gap" must be a number'),
-        (('-p', 'chain:=ur10e', '-p', 'executor:=fast'), 'must be one of events'),
-        (('-p', 'chain:=ur10e', '-p', 'folds:=1'), 'folds'),
-        (('-p', 'chain:=ur10e', '-p', 'max_gapp:=1.0'), 'did you mean "max_gap"'),
-        (('--params-file', os.devnull + '/none'), 'none'),
+        ({'chain': 'ur10f'}, 'did you mean "ur10"?'),
+        ({'folds': 1}, 'folds'),
+        ({'folds': 5.5}, 'folds'),
+        ({'model': 'ration'}, 'did you mean "ratio"'),
+        ({'mode': 'dwel'}, 'did you mean "dwell"'),
+        ({'fixed': ['joint_2.a']}, 'unknown parameter "joint_2.a"'),
+        ({'sources': ['pose typ=Range']}, 'did you mean "type"'),
+        ({'sources': ['/pose type=Rangee']}, 'sensor_msgs/msg/Range'),
+        ({'sources': ['/pose', '/pose type=Range']}, 'named twice'),
+        ({'max_gapp': 1.0}, 'did you mean "max_gap"'),
+        ({'delay': 'none'}, 'parameter "delay" must be a number'),
     ],
 )
-def test_a_wrong_parameter_ends_the_node_with_one_clear_line(arguments, said):
-    process = start_node(*arguments)
-    output, _ = process.communicate(timeout=20)
-    assert process.returncode == 1
-    assert said in output
-    assert 'Traceback' not in output
+def test_a_wrong_parameter_is_refused_at_the_start(tmp_path, parameters, said):
+    with Cell() as cell, pytest.raises((CalibrationError, ParameterException)) as caught:
+        cell.start(**{'chain': 'ur10e', 'data_dir': str(tmp_path)} | parameters)
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'said'),
+    [
+        ({}, 'parameter "chain" is not set'),
+        ({'chain': 'ur10e', 'folds': 1}, 'folds'),
+        ({'chain': 'ur10e', 'executor': 'fast'}, 'must be one of events'),
+    ],
+)
+def test_a_wrong_parameter_ends_the_node_with_one_clear_line(parameters, said):
+    with Child(**parameters) as child:
+        assert child.end() == 1
+        assert said in child.output
+        assert 'Traceback' not in child.output
 
 
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):
-    shipped = os.path.join(os.path.dirname(__file__), '..', 'config', 'calibration_node.yaml')
-    with open(shipped) as file:
-        text = file.read().replace('# chain: ur10e ', 'chain: meca500')
+    with open(SHIPPED) as file:
+        text = file.read().replace("chain: ''", 'chain: meca500')
     path = tmp_path / 'parameters.yaml'
     path.write_text(text)
-    process = start_node('--params-file', str(path), '-r', '__ns:=/cell_2', '-r', '__node:=arm')
-    line = process.stdout.readline()
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=20)
-    assert 'cell_2.arm' in line
-    assert 'ready to calibrate meca500' in line
-    assert process.returncode == 0, output
+    names = ('-r', '__ns:=/cell_2', '-r', '__node:=arm')
+    with Child('--params-file', str(path), *names, data_dir=tmp_path) as child:
+        output = child.wait_for('ready to calibrate meca500')
+        assert 'cell_2.arm' in output
+        assert child.end(signal.SIGINT) == 0, child.output
+
+
+def test_the_launch_file_names_what_is_there():
+    """`launch` is not among the wheels: the file is read, not run."""
+    text = (SHIPPED.parents[1] / 'launch' / 'calibration.launch.py').read_text()
+    tree = ast.parse(text)
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    (node,) = [call for call in calls if getattr(call.func, 'id', '') == 'Node']
+    given = {item.arg: item.value for item in node.keywords}
+    assert given['package'].value == 'calib_ros'
+    setup = (SHIPPED.parents[1] / 'setup.py').read_text()
+    assert f'{given["executable"].value} = calib_ros.node:main' in setup
+    constants = {c.value for c in ast.walk(tree) if isinstance(c, ast.Constant)}
+    assert {'share', 'calib_ros', 'config', 'calibration_node.yaml'} - {'share'} <= constants
+    remapped = [pair.elts[0].value for pair in given['remappings'].elts]
+    assert set(remapped) <= {source.topic for source in STANDARD} | {'joint_states'}

@@ -1,0 +1,316 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Flood the node with messages for minutes: is every one accounted for, and what does it cost?
+
+    python benchmarks/soak.py [--quick] [--json] [--minutes 10] [--rates 1000 1000]
+
+Four processes: the node; a publisher of joint states and poses of an arm that moves and stops; a
+node with empty callbacks on the same executor, which hears the same messages; and this one, which
+watches. In the middle an identification is asked for.
+
+`lost_uncounted` is what was sent and not counted by the node, plus what it counted as received
+and does not account for: received poses = in samples + waiting + not used + dropped.
+"""
+
+import argparse
+import csv
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from calib_ros import se3
+from calib_ros.config import load_chain
+from calib_ros.simulation import Cell, faulty, measure
+
+LEG = 1.2
+"""Time from one stop to the next [s], half of it in motion."""
+TICK = 1.0 / os.sysconf('SC_CLK_TCK')
+COUNTS = ('dropped', 'not used', 'note')
+PAGE = os.sysconf('SC_PAGE_SIZE') / 1e6
+
+
+def publisher(rates):
+    """Publish probes until a line comes on stdin, then the arm until another one does."""
+    node = Node('publisher')
+    truth = faulty(load_chain('ur10e'), Cell(), np.random.default_rng(0))
+    names = list(truth.joint_names)
+    out = {
+        JointState: node.create_publisher(JointState, 'joint_states', QoSProfile(depth=2000)),
+        PoseStamped: node.create_publisher(PoseStamped, 'measured_pose', QoSProfile(depth=2000)),
+    }
+    os.set_blocking(0, False)
+    while not sys.stdin.buffer.read(1):
+        for kind, each in out.items():
+            each.publish(kind())  # without a stamp: counted, and no more
+        time.sleep(0.1)
+    sent, slowest = dict.fromkeys(('joints', 'poses'), 0), 0.0
+    wall, start, leg = time.time_ns(), time.monotonic(), 0
+    rng = np.random.default_rng(1)
+    goals = truth.random_joints(1, rng)
+    while not sys.stdin.buffer.read(1):
+        goals = np.concatenate([goals[-1:], truth.random_joints(1, rng)])
+        due = sorted(
+            [(float(t), m) for t, m in joint_messages(goals, leg * LEG, rates[0], wall, names)]
+            + [(float(t), m) for t, m in poses(truth, goals, leg * LEG, rates[1], wall, rng)],
+            key=lambda item: item[0],
+        )
+        for moment, message in due:
+            late = time.monotonic() - start - moment
+            slowest = max(slowest, late)
+            if late < 0.0:
+                time.sleep(-late)
+            out[type(message)].publish(message)
+            sent['joints' if type(message) is JointState else 'poses'] += 1
+        leg += 1
+    print(json.dumps(sent | {'slowest': slowest}), flush=True)
+    sys.stdin.buffer.raw.readall()
+    node.destroy_node()
+
+
+def angles(goals, begin, times):
+    """Return joint values (N, n) of a smooth move after a stop."""
+    share = np.clip((times - begin - 0.5 * LEG) / (0.5 * LEG), 0.0, 1.0)
+    share = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    return goals[0] + share[:, np.newaxis] * (goals[1] - goals[0])
+
+
+def header(wall, moment, frame_id=''):
+    """Return a header stamped with a moment [s] after `wall` [ns]."""
+    seconds, nanoseconds = divmod(wall + round(moment * 1e9), 1_000_000_000)
+    return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
+
+
+def joint_messages(goals, begin, rate, wall, names):
+    """Yield joint states with their times."""
+    times = begin + np.arange(round(LEG * rate)) / rate
+    for moment, values in zip(times, angles(goals, begin, times).tolist(), strict=True):
+        yield moment, JointState(header=header(wall, moment), name=names, position=values)
+
+
+def poses(truth, goals, begin, rate, wall, rng):
+    """Yield measured poses with their times."""
+    times = begin + np.arange(round(LEG * rate)) / rate + 0.3e-3
+    measured = measure(truth, angles(goals, begin, times), rng, 5e-5, 1e-4)
+    quats = se3.to_quat(measured.rotations).tolist()
+    for moment, at, turn in zip(times, measured.positions.tolist(), quats, strict=True):
+        pose = Pose(
+            position=Point(x=at[0], y=at[1], z=at[2]),
+            orientation=Quaternion(x=turn[0], y=turn[1], z=turn[2], w=turn[3]),
+        )
+        yield moment, PoseStamped(header=header(wall, moment, 'tracker'), pose=pose)
+
+
+def empty():
+    """Hear the messages with callbacks that only count."""
+    node = Node('empty')
+    counts = [0, 0]
+
+    def hear(which):
+        def callback(message):
+            counts[which] += message.header.stamp.sec > 0
+
+        return callback
+
+    qos = QoSProfile(depth=2000, reliability=qos_profile_sensor_data.reliability)
+    node.create_subscription(JointState, 'joint_states', hear(0), qos)
+    node.create_subscription(PoseStamped, 'measured_pose', hear(1), qos)
+    executor = EventsExecutor()
+    executor.add_node(node)
+    os.set_blocking(0, False)
+    while not sys.stdin.buffer.read(1):
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
+    print(json.dumps({'joints': counts[0], 'poses': counts[1]}), flush=True)
+    sys.stdin.buffer.raw.readall()
+
+
+class Process:
+    """A child process, and what it uses."""
+
+    def __init__(self, *command):
+        self.process = subprocess.Popen(
+            [sys.executable, *map(str, command)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def tell(self):
+        """Send it a character."""
+        self.process.stdin.write('x')
+        self.process.stdin.flush()
+
+    def answer(self):
+        """Send it a character; return the JSON that it prints."""
+        self.tell()
+        return json.loads(self.process.stdout.readline())
+
+    @property
+    def cpu(self):
+        """Return the CPU time used so far [s]."""
+        text = Path(f'/proc/{self.process.pid}/stat').read_text().rpartition(')')[2].split()
+        return (int(text[11]) + int(text[12])) * TICK
+
+    @property
+    def memory(self):
+        """Return the resident memory [MB]."""
+        return int(Path(f'/proc/{self.process.pid}/statm').read_text().split()[1]) * PAGE
+
+
+def run(seconds, rates, folder):
+    """Run the soak; return what was found."""
+    watch = Node('watch')
+    executor = EventsExecutor()
+    executor.add_node(watch)
+    heard = []
+    watch.create_subscription(DiagnosticArray, '/diagnostics', heard.append, 10)
+    identify = watch.create_client(Trigger, '/calibration_node/identify')
+
+    def spin_until(predicate, timeout=60.0):
+        end = time.monotonic() + timeout
+        while not predicate():
+            if time.monotonic() > end:
+                raise TimeoutError('the node does not answer')
+            executor.spin_once(timeout_sec=0.1)
+
+    def values():
+        return {item.key: item.value for item in heard[-1].status[0].values} if heard else {}
+
+    parameters = ('-p', 'chain:=ur10e', '-p', f'data_dir:={folder}')
+    node = Process('-m', 'calib_ros.node', '--ros-args', *parameters)
+    idle = Process(__file__, '--role', 'empty')
+    flood = Process(__file__, '--role', 'publisher', '--rates', *rates)
+    probes = ('dropped joints: zero stamp', 'dropped poses: zero stamp')
+    try:
+        spin_until(lambda: all(name in values() for name in probes))
+        spin_until(identify.service_is_ready)
+        flood.tell()
+        warm = min(60.0, 0.3 * seconds)
+        start = time.monotonic()
+        spin_until(lambda: time.monotonic() - start > warm, 2.0 * warm)
+        first = values()
+        begin = (time.monotonic(), node.cpu, idle.cpu, received(first))
+        memory, asked, answered = [], None, None
+        while time.monotonic() - start < seconds:
+            executor.spin_once(timeout_sec=0.1)
+            if not memory or time.monotonic() - memory[-1][0] > 1.0:
+                memory.append((time.monotonic(), node.memory))
+            if asked is None and time.monotonic() - start > 0.6 * seconds:
+                asked, called = identify.call_async(Trigger.Request()), time.monotonic()
+            if asked is not None and asked.done() and answered is None:
+                answered = time.monotonic() - called
+        # Diagnostics come once a second: what they count and the time of them belong together.
+        count = len(heard)
+        spin_until(lambda: len(heard) > count)
+        end = (time.monotonic(), node.cpu, idle.cpu, received(values()))
+        sent = flood.answer()
+        spin_until(lambda: len(heard) > 1 and steady(heard))
+        last, other = values(), idle.answer()
+    finally:
+        for each in (flood, idle, node):
+            each.process.terminate()
+            each.process.wait()
+    messages, span = end[3] - begin[3], end[0] - begin[0]
+    probed = {name: int(last[name]) for name in probes}
+    lost = {
+        'joints': sent['joints'] + probed[probes[0]] - int(last['joint states']),
+        'poses': sent['poses'] + probed[probes[1]] - int(last['poses']),
+    }
+    (journal,) = folder.glob('*Z.csv')
+    with journal.open() as file:
+        in_samples = sum(int(row['count']) for row in csv.DictReader(file))
+    accounted = in_samples + int(last['poses waiting'])
+    for key, value in last.items():
+        if key.startswith(('dropped poses', 'not used poses')):
+            accounted += int(value)
+    unaccounted = int(last['poses']) - accounted
+    times, sizes = np.array(memory).T
+    return {
+        'seconds': round(span, 1),
+        'sent': {key: sent[key] for key in ('joints', 'poses')},
+        'publisher late by at most [s]': round(sent['slowest'], 3),
+        'lost': lost,
+        'unaccounted poses': unaccounted,
+        'lost_uncounted': sum(abs(n) for n in (*lost.values(), unaccounted)),
+        'lost by the empty node': sent['joints'] + sent['poses'] - sum(other.values()),
+        'samples': int(last['samples']),
+        'account': {
+            k: v for k, v in last.items() if k.startswith(('dropped', 'not used', 'note'))
+        },
+        'identify': {
+            'success': bool(asked and asked.done() and asked.result().success),
+            'seconds': None if answered is None else round(answered, 2),
+        },
+        'memory [MB]': round(float(sizes[-1]), 1),
+        'memory slope [kB/min]': round(6e4 * float(np.polyfit(times, sizes, 1)[0]), 1),
+        'cpu of the node [us/message]': round(1e6 * (end[1] - begin[1]) / messages, 1),
+        'cpu of empty callbacks [us/message]': round(1e6 * (end[2] - begin[2]) / messages, 1),
+        'ratio': round((end[1] - begin[1]) / (end[2] - begin[2]), 3),
+        'share of a core': round((end[1] - begin[1]) / span, 3),
+    }
+
+
+def received(values):
+    """Return how many messages the node has counted."""
+    return int(values['joint states']) + int(values['poses'])
+
+
+def steady(heard):
+    """Tell whether nothing has changed between the last two diagnostics."""
+    first, second = (
+        [v.value for v in each.status[0].values if v.key in ('joint states', 'poses')]
+        for each in heard[-2:]
+    )
+    return first == second
+
+
+def main():
+    """Play the part that is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--minutes', type=float, default=10.0)
+    parser.add_argument('--rates', type=float, nargs=2, default=(1000.0, 1000.0), metavar='HZ')
+    parser.add_argument('--quick', action='store_true')
+    parser.add_argument('--json', action='store_true')
+    parser.add_argument('--role', choices=('publisher', 'empty'), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
+    rclpy.init(args=[])
+    if options.role == 'publisher':
+        publisher(options.rates)
+    elif options.role == 'empty':
+        empty()
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            os.environ['ROS_HOME'] = folder
+            found = run(
+                30.0 if options.quick else 60.0 * options.minutes, options.rates, Path(folder)
+            )
+        if options.json:
+            print(json.dumps(found))
+        else:
+            for name, value in found.items():
+                print(f'{name:36} {value}')
+
+
+if __name__ == '__main__':
+    main()

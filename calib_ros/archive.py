@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The folder in which a node keeps the journals and calibrations of one robot.
+
+Rows that cannot be written, because the disk is full say, wait in memory until they can be.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+
+from calib_ros.files import write_file
+from calib_ros.journal import Journal
+from calib_ros.samples import Sample
+from calib_ros.tables import read_journal
+
+CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
+
+
+class Archive:
+    """Files ROBOT_TIME of one robot.
+
+    Parameters
+    ----------
+    folder : Path
+        It is made when the first file is written.
+    robot : str
+        Name of the robot, with its serial number if there are several.
+    joints : int
+        Number of joints.
+    configuration : callable
+        Returns the configuration to write beside every file.
+
+    """
+
+    def __init__(
+        self, folder: Path, robot: str, joints: int, configuration: Callable[[], str]
+    ) -> None:
+        self.folder = folder
+        self.error = ''
+        """Why samples are in memory only; empty while all are in the journal."""
+        self._robot = re.sub(r'[^\w.-]', '_', robot)
+        self._joints = joints
+        self._configuration = configuration
+        self._journal: Journal | None = None
+        self._waiting: list[tuple[Sample, bool]] = []
+        self._path = self._new_path(JOURNAL)
+        self._due = False
+
+    @property
+    def journal(self) -> Path | None:
+        """Return the path of the journal, if there is one."""
+        return None if self._journal is None else self._journal.path
+
+    def add(self, sample: Sample) -> None:
+        """Keep a sample."""
+        self._waiting.append((sample, False))
+        self.write()
+
+    def remove(self, sample: Sample) -> None:
+        """Keep that a sample was taken back."""
+        if (sample, False) in self._waiting:
+            self._waiting.remove((sample, False))
+        else:
+            self._waiting.append((sample, True))
+        self.write()
+
+    def write(self) -> None:
+        """Write what waits, as far as that is possible; `error` tells whether it was."""
+        try:
+            if self._journal is None and (self._waiting or self._due):
+                write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
+                self._journal = Journal(self._path, self._joints)
+                self._due = False
+            while self._journal is not None and self._waiting:
+                sample, removed = self._waiting[0]
+                (self._journal.remove if removed else self._journal.add)(sample)
+                del self._waiting[0]
+        except OSError as err:
+            self.error = str(err)
+        else:
+            self.error = ''
+
+    def begin_anew(self) -> Path | None:
+        """Begin another journal; return the path of the old one, which stays.
+
+        The new one is written at once: after a crash it must be the newest.
+        """
+        old = self.journal
+        self._waiting.clear()
+        self.close()
+        self._path = self._new_path(JOURNAL)
+        self._due = old is not None
+        self.write()
+        return old
+
+    def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
+        """Go on with the newest journal, if there is one; return its samples, and warnings.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read.
+
+        """
+        found = self._files(JOURNAL)
+        if not found:
+            return (), (f'nothing to resume in {self.folder}: a new session begins',)
+        self._path = found[-1]
+        samples, warnings = read_journal(self._path, self._joints)
+        self._journal = Journal(self._path, self._joints)
+        return samples, warnings
+
+    def newest_calibration(self) -> Path | None:
+        """Return the calibration that was saved last."""
+        return next(reversed(self._files(CALIBRATION)), None)
+
+    def save(self, text: str, path: Path | None = None) -> Path:
+        """Write a calibration, into a new file unless a path is given; return its path.
+
+        Raises
+        ------
+        InputError
+            When the file is there already.
+        OSError
+            When it cannot be written.
+
+        """
+        path = path or self._new_path(CALIBRATION)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, text)
+        write_file(path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
+        return path
+
+    def export(self, files: Mapping[str, str]) -> Path:
+        """Write files into a new folder; return its path."""
+        folder = self._new_path('')
+        folder.mkdir(parents=True)
+        for name, content in files.items():
+            write_file(folder / name, content)
+        return folder
+
+    def close(self) -> None:
+        """Write what can be written, and close the journal."""
+        self.write()
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
+
+    def _new_path(self, ending: str) -> Path:
+        moment = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
+        return self.folder / f'{self._robot}_{moment}{ending}'
+
+    def _files(self, ending: str) -> list[Path]:
+        """Return the files of this robot that hold anything, the oldest first."""
+        name = re.compile(rf'{re.escape(self._robot)}_\d{{8}}T\d{{12}}Z{re.escape(ending)}')
+        found = self.folder.glob(f'*{ending}')
+        mine = [path for path in found if name.fullmatch(path.name)]
+        return sorted(path for path in mine if path.stat().st_size)

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Serialised messages of a recording straight to arrays.
+
+Messages of one topic mostly differ in their stamps and numbers only: the names in them, and so
+the places of the numbers (OMG Common Data Representation), are the same. The layout is read off
+the first message of a batch, the others are held against it byte by byte, and all numbers are
+taken at once. A batch that differs is no error: `None` says that each message must be decoded by
+itself.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.messages import JOINT_STATE
+from calib_ros.se3 import FloatArray
+from calib_ros.track import Stamps
+
+LITTLE_ENDIAN = b'\x00\x01'
+_HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
+
+# Of each type: strings before the numbers, bytes between, kind and count of the numbers.
+_LAYOUTS: dict[str, tuple[int, int, str, int]] = {
+    'geometry_msgs/msg/PoseStamped': (1, 0, '<f8', 7),
+    'geometry_msgs/msg/PointStamped': (1, 0, '<f8', 3),
+    'geometry_msgs/msg/TransformStamped': (2, 0, '<f8', 7),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': (1, 0, '<f8', 43),
+    'nav_msgs/msg/Odometry': (2, 0, '<f8', 43),
+    'sensor_msgs/msg/Range': (1, 1, '<f4', 4),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Stamps (N,), the strings that all messages share, and their numbers (N, k)."""
+
+    stamps_ns: Stamps
+    strings: tuple[str, ...]
+    numbers: FloatArray
+
+
+def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
+    """Return messages of one topic as arrays; None where their layouts differ.
+
+    Parameters
+    ----------
+    kind : str
+        Message type: JointState or a type of measurement.
+    blobs : sequence of bytes
+        Serialised messages, each with its encapsulation.
+
+    Notes
+    -----
+    Strings are the frame and child frame of a measurement, or the frame and the joint names.
+    Numbers are position and quaternion (7), position (3), those and the covariance (43), field of
+    view, least, greatest and measured range (4), or the joint positions.
+
+    """
+    first = blobs[0]
+    length = len(first)
+    if first[:2] != LITTLE_ENDIAN or any(len(blob) != length for blob in blobs):
+        return None
+    try:
+        strings, begin, dtype, count = _layout(kind, first)
+    except (struct.error, UnicodeDecodeError):
+        return None
+    size = np.dtype(dtype).itemsize
+    if begin + count * size > length:
+        return None
+    rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
+    names = rows[:, _HEAD + _STAMP : begin]
+    if (rows[:, :2] != rows[0, :2]).any() or (names != names[0]).any():
+        return None
+    stamps = _numbers(rows, _HEAD, '<u4', 2).astype(np.int64)
+    numbers = _numbers(rows, begin, dtype, count)
+    seconds = stamps[:, 0].astype(np.uint32).view(np.int32)
+    return Batch(
+        seconds.astype(np.int64) * 1_000_000_000 + stamps[:, 1],
+        strings,
+        numbers.astype(np.float64),
+    )
+
+
+def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
+    """Return strings, the place of the numbers, their kind and count."""
+    at = _HEAD + _STAMP
+    if kind == JOINT_STATE:
+        frame_id, at = _string(blob, at)
+        names, at = _integer(blob, at)
+        strings = [frame_id]
+        for _ in range(names):
+            name, at = _string(blob, at)
+            strings.append(name)
+        count, at = _integer(blob, at)
+        return tuple(strings), _aligned(at, 8), '<f8', count
+    texts, between, dtype, count = _LAYOUTS[kind]
+    strings = []
+    for _ in range(texts):
+        text, at = _string(blob, at)
+        strings.append(text)
+    return tuple(strings), _aligned(at + between, np.dtype(dtype).itemsize), dtype, count
+
+
+def _aligned(at: int, size: int) -> int:
+    """Return the next place that is a multiple of a size after the encapsulation."""
+    return at + (_HEAD - at) % size
+
+
+def _integer(blob: bytes, at: int) -> tuple[int, int]:
+    at = _aligned(at, 4)
+    return int(struct.unpack_from('<I', blob, at)[0]), at + 4
+
+
+def _string(blob: bytes, at: int) -> tuple[str, int]:
+    length, at = _integer(blob, at)
+    return blob[at : at + max(length - 1, 0)].decode(), at + length
+
+
+def _numbers(rows: NDArray[np.uint8], begin: int, dtype: str, count: int) -> NDArray[np.generic]:
+    size = np.dtype(dtype).itemsize * count
+    return np.ascontiguousarray(rows[:, begin : begin + size]).view(dtype)

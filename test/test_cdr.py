@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros import messages
+from calib_ros.cdr import decode
+from calib_ros.messages import DECODERS, JOINT_STATE
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
+NUMBERS = st.floats(-1e6, 1e6)
+SECONDS, NANOSECONDS = st.integers(0, 2**31 - 1), st.integers(0, 999_999_999)
+
+
+def header(seconds, nanoseconds, frame_id):
+    time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
+    return TYPES['std_msgs/msg/Header'](time, frame_id)
+
+
+def pose(numbers):
+    point = TYPES['geometry_msgs/msg/Point'](*numbers[:3])
+    return TYPES['geometry_msgs/msg/Pose'](
+        point, TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
+    )
+
+
+def message(kind, head, child, numbers):
+    cls = TYPES[kind]
+    covariance = np.arange(36.0) + numbers[0]
+    if kind == 'geometry_msgs/msg/PoseStamped':
+        return cls(head, pose(numbers))
+    if kind == 'geometry_msgs/msg/PointStamped':
+        return cls(head, TYPES['geometry_msgs/msg/Point'](*numbers[:3]))
+    if kind == 'sensor_msgs/msg/Range':
+        return cls(head, 0, *np.float32(numbers[:4]))
+    if kind == 'geometry_msgs/msg/TransformStamped':
+        shift = TYPES['geometry_msgs/msg/Vector3'](*numbers[:3])
+        turn = TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
+        return cls(head, child, TYPES['geometry_msgs/msg/Transform'](shift, turn))
+    with_covariance = TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(numbers), covariance)
+    if kind == 'nav_msgs/msg/Odometry':
+        zero = TYPES['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+        twist = TYPES['geometry_msgs/msg/Twist'](zero, zero)
+        return cls(
+            head,
+            child,
+            with_covariance,
+            TYPES['geometry_msgs/msg/TwistWithCovariance'](twist, covariance),
+        )
+    return cls(head, with_covariance)
+
+
+@given(
+    st.sampled_from(sorted(DECODERS)),
+    NAMES,
+    NAMES,
+    st.lists(
+        st.tuples(SECONDS, NANOSECONDS, st.lists(NUMBERS, min_size=7, max_size=7)),
+        min_size=1,
+        max_size=5,
+    ),
+)
+def test_measurements_are_decoded_as_by_rosbags(kind, frame_id, child, rows):
+    given_ = [message(kind, header(s, ns, frame_id), child, n) for s, ns, n in rows]
+    blobs = [bytes(STORE.serialize_cdr(each, kind)) for each in given_]
+    batch = decode(kind, blobs)
+    assert batch.strings[0] == frame_id
+    if len(batch.strings) > 1:
+        assert batch.strings[1] == child
+    for k, ((seconds, nanoseconds, numbers), stamp) in enumerate(
+        zip(rows, batch.stamps_ns, strict=True)
+    ):
+        assert stamp == seconds * 1_000_000_000 + nanoseconds
+        found = batch.numbers[k]
+        if kind.endswith('Range'):
+            numbers = np.float32(numbers[:4])
+        np.testing.assert_array_equal(found[:7], numbers[: len(found)])
+        if len(found) == 43:
+            np.testing.assert_array_equal(found[7:], np.arange(36.0) + numbers[0])
+
+
+@given(
+    NAMES,
+    st.lists(NAMES, max_size=8),
+    st.lists(st.tuples(SECONDS, NANOSECONDS, NUMBERS), min_size=1, max_size=5),
+)
+def test_joint_states_are_decoded_as_by_rosbags(frame_id, names, rows):
+    empty = np.zeros(0)
+    blobs = []
+    for seconds, nanoseconds, value in rows:
+        positions = value + np.arange(float(len(names)))
+        head = header(seconds, nanoseconds, frame_id)
+        given_ = TYPES[JOINT_STATE](head, names, positions, positions, empty)
+        blobs.append(bytes(STORE.serialize_cdr(given_, JOINT_STATE)))
+    batch = decode(JOINT_STATE, blobs)
+    assert batch.strings == (frame_id, *names)
+    for k, blob in enumerate(blobs):
+        expected = STORE.deserialize_cdr(blob, JOINT_STATE)
+        np.testing.assert_array_equal(batch.numbers[k], expected.position)
+        if rows[k][0] + rows[k][1]:
+            assert batch.stamps_ns[k] == messages.joint_state(expected).stamp_ns
+
+
+def joint_blob(names, positions, frame_id=''):
+    empty = np.zeros(0)
+    given_ = TYPES[JOINT_STATE](header(1, 0, frame_id), names, np.array(positions), empty, empty)
+    return bytes(STORE.serialize_cdr(given_, JOINT_STATE))
+
+
+def test_messages_of_different_layout_are_left_to_others():
+    one, other = joint_blob(['a', 'b'], [1.0, 2.0]), joint_blob(['b', 'a'], [1.0, 2.0])
+    assert decode(JOINT_STATE, [one, one]) is not None
+    assert decode(JOINT_STATE, [one, other]) is None
+    assert decode(JOINT_STATE, [one, joint_blob(['a'], [1.0])]) is None
+    assert decode(JOINT_STATE, [one, joint_blob(['a', 'b'], [1.0, 2.0], 'x')]) is None
+
+
+@pytest.mark.parametrize('cut', [3, 9, 14, 30, -9, -1])
+def test_broken_messages_are_left_to_others(cut):
+    blob = joint_blob(['a', 'b'], [1.0, 2.0])
+    decoded = decode(JOINT_STATE, [blob[:cut]])
+    assert decoded is None or decoded.numbers.shape == (1, 2)
+    assert decode(JOINT_STATE, [b'\x00\x00' + blob[2:]]) is None  # big-endian

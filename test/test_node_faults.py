@@ -1,0 +1,408 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in real rclpy when something goes wrong: kills, full disks, dead sources."""
+
+import resource
+import signal
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_cell import (
+    START,
+    STOPS,
+    Cell,
+    Child,
+    assert_same,
+    direct,
+    joint_messages,
+    pose_messages,
+    shift,
+    stamp_ns,
+    topics,
+    true_arm,
+    values_of,
+)
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from calib_ros import node as node_module
+from calib_ros.archive import Archive
+from calib_ros.config import load_chain
+from calib_ros.tables import read_journal
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+@pytest.fixture(scope='module')
+def recording():
+    return shift(true_arm())
+
+
+@pytest.fixture
+def cell(monkeypatch, tmp_path):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        yield cell
+
+
+@pytest.fixture
+def journal(tmp_path, recording):
+    """Return a folder with the journal of a whole shift."""
+    archive = Archive(tmp_path, 'ur10e', 6, lambda: '')
+    session = direct(recording)
+    session.finish()
+    for sample in session.samples:
+        archive.add(sample)
+    archive.close()
+    return tmp_path
+
+
+def part(recording, first, last):
+    """Return the messages of a time [s] by topic."""
+    return {
+        topic: [m for m in messages if first <= (stamp_ns(m) - START) * 1e-9 < last]
+        for topic, messages in topics(recording).items()
+    }
+
+
+def samples_in(folder):
+    (path,) = folder.glob('*Z.csv')
+    return read_journal(path, 6)[0]
+
+
+@contextmanager
+def cell_and_child(**parameters):
+    """Start a peer and a node in a child process, which misses nothing.
+
+    Each child has a peer and a domain of its own: DDS takes a killed one to be alive for a while.
+    """
+    reliable = {
+        f'qos_overrides./{topic}.subscription.reliability': 'reliable'
+        for topic in ('joint_states', 'measured_pose')
+    }
+    with (
+        Cell() as cell,
+        Child(domain=cell.domain, chain='ur10e', **reliable, **parameters) as child,
+    ):
+        yield cell, child
+
+
+# Killed
+
+
+def test_a_killed_node_goes_on_with_all_its_samples(tmp_path, recording):
+    with cell_and_child(data_dir=tmp_path) as (cell, child):
+        cell.play(part(recording, 0.0, 12.0))
+        cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 11)
+        child.kill()
+    (path,) = tmp_path.glob('*Z.csv')
+    with path.open('a') as file:
+        file.write('1700000000,0.1,0.')  # a row that a crash of the machine cut off
+    with cell_and_child(data_dir=tmp_path, resume='true') as (cell, child):
+        output = child.wait_for('ready to calibrate')
+        assert 'was cut off and is left out' in output
+        assert f'resumed 11 samples of {path}' in output
+        cell.play(part(recording, 12.0, 24.0))
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 22)
+        answer = cell.call('identify')
+        assert answer.success, answer.message
+        assert '23 pairs' in answer.message  # the last stop had not ended
+    expected = direct(recording)
+    expected.finish()
+    survived = [s for s in expected.samples if not 11.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
+    for kept, sample in zip(samples_in(tmp_path), survived, strict=True):
+        assert kept.stamp_ns == sample.stamp_ns
+        np.testing.assert_array_equal(kept.joints, sample.joints)
+        np.testing.assert_array_equal(kept.position, sample.position)
+
+
+SLOW_SAVE = """
+import os, time
+sync = os.fsync
+def slow(file):
+    sync(file)
+    if os.readlink(f'/proc/self/fd/{file}').endswith('.partial'):
+        print('in the middle of saving', flush=True)
+        time.sleep(60.0)
+os.fsync = slow
+"""
+SLOW_IDENTIFICATION = """
+import time
+from calib_ros import node
+def identify_model(problem, model):
+    print('identifying', flush=True)
+    time.sleep(60.0)
+node.identify_model = identify_model
+close = node.CalibrationNode.close
+def noisy(self):
+    print('joining', flush=True)
+    return close(self)
+node.CalibrationNode.close = noisy
+"""
+RUN = """
+import sys
+from calib_ros.node import main
+sys.exit(main())
+"""
+
+
+def test_killed_while_it_saves(journal):
+    with cell_and_child(data_dir=journal, resume='true') as (cell, child):
+        assert cell.call('identify').success
+        assert cell.call('save').success
+        (earlier,) = journal.glob('*Z.yaml')
+        whole = earlier.read_text()
+        child.kill()
+    command = ('-c', SLOW_SAVE + RUN)
+    with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
+        assert cell.call('identify').success
+        cell.start_call('save')
+        child.wait_for('in the middle of saving')
+        child.kill()
+    assert list(journal.glob('*Z.yaml')) == [earlier]
+    assert earlier.read_text() == whole
+    with Cell(chain='ur10e', data_dir=str(journal)) as cell:
+        loaded = cell.call('load')
+        assert loaded.success, loaded.message
+        assert str(earlier) in loaded.message
+
+
+def test_killed_in_a_loop_of_saves(journal):
+    with cell_and_child(data_dir=journal, resume='true') as (cell, child):
+        assert cell.call('identify').success
+        for _ in range(10):
+            running = [cell.start_call('save') for _ in range(8)]
+            cell.spin_until(running[3].done)
+        child.kill()
+    saved = list(journal.glob('*Z.yaml'))
+    assert len(saved) >= 40
+    assert len({path.read_text() for path in saved}) == 1
+    assert load_chain(saved[-1]).joint_names == true_arm().joint_names
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_ended_while_an_identification_runs(journal, number):
+    command = ('-c', SLOW_IDENTIFICATION + RUN)
+    with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
+        cell.start_call('identify')
+        child.wait_for('identifying')
+        child.process.send_signal(number)
+        child.process.send_signal(signal.SIGINT)  # a second one harms nothing
+        child.wait_for('joining')
+        child.process.send_signal(signal.SIGINT)
+        assert child.end() == 0, child.output
+        assert 'Traceback' not in child.output
+
+
+# A full disk
+
+
+def test_a_full_disk(tmp_path, recording):
+    with cell_and_child(data_dir=tmp_path) as (cell, child):
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        cell.play(part(recording, 0.0, 6.0))
+        cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 5)
+        (path,) = tmp_path.glob('*Z.csv')
+        _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
+        full = path.stat().st_size + 100  # there is room for a part of the next row
+        resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (full, hard))
+        cell.play(part(recording, 6.0, 24.0))
+
+        def level(wanted, said):
+            cell.spin_until(lambda: heard and heard[-1].status[0].level == wanted)
+            assert said in heard[-1].status[0].message
+
+        level(DiagnosticStatus.ERROR, 'samples are in memory only')
+        cell.spin_until(lambda: values_of(heard[-1])['samples'] == '23')
+        assert len(samples_in(tmp_path)) == 5
+        answer = cell.call('identify')
+        assert answer.success, answer.message
+        resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
+        unsaved = cell.call('save')
+        assert not unsaved.success
+        assert 'File too large' in unsaved.message
+        assert [each.name for each in tmp_path.iterdir() if 'yaml' in each.name] == [
+            path.with_suffix('.settings.yaml').name
+        ]
+        resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
+        level(DiagnosticStatus.OK, 'samples')
+        assert len(samples_in(tmp_path)) == STOPS
+        assert cell.call('save').success
+        assert child.end(signal.SIGINT) == 0
+        assert child.output.count('samples are kept in memory only') == 1
+
+
+# Sources
+
+
+def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
+    monkeypatch.setattr(node_module, 'SILENCE', 0.4)
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    joints, poses = topics(recording).values()
+    arm = cell.publisher(JointState, 'joint_states')
+    tracker = cell.publisher(PoseStamped, 'measured_pose')
+    alive = [arm, tracker]
+
+    def publish():
+        for publisher, messages in ((arm, joints), (tracker, poses)):
+            if publisher in alive:
+                publisher.publish(messages[0])
+
+    cell.peer.create_timer(0.05, publish)
+
+    def wait_for(said, wanted=True):
+        cell.spin_until(lambda: heard and (said in heard[-1].status[0].message) == wanted)
+
+    silent = 'nothing is heard on /measured_pose any more'
+    cell.spin_until(lambda: heard and 'rate of /measured_pose [Hz]' in values_of(heard[-1]))
+    alive.remove(tracker)
+    wait_for(silent)
+    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    assert '/joint_states' not in heard[-1].status[0].message
+    alive.append(tracker)
+    wait_for(silent, wanted=False)
+    alive.clear()
+    wait_for('nothing is heard on /joint_states any more')
+
+
+def test_a_bag_that_is_played_again(cell, recording):
+    cell.play(topics(recording))
+    cell.node.session.problem()
+    before = {sample.stamp_ns for sample in cell.node.session.samples}
+    hour = 3_600_000_000_000
+    earlier = replace(
+        recording,
+        joint_stamps_ns=recording.joint_stamps_ns - hour,
+        poses=recording.poses.at(recording.poses.stamps_ns - hour),
+    )
+    for jumps, played, new in ((1, recording, 1), (2, earlier, STOPS)):
+        cell.play(topics(played))
+        cell.node.session.problem()
+        account = cell.node.session.account()
+        assert account.notes['the clock jumped back'] == jumps
+        fresh = {sample.stamp_ns for sample in cell.node.session.samples} - before
+        # The measurements before the jump shows are lost: the first stop gets another stamp.
+        assert new - 1 <= len(fresh) <= new
+        before |= fresh
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+
+
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+def test_a_late_tracker_and_messages_out_of_order(tmp_path, recording, mode):
+    expected = direct(recording, mode=mode).problem().observations
+    parameters = {'chain': 'ur10e', 'mode': mode, 'data_dir': str(tmp_path)}
+    with Cell(**parameters) as cell:
+        cell.play(topics(recording), late_ns=200_000_000)
+        assert_same(expected, cell.node.session.problem().observations)
+        account = cell.node.session.account()
+        assert (account.dropped, account.notes) == ({}, {})
+        assert cell.call('clear').success
+        cell.play(topics(recording), jitter=np.random.default_rng(4))
+        assert_same(expected, cell.node.session.problem().observations)
+        account = cell.node.session.account()
+        assert account.dropped == {}
+        assert account.notes['joints with a stamp older than the one before'] > 100
+
+
+def test_a_tracker_that_is_too_late_is_counted(cell, recording):
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.play(topics(recording), late_ns=4_000_000_000)
+    account = cell.node.session.account()
+    late = account.dropped['poses: later than lateness allows']
+    assert late + account.waiting == len(recording.poses)
+    cell.spin_until(lambda: heard and heard[-1].status[0].level == DiagnosticStatus.WARN)
+    assert 'later than lateness allows' in heard[-1].status[0].message
+
+
+# Messages that do not fit
+
+
+def test_poses_in_different_frames_are_refused(cell, recording):
+    some = pose_messages(recording.poses)
+    some[40].header.frame_id = 'camera'
+    cell.play(topics(recording, measured_pose=some))
+    answer = cell.call('identify')
+    assert not answer.success
+    assert 'different frames (camera, tracker)' in answer.message
+    assert 'set frame_id' in answer.message
+
+
+def test_poses_in_another_frame_than_frame_id_are_dropped(monkeypatch, tmp_path, recording):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    some = pose_messages(recording.poses)
+    some[40].header.frame_id = 'camera'
+    with Cell(chain='ur10e', data_dir=str(tmp_path), frame_id='tracker') as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        cell.spin_until(lambda: heard)
+        cell.play(topics(recording, measured_pose=some))
+        cell.spin_until(lambda: any('messages are dropped' in m.status[0].message for m in heard))
+        said = 'poses: in frame "camera", not in frame_id "tracker"'
+        assert cell.node.session.account().dropped == {said: 1}
+        assert values_of(heard[-1])[f'dropped {said}'] == '1'
+        answer = cell.call('identify')
+        assert answer.success, answer.message
+
+
+@pytest.mark.parametrize('all_renamed', [True, False])
+def test_a_renamed_joint_is_named(cell, recording, all_renamed):
+    names = [name.replace('_joint', '') for name in recording.joint_names]
+    if not all_renamed:
+        names = [*recording.joint_names[:5], 'tool0']
+    words = cell.listen(String, 'calibration_node/status')
+    cell.play(topics(recording, joint_states=joint_messages(recording, names)))
+    answer = cell.call('identify')
+    assert not answer.success
+    assert 'set joint_names' in answer.message
+    assert names[5] in answer.message
+    cell.spin_until(lambda: words and 'waiting for joint states of' in words[-1].data)
+    missing = recording.joint_names if all_renamed else recording.joint_names[5:]
+    assert f'waiting for joint states of {", ".join(missing)};' in words[-1].data
+    assert names[5] in words[-1].data
+
+
+def test_broken_messages_are_counted_by_cause(cell, recording):
+    joints, poses = topics(recording).values()
+    joints[3].position[2] = float('nan')
+    joints[4].position.pop()
+    joints[5].header.stamp.sec = joints[5].header.stamp.nanosec = 0
+    poses[8].pose.position.x = float('inf')
+    poses[9].pose.orientation.w = 3.0
+    poses[10].pose.orientation.x = float('nan')
+    cell.play({'joint_states': joints, 'measured_pose': poses})
+    assert cell.node.session.account().dropped == {
+        'joints: NaN or infinite joint value': 1,
+        'joints: names and positions differ in number': 1,
+        'joints: zero stamp': 1,
+        'poses: NaN or infinite position': 1,
+        'poses: quaternion not of length 1': 2,
+    }
+    assert cell.call('identify').success
+
+
+def test_an_overridden_qos(monkeypatch, tmp_path, recording):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        deaf = cell.peer.create_publisher(JointState, 'joint_states', BEST_EFFORT)
+        cell.spin_until(
+            lambda: (
+                heard
+                and '/joint_states is published best effort, but reliable is asked for'
+                in heard[-1].status[0].message
+            )
+        )
+        assert heard[-1].status[0].level == DiagnosticStatus.WARN
+        deaf.publish(joint_messages(recording)[0])
+        cell.play(topics(recording))
+        assert cell.node.session.received['joints'] == len(recording.joints)
+        assert cell.call('identify').success
+        cell.spin_until(lambda: 'best effort' not in heard[-1].status[0].message)
