@@ -233,7 +233,7 @@ def test_in_continuous_mode_samples_come_while_the_arm_moves():
     motion = sweep(2, np.random.default_rng(2))
     made = collector(mode='continuous', lateness=0.3)
     samples = play(made, joint_events(motion, 5.0), pose_events(motion, 5.0), finish=False)
-    assert len(samples) == pytest.approx(250 - 15, abs=12)
+    assert 250 - 15 - 26 < len(samples) < 250 - 14  # a round comes twice a second
 
 
 # On request
@@ -331,7 +331,7 @@ def test_what_comes_later_than_lateness_is_counted(mode):
     late = [(time + 2.0, happens) for time, happens in pose_events(motion, 7.0)]
     samples = play(made, joint_events(motion, 9.5), late)
     assert samples == []
-    assert made.dropped == {LATE: 350}
+    assert made.dropped == {LATE: pytest.approx(350, abs=10)}
     made = collector(mode=mode, lateness=2.5)
     assert len(play(made, joint_events(motion, 9.5), late)) >= 4
     assert made.dropped == {}
