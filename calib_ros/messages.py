@@ -85,12 +85,12 @@ def transform_stamped(message: Any) -> Reading:
     """Decode a geometry_msgs/TransformStamped; each child frame is a target."""
     transform = message.transform
     reading = _pose(message.header, transform.translation, transform.rotation)
-    return reading._replace(child=message.child_frame_id)
+    return reading._replace(child=_name(message.child_frame_id))
 
 
 def odometry(message: Any) -> Reading:
     """Decode a nav_msgs/Odometry, of which only the pose counts."""
-    return pose_with_covariance(message)._replace(child=message.child_frame_id)
+    return pose_with_covariance(message)._replace(child=_name(message.child_frame_id))
 
 
 def distance(message: Any) -> Reading:
@@ -132,6 +132,12 @@ def _pose(header: Any, point: Any, quaternion: Any) -> Reading:
         if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
             raise MessageError('quaternion not of length 1')
     return Reading(stamp_ns, header.frame_id, position, quat)
+
+
+def _name(child: str) -> str:
+    if not child.isprintable():  # it shall be a cell of a table
+        raise MessageError('child frame whose name cannot be printed')
+    return child
 
 
 def _covariance(numbers: Any) -> tuple[float, ...] | None:

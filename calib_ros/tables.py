@@ -11,6 +11,7 @@ one table.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -292,15 +293,18 @@ def _read(
 ) -> tuple[Sequence[str], list[tuple[int, Row]], tuple[str, ...]]:
     """Return header, rows with their lines, and warnings; `journal` is the header of one."""
     try:
-        text = path.read_text(encoding='utf-8-sig')
-        reader = csv.DictReader(text.splitlines(keepends=True), strict=True)
+        data = path.read_bytes()
+        whole = data
+        if data.startswith(','.join(journal).encode()):
+            whole = data[: data.rfind(b'\n') + 1]
+        text = io.StringIO(whole.decode('utf-8-sig'), newline='')
+        reader = csv.DictReader(text, strict=True)
         rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as err:
         raise InputError(f'cannot read {path}: {err}') from err
     header = reader.fieldnames or []
-    if rows and header == journal and not text.endswith('\n'):
-        line, _ = rows.pop()
-        return header, rows, (f'{path}: line {line} was cut off and is left out',)
+    if len(whole) < len(data):
+        return header, rows, (f'{path}: line {reader.line_num + 1} was cut off and is left out',)
     return header, rows, ()
 
 
