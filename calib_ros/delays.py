@@ -34,6 +34,8 @@ WATCH_NS = 15_000_000_000
 """Time over which a watch looks."""
 WATCHED = 20_000
 """Samples that it keeps at most."""
+DENSE_NS = 4_000_000
+"""Time between two samples that it keeps; nearer ones tell no more."""
 SMOOTHING = 0.05
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
 
@@ -60,12 +62,14 @@ class Watch:
         self._joints = Rows(joints, WATCHED)
         self._poses = Rows(7, WATCHED)
         self._begun_ns = 0
+        self._last_ns = [0, 0]
 
     def add_joints(self, stamp_ns: int, values: Sequence[float]) -> bool:
         """Take joint values; return whether it is time to look."""
         if not self._begun_ns:
             self._begun_ns = stamp_ns
-        if not self._joints.full:
+        if abs(stamp_ns - self._last_ns[0]) >= DENSE_NS and not self._joints.full:
+            self._last_ns[0] = stamp_ns
             self._joints.append(stamp_ns, values)
         return abs(stamp_ns - self._begun_ns) > WATCH_NS
 
@@ -73,8 +77,9 @@ class Watch:
         self, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float] | None
     ) -> None:
         """Take a measured pose or position."""
-        if not self._poses.full:
-            self._poses.append(stamp_ns, [*position, *(quat_xyzw or [np.nan] * 4)])
+        if abs(stamp_ns - self._last_ns[1]) >= DENSE_NS and not self._poses.full:
+            self._last_ns[1] = stamp_ns
+            self._poses.append(stamp_ns, (*position, *(quat_xyzw or ())))
 
     def look(self, chain: Chain) -> Delay | None:
         """Return the delay if it shows, and begin anew."""

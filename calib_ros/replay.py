@@ -192,7 +192,7 @@ class Recording:
         """Turn a table into a recording: the arm stands for a while at every row."""
         count = len(observations)
         begin = (1 + np.arange(count)[:, np.newaxis]) * 1_000_000_000
-        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 10)
+        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 4)
         return cls(
             joint_names,
             stamps.ravel(),

@@ -95,6 +95,8 @@ class Frames:
             self._sessions.append(sample.session)
         first = sample.session == self._sessions[0]
         suffix = '' if first else f'_{plain(sample.session)}'
+        if sample.socket:  # none of them is the first
+            return f'base{suffix}_{plain(base)}', f'tool{suffix}'
         return (
             f'base{suffix}{self._end("base", sample.session, (eye, base))}',
             f'tool{suffix}{self._end("tool", sample.session, (eye, tool))}',

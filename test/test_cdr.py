@@ -37,7 +37,7 @@ def message(kind, head, child, numbers):
     if kind == 'geometry_msgs/msg/PointStamped':
         return cls(head, TYPES['geometry_msgs/msg/Point'](*numbers[:3]))
     if kind == 'sensor_msgs/msg/Range':
-        return cls(head, 0, *np.float32(numbers[:4]))
+        return cls(head, 0, *np.float32(numbers[:5]))
     if kind == 'geometry_msgs/msg/TransformStamped':
         shift = TYPES['geometry_msgs/msg/Vector3'](*numbers[:3])
         turn = TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
