@@ -30,6 +30,7 @@ from calib_ros.se3 import FloatArray
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
+FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 SPLITS = ('', 'train', 'test', 'removed')
 Row: TypeAlias = Mapping[str, str | None]
 
@@ -200,7 +201,7 @@ class _Reader:
             session=row.get('session') or '',
             device=row.get('device') or '',
             target=row.get('target') or '',
-            eye_in_hand=row.get('eye_in_hand') in ('1', 'true'),
+            eye_in_hand=self._flag(line, row, 'eye_in_hand'),
             validation=split == 'test',
             delay=self._number(line, row, 'delay') if row.get('delay') else 0.0,
             count=self._integer(line, row, 'count') if row.get('count') else 1,
@@ -280,6 +281,12 @@ class _Reader:
             found = 'the row ends before it' if text is None else f'not {text!r}'
             raise InputError(f'{self._path}, line {line}: {name} must be a number, {found}')
         return number
+
+    def _flag(self, line: int, row: Row, name: str) -> bool:
+        text = row.get(name) or ''
+        if text not in FLAGS:
+            raise InputError(f'{self._path}, line {line}: {name} must be 0 or 1, not {text!r}')
+        return FLAGS[text]
 
     def _integer(self, line: int, row: Row, name: str) -> int:
         text = row.get(name) or ''
