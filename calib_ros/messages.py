@@ -73,7 +73,7 @@ def pose_with_covariance(message: Any) -> Reading:
     """Decode a geometry_msgs/PoseWithCovarianceStamped; a covariance of zeros means none."""
     pose = message.pose.pose
     reading = _pose(message.header, pose.position, pose.orientation)
-    return reading._replace(covariance=_covariance(message.pose.covariance))
+    return reading._replace(covariance=measured_covariance(message.pose.covariance))
 
 
 def point_stamped(message: Any) -> Reading:
@@ -140,7 +140,8 @@ def _name(child: str) -> str:
     return child
 
 
-def _covariance(numbers: Any) -> tuple[float, ...] | None:
+def measured_covariance(numbers: Any) -> tuple[float, ...] | None:
+    """Return a covariance (36) row by row; one of zeros means none."""
     return _checked_covariance(np.asarray(numbers, dtype=np.float64).tobytes())
 
 
