@@ -5,20 +5,28 @@
 Messages of one topic mostly differ in their stamps and numbers only: the names in them, and so
 the places of the numbers (OMG Common Data Representation), are the same. The layout is read off
 the first message of a batch, the others are held against it byte by byte, and all numbers are
-taken at once. A batch that differs is no error: `None` says that each message must be decoded by
-itself.
+taken and checked at once. A batch that differs, or that holds anything wrong, is no error: `None`
+says that each message must be decoded by itself.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.messages import JOINT_STATE
+from calib_ros.config import QUATERNION_TOLERANCE
+from calib_ros.messages import (
+    JOINT_STATE,
+    JointReading,
+    MessageError,
+    Reading,
+    measured_covariance,
+)
 from calib_ros.se3 import FloatArray
 from calib_ros.track import Stamps
 
@@ -85,6 +93,45 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
         strings,
         numbers.astype(np.float64),
     )
+
+
+def readings(kind: str, blobs: Sequence[bytes]) -> Sequence[JointReading | Reading] | None:
+    """Return what the decoders of `messages` make of each message, None where one would object."""
+    batch = decode(kind, blobs)
+    if batch is None or not (batch.stamps_ns > 0).all():
+        return None
+    stamps, numbers = batch.stamps_ns.tolist(), batch.numbers
+    frame_id, *names = batch.strings
+    if kind == JOINT_STATE:
+        if len(names) != numbers.shape[1]:
+            return None
+        return [JointReading(s, names, v) for s, v in zip(stamps, numbers.tolist(), strict=True)]
+    child = names[0] if names else ''
+    if not child.isprintable() or not np.isfinite(numbers).all():
+        return None
+    if kind.endswith('/Range'):
+        distances = numbers[:, 3].tolist()
+        if min(distances) <= 0.0:
+            return None
+        return [
+            Reading(s, frame_id, distance=value)
+            for s, value in zip(stamps, distances, strict=True)
+        ]
+    found = []
+    positions = map(tuple, numbers[:, :3].tolist())
+    quats: Iterable[Any] = [None] * len(blobs)
+    if numbers.shape[1] >= 7:
+        length = np.linalg.norm(numbers[:, 3:7], axis=1)
+        if not (np.abs(length - 1.0) <= QUATERNION_TOLERANCE).all():
+            return None
+        quats = map(tuple, numbers[:, 3:7].tolist())
+    for s, position, quat, row in zip(stamps, positions, quats, numbers[:, 7:], strict=True):
+        try:
+            covariance = measured_covariance(row) if len(row) else None
+        except MessageError:
+            return None
+        found.append(Reading(s, frame_id, position, quat, covariance, None, child))
+    return found
 
 
 def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:

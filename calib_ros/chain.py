@@ -62,6 +62,11 @@ _MOTIONS: dict[str, tuple[tuple[str, bool, int], ...]] = {
 }
 
 
+def is_length(name: str) -> bool:
+    """Tell whether a parameter is a length [m]; the others are angles [rad]."""
+    return name.partition('.')[2] in ('a', 'd', 'x', 'y', 'z')
+
+
 @dataclass(frozen=True)
 class Joint:
     """One row of the DH table: lengths in m, angles in rad, limits in rad or m.

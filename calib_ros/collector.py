@@ -67,6 +67,7 @@ class Collector:
         self._track = Track(revolute, settings.max_gap, settings.joint_buffer)
         self._waiting: dict[StreamKey, Rows] = {}
         self._taken: dict[StreamKey, set[int]] = {}
+        self._stops = Rows(1 + len(revolute), settings.pose_buffer)  # how long, and where
         self._lateness_ns = round(settings.lateness * 1e9)
         self._advanced_ns = 0  # the newest joint sample at the last round
         self._settled_ns = 0  # measurements before have been dealt with
@@ -147,7 +148,7 @@ class Collector:
         if stamp_ns - self._advanced_ns >= ADVANCE_NS:
             self._advanced_ns = stamp_ns
             if not self.holding:
-                self._round(self._track.newest_ns - self._lateness_ns)
+                self._round(self._complete_ns)
 
     def add(self, key: StreamKey, reading: Reading) -> None:
         """Take a measurement."""
@@ -218,6 +219,12 @@ class Collector:
 
     # Rounds
 
+    @property
+    def _complete_ns(self) -> int:
+        """Return the stamp of the joints up to which all has come, and stops can be told."""
+        late = self._lateness_ns + max(self.delay_ns, 0)
+        return self._track.newest_ns - max(late, round(WINDOW * 1e9))
+
     def _round(self, until: int, ends_here: bool = False) -> None:
         """Make samples of everything up to a stamp of the joints.
 
@@ -232,8 +239,7 @@ class Collector:
             until = self._take_stops(until, ends_here)
         self._settled_ns = max(self._settled_ns, until)
         margin = round((WINDOW + self.settings.max_gap) * 1e9)
-        needed = min(until, self._track.newest_ns - self._lateness_ns)
-        self._track.release(needed - margin)
+        self._track.release(min(until, self._complete_ns) - margin)
 
     def _sort(self) -> None:
         twice = self._track.sort()
@@ -292,8 +298,13 @@ class Collector:
             if last - begin < shortest:
                 done = self._drop(done, last, 'the stop was too short')
                 continue
-            self._average(begin, last)
-            done = self._sampled_ns = last
+            if self._is_known(begin, last):
+                done = self._sampled_ns = self._drop(
+                    done, last, 'of a stop that is sampled already'
+                )
+            else:
+                self._average(begin, last)
+                done = self._sampled_ns = last
             if end > last:
                 done = self._drop(done, min(end, until), 'of a stop that is sampled already')
                 self._sampled_ns = done
@@ -312,6 +323,18 @@ class Collector:
                     self.unused[f'poses: {why}'] += fine
                 rows.keep(~due)
         return until if until > after else after
+
+    def _is_known(self, begin: int, end: int) -> bool:
+        """Tell whether a stop was sampled before the clock jumped back; if not, remember it."""
+        where = self._track.at(np.array([(begin + end) // 2])).joints[0]
+        begins, lengths = self._stops.stamps, self._stops.values[:, 0]
+        meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)
+        steps = unwrapped(self._stops.values[meets, 1:] - where, self._revolute)
+        if (np.abs(steps).max(axis=1) <= 2.0 * self.settings.still).any():
+            return True
+        if not self._stops.full:
+            self._stops.append(begin, [end - begin, *where])
+        return False
 
     def _average(self, begin: int, end: int) -> None:
         """Make one sample of each stream from what was measured in a stop."""
@@ -421,6 +444,8 @@ class Collector:
     def forget(self, sample: Sample) -> None:
         """Allow a sample of the same stamp again."""
         self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
+        since = sample.stamp_ns - round(1e9 * sample.delay) - self._stops.stamps
+        self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
 
     def _count_causes(self, cause: NDArray[np.intp]) -> None:
         for k, text in enumerate(CAUSES[1:], start=1):
@@ -432,7 +457,7 @@ class Collector:
 
     def _make_room(self, columns: tuple[int, ...]) -> None:
         """Let go the older half of the samples of some joints; nothing may be held any longer."""
-        self._round(self._track.newest_ns - self._lateness_ns)
+        self._round(self._complete_ns)
         if self._track.full(columns):
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 

@@ -26,15 +26,7 @@ from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
-from calib_ros.validation import (
-    Comparison,
-    Parameter,
-    compare,
-    is_length,
-    refusals,
-    residuals,
-    validate,
-)
+from calib_ros.validation import Comparison, Parameter, compare, refusals, residuals, validate
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
@@ -292,7 +284,7 @@ def _weak(problem: Problem, names: Sequence[str], covariance: FloatArray) -> dic
     known = problem.prior_sigmas
     found = {}
     for name, std in zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True):
-        third = (problem.largest_length if is_length(name) else problem.largest_angle) / 3.0
+        third = problem.common_sense(name)
         if std > third > 0.0 and name not in known and not problem.model.owns_frame(name):
             found[name] = third
     return found

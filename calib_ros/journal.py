@@ -73,19 +73,20 @@ class Journal:
         os.close(self._file)
 
     def _begin(self, header: Sequence[str]) -> None:
-        """Write the header into a new file; leave out the row that a crash cut off."""
-        size = os.fstat(self._file).st_size
-        if size and os.pread(self._file, 1, size - 1) != b'\n':
-            size = _last_line(self._file, size)
-            os.ftruncate(self._file, size)
-        if size == 0:
-            self._write(header)
-            return
+        """Write the header into a new file; leave out what a crash cut off."""
         expected = ','.join(header).encode() + b'\n'
-        if os.pread(self._file, len(expected), 0) != expected:
+        found = os.pread(self._file, len(expected), 0)
+        if not expected.startswith(found):
             raise InputError(
                 f'{self.path} has not the columns of a journal of this robot: move it away'
             )
+        if found != expected:
+            os.ftruncate(self._file, 0)
+            self._write(header)
+            return
+        size = os.fstat(self._file).st_size
+        if os.pread(self._file, 1, size - 1) != b'\n':
+            os.ftruncate(self._file, _last_line(self._file, size))
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()

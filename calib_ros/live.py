@@ -30,6 +30,7 @@ from calib_ros.leastsquares import (
     normal_equations,
     residual_arrays,
 )
+from calib_ros.observations import configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
@@ -40,11 +41,13 @@ FAR = 1e-3
 """Step [m or rad] from which the linear model is made anew."""
 MOST_STEPS = 5
 START = 6
-"""Samples with which the frames can be found."""
+"""Configurations with which the frames can be found."""
 MOST_ANEW = 500
 """Samples up to which the linear model is made anew."""
 FAR_OFF = 7.0
 """Distance [standard deviations] from which a sample is left out as suspicious."""
+LEAST_NOISE = 1e-3
+"""Smallest noise [sigma given] that residuals are taken to show."""
 LOOK = 100
 """Configurations at which the accuracy is predicted."""
 LITTLE = 0.35
@@ -105,7 +108,8 @@ class LiveEstimate:
             return self._latest
         fresh = [sample for sample in samples[self._taken :] if not sample.validation]
         if self._chain is None or any(not self._knows(sample) for sample in fresh):
-            if len(samples) < START or not self._begin(samples):
+            fitted = [sample for sample in samples if not sample.validation]
+            if _distinct(fitted) < START or not self._begin(fitted):
                 return None
         elif fresh:
             self._add(fresh)
@@ -121,10 +125,9 @@ class LiveEstimate:
         assert self._chain is not None
         return set(self._frames.of(sample)) <= set(self._chain.frame_names)
 
-    def _begin(self, samples: Sequence[Sample]) -> bool:
+    def _begin(self, fitted: Sequence[Sample]) -> bool:
         """Choose the parameters, and a first chain with frames near the samples."""
         self.restart()
-        fitted = [sample for sample in samples if not sample.validation]
         problem = self._problem_of(fitted)
         model = problem.model
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
@@ -136,7 +139,7 @@ class LiveEstimate:
         wide = {name: _wide(name) for name in self._names if not model.owns_frame(name)}
         self._prior = Prior(model, wide | problem.prior_sigmas)
         self._joints = chain.random_joints(LOOK, np.random.default_rng(0))
-        self._added = fitted
+        self._added = list(fitted)
         for _ in range(MOST_STEPS):
             self._linearise(chain)
             chain = self._estimate()
@@ -172,6 +175,8 @@ class LiveEstimate:
         """Return the samples that lie where the others predict them."""
         chain = self._estimate()
         covariance, noise = self._uncertainty()
+        # Samples of one place may agree better than the model does elsewhere.
+        covariance, noise = covariance * max(1.0 / noise, 1.0), max(noise, 1.0)
         groups: dict[tuple[Any, ...], list[Sample]] = {}
         for sample in samples:
             key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
@@ -206,7 +211,7 @@ class LiveEstimate:
         """Return the covariance by the noise that the residuals show, and its variance."""
         left = max(self._cost - float(self._step() @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
-        noise = left / freedom if freedom > 0 else 1.0
+        noise = max(left / freedom, LEAST_NOISE**2) if freedom > 0 else 1.0
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
         matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
         return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
@@ -231,6 +236,13 @@ def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
         for joint, reached, wanted in zip(chain.joints, span.tolist(), least, strict=True)
         if reached < wanted
     )
+
+
+def _distinct(samples: Sequence[Sample]) -> int:
+    """Return in how many configurations samples were taken."""
+    if not samples:
+        return 0
+    return int(configurations(np.array([sample.joints for sample in samples])).max()) + 1
 
 
 def _wide(name: str) -> float:

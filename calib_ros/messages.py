@@ -73,7 +73,7 @@ def pose_with_covariance(message: Any) -> Reading:
     """Decode a geometry_msgs/PoseWithCovarianceStamped; a covariance of zeros means none."""
     pose = message.pose.pose
     reading = _pose(message.header, pose.position, pose.orientation)
-    return reading._replace(covariance=_covariance(message.pose.covariance))
+    return reading._replace(covariance=measured_covariance(message.pose.covariance))
 
 
 def point_stamped(message: Any) -> Reading:
@@ -85,12 +85,12 @@ def transform_stamped(message: Any) -> Reading:
     """Decode a geometry_msgs/TransformStamped; each child frame is a target."""
     transform = message.transform
     reading = _pose(message.header, transform.translation, transform.rotation)
-    return reading._replace(child=message.child_frame_id)
+    return reading._replace(child=_name(message.child_frame_id))
 
 
 def odometry(message: Any) -> Reading:
     """Decode a nav_msgs/Odometry, of which only the pose counts."""
-    return pose_with_covariance(message)._replace(child=message.child_frame_id)
+    return pose_with_covariance(message)._replace(child=_name(message.child_frame_id))
 
 
 def distance(message: Any) -> Reading:
@@ -134,7 +134,14 @@ def _pose(header: Any, point: Any, quaternion: Any) -> Reading:
     return Reading(stamp_ns, header.frame_id, position, quat)
 
 
-def _covariance(numbers: Any) -> tuple[float, ...] | None:
+def _name(child: str) -> str:
+    if not child.isprintable():  # it shall be a cell of a table
+        raise MessageError('child frame whose name cannot be printed')
+    return child
+
+
+def measured_covariance(numbers: Any) -> tuple[float, ...] | None:
+    """Return a covariance (36) row by row; one of zeros means none."""
     return _checked_covariance(np.asarray(numbers, dtype=np.float64).tobytes())
 
 

@@ -170,6 +170,7 @@ class CalibrationNode(Node):
         )
         self.session = CalibrationSession(chain, settings, self._on_sample)
         self._last = 'nothing identified yet'
+        self._observability = ''
         self._calibration_text = ''
         self._dropped_before: dict[str, int] = {}
         self._heard: dict[str, Hearing] = {}
@@ -430,6 +431,7 @@ class CalibrationNode(Node):
         problem, samples, origin = snapshot
         result = identify_model(problem, self.session.settings.model)
         self._last = report.summary(result)
+        self._observability = report.observability_in_words(result)
         self._residuals.publish(
             outgoing.residual_markers(
                 result,
@@ -594,6 +596,7 @@ class CalibrationNode(Node):
             'recording': self.session.recording,
             'calibrated': self.session.calibration is not None,
             'last identification': self._last,
+            'observability': self._observability,
             'joint states': account.joint_states,
             'poses': account.poses,
             'poses waiting': account.waiting,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib_ros import effects, identifiability
-from calib_ros.chain import Chain
+from calib_ros.chain import Chain, is_length
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.leastsquares import Prior, Samples, System
 from calib_ros.observations import Observations
@@ -190,6 +190,20 @@ class Problem:
         for name, _ in model.effects:
             sigmas.setdefault(name, effects.expected(name))
         return sigmas
+
+    @property
+    def informed(self) -> frozenset[str]:
+        """Return the DH parameters whose prior says more than common sense does."""
+        known = dict(self.model.effects)
+        return frozenset(
+            name
+            for name, sigma in self.prior_sigmas.items()
+            if name not in known and sigma < self.common_sense(name)
+        )
+
+    def common_sense(self, name: str) -> float:
+        """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
+        return (self.largest_length if is_length(name) else self.largest_angle) / 3.0
 
     def system(self, sets: Sequence[Observations]) -> System:
         """Return sets of observations, and the priors, as the solver takes them."""

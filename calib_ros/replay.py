@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from calib_ros.cdr import readings
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
-from calib_ros.messages import DECODERS, JOINT_STATE
+from calib_ros.messages import DECODERS, JOINT_STATE, JointReading, Reading
 from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
@@ -25,6 +27,8 @@ from calib_ros.session import CalibrationSession
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
+BATCH = 5000
+"""Messages that are decoded at once."""
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
 _TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
@@ -149,27 +153,49 @@ def _feed(
     session: CalibrationSession, topics: Topics, raw: Iterator[tuple[str, bytes]]
 ) -> tuple[int, str | None]:
     """Feed serialised messages; return how many, and what is wrong with the others if any."""
-    count, problem = 0, None
-    while True:
+    count, problem, ended = 0, None, False
+    while not ended:
+        batch: list[tuple[str, bytes]] = []
         try:
-            topic, data = next(raw)
-        except StopIteration:
-            session.finish()
-            return count, problem
+            for topic, data in itertools.islice(raw, BATCH):
+                batch.append((topic, data))
+            ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
-            session.finish()
-            return count, str(err) or type(err).__name__
-        kind = topics.types.get(topic)
-        try:
-            message = None if kind is None else _TYPESTORE.deserialize_cdr(data, kind)
-        except Exception as err:
-            problem = f'a message on {topic} cannot be decoded: {err!r}'
-            continue
-        if kind == JOINT_STATE:
-            session.take_joints(message)
-        elif kind is not None:
-            session.take(topics.sources[topic], kind, message)
-        count += kind is not None
+            problem, ended = str(err) or type(err).__name__, True
+        decoded = {
+            topic: iter(found)
+            for topic in {topic for topic, _ in batch} & set(topics.types)
+            if (found := readings(topics.types[topic], [d for t, d in batch if t == topic]))
+        }
+        for topic, data in batch:
+            kind = topics.types.get(topic)
+            if kind is None:
+                continue
+            if topic in decoded:
+                _take(session, topics, topic, next(decoded[topic]))
+                count += 1
+                continue
+            try:
+                message = _TYPESTORE.deserialize_cdr(data, kind)
+            except Exception as err:
+                problem = f'a message on {topic} cannot be decoded: {err!r}'
+                continue
+            if kind == JOINT_STATE:
+                session.take_joints(message)
+            else:
+                session.take(topics.sources[topic], kind, message)
+            count += 1
+    session.finish()
+    return count, problem
+
+
+def _take(
+    session: CalibrationSession, topics: Topics, topic: str, reading: JointReading | Reading
+) -> None:
+    if isinstance(reading, JointReading):
+        session.take_joint_reading(reading)
+    else:
+        session.take_reading(topics.sources[topic], reading)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +218,7 @@ class Recording:
         """Turn a table into a recording: the arm stands for a while at every row."""
         count = len(observations)
         begin = (1 + np.arange(count)[:, np.newaxis]) * 1_000_000_000
-        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 10)
+        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 4)
         return cls(
             joint_names,
             stamps.ravel(),

@@ -14,11 +14,11 @@ import numpy as np
 
 import calib_ros
 from calib_ros import effects
-from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import Settings, dump_chain, dump_yaml
 from calib_ros.identification import Identification
 from calib_ros.session import Calibration
-from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
+from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
 HOLDS = 1.5
 """A calibration whose error on new samples has grown by more does not hold."""
@@ -29,7 +29,7 @@ WEAK = 0.01
 def summary(result: Identification) -> str:
     """Return the one line that an operator reads."""
     before, after = (result.validation or result.fitted).figures
-    text = f'{len(result.fitted.judged)} pairs, RMS {before.rms_mm:.3f} -> '
+    text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
@@ -67,7 +67,7 @@ def provenance(result: Identification) -> dict[str, Any]:
         'software': f'calib_ros {calib_ros.__version__}',
         'accepted': result.accepted,
         'world_frame': result.world_frame,
-        'pairs': len(result.fitted.judged),
+        'samples': len(result.fitted.judged),
         'outliers': len(result.outliers),
         'validated_by': result.validated_by,
         'rms_mm_before': round(before.rms_mm, 6),
@@ -170,7 +170,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
     }
 
 
-BEFORE = 'the nominal chain with its base and tool frames fitted to the same pairs'
+BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
 
 
 def unit(name: str) -> str:
@@ -292,11 +292,14 @@ def identifiability_in_words(result: Identification) -> list[str]:
         f'one sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
         f'(median), {sigma["max"]:.3f} mm at most'
     )
-    o = result.observability
-    lines.append(
-        f'observability O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
-    )
+    lines.append(f'observability {observability_in_words(result)}')
     return lines
+
+
+def observability_in_words(result: Identification) -> str:
+    """Return the observability indices."""
+    o = result.observability
+    return f'O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
 
 
 def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:

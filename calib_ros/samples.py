@@ -83,6 +83,7 @@ class Frames:
     def __init__(self) -> None:
         self._sessions: list[str] = []
         self._ends: dict[tuple[str, str], list[tuple[bool, str]]] = {}
+        self._owners: dict[str, tuple[str, bool, bool, str]] = {}
 
     def of(self, sample: Sample) -> tuple[str, str]:
         """Return the names of base and tool of a sample.
@@ -95,10 +96,21 @@ class Frames:
             self._sessions.append(sample.session)
         first = sample.session == self._sessions[0]
         suffix = '' if first else f'_{plain(sample.session)}'
+        if sample.socket:  # none of them is the first
+            place = (sample.session, False, True, base)
+            return self._own(f'base{suffix}_{plain(base)}', place), f'tool{suffix}'
+        start = self._end('base', sample.session, (eye, base))
+        end = self._end('tool', sample.session, (eye, tool))
         return (
-            f'base{suffix}{self._end("base", sample.session, (eye, base))}',
-            f'tool{suffix}{self._end("tool", sample.session, (eye, tool))}',
+            self._own(f'base{suffix}{start}', (sample.session, eye, False, base)),
+            self._own(f'tool{suffix}{end}', (sample.session, eye, False, tool)),
         )
+
+    def _own(self, name: str, owner: tuple[str, bool, bool, str]) -> str:
+        """Return a name that is no one else's: a device may be called like a session."""
+        while self._owners.setdefault(name, owner) != owner:
+            name += '_'
+        return name
 
     def _end(self, side: str, session: str, label: tuple[bool, str]) -> str:
         known = self._ends.setdefault((side, session), [])
@@ -158,7 +170,10 @@ def _observations(samples: Sequence[Sample]) -> Observations:
 
     def optional(name: str) -> FloatArray | None:
         rows = [getattr(sample, name) for sample in samples]
-        return None if any(row is None for row in rows) else np.array(rows, dtype=np.float64)
+        if all(row is None for row in rows):
+            return None
+        nothing = np.zeros(samples[0].joints.shape)  # it stood; how it came there is not known
+        return np.array([nothing if row is None else row for row in rows], dtype=np.float64)
 
     return Observations(
         np.array([sample.stamp_ns for sample in samples], dtype=np.int64),

@@ -186,9 +186,18 @@ class CalibrationSession:
 
     def take_joints(self, message: Any) -> Sequence[float] | None:
         """Take a JointState; return its values in the order of the chain if it has all."""
-        self.received['joints'] += 1
         try:
             reading = messages.joint_state(message)
+        except messages.MessageError as err:
+            self.received['joints'] += 1
+            self._dropped[f'joints: {err}'] += 1
+            return None
+        return self.take_joint_reading(reading)
+
+    def take_joint_reading(self, reading: messages.JointReading) -> Sequence[float] | None:
+        """Take decoded joint values; return them in the order of the chain if all are there."""
+        self.received['joints'] += 1
+        try:
             columns, pick = self._layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
@@ -210,12 +219,21 @@ class CalibrationSession:
 
     def take(self, source: Source, msgtype: str, message: Any) -> None:
         """Take a measurement of the message type named."""
+        try:
+            reading = messages.DECODERS[msgtype](message)
+        except messages.MessageError as err:
+            self.received['poses'] += 1
+            self._dropped[f'poses: {err}'] += 1
+            return
+        self.take_reading(source, reading)
+
+    def take_reading(self, source: Source, reading: messages.Reading) -> None:
+        """Take a decoded measurement."""
         self.received['poses'] += 1
         if not self.recording:
             self._unused['poses: not recording'] += 1
             return
         try:
-            reading = messages.DECODERS[msgtype](message)
             self._check_frame(source.device, reading.frame_id)
         except messages.MessageError as err:
             self._dropped[f'poses: {err}'] += 1

@@ -70,7 +70,9 @@ def parse_source(text: str) -> Source:
     Keys: type, device, target, eye_in_hand (true or false), validation (true or false). A short
     type such as PoseStamped will do.
     """
-    topic, *pairs = text.split()
+    topic, *pairs = text.split() or ('',)
+    if not topic or '=' in topic:
+        raise ConfigError(f'source "{text}" must begin with its topic: "TOPIC key=value ..."')
     source = Source(topic, validation=topic.rpartition('/')[2].startswith(VALIDATION))
     for pair in pairs:
         key, equals, value = pair.partition('=')

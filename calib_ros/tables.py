@@ -11,6 +11,7 @@ one table.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ from calib_ros.se3 import FloatArray
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
+FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 SPLITS = ('', 'train', 'test', 'removed')
 Row: TypeAlias = Mapping[str, str | None]
 
@@ -199,7 +201,7 @@ class _Reader:
             session=row.get('session') or '',
             device=row.get('device') or '',
             target=row.get('target') or '',
-            eye_in_hand=row.get('eye_in_hand') in ('1', 'true'),
+            eye_in_hand=self._flag(line, row, 'eye_in_hand'),
             validation=split == 'test',
             delay=self._number(line, row, 'delay') if row.get('delay') else 0.0,
             count=self._integer(line, row, 'count') if row.get('count') else 1,
@@ -280,6 +282,12 @@ class _Reader:
             raise InputError(f'{self._path}, line {line}: {name} must be a number, {found}')
         return number
 
+    def _flag(self, line: int, row: Row, name: str) -> bool:
+        text = row.get(name) or ''
+        if text not in FLAGS:
+            raise InputError(f'{self._path}, line {line}: {name} must be 0 or 1, not {text!r}')
+        return FLAGS[text]
+
     def _integer(self, line: int, row: Row, name: str) -> int:
         text = row.get(name) or ''
         if not text.lstrip('-').isdigit():
@@ -292,15 +300,18 @@ def _read(
 ) -> tuple[Sequence[str], list[tuple[int, Row]], tuple[str, ...]]:
     """Return header, rows with their lines, and warnings; `journal` is the header of one."""
     try:
-        text = path.read_text(encoding='utf-8-sig')
-        reader = csv.DictReader(text.splitlines(keepends=True), strict=True)
+        data = path.read_bytes()
+        whole = data
+        if data.startswith(','.join(journal).encode()):
+            whole = data[: data.rfind(b'\n') + 1]
+        text = io.StringIO(whole.decode('utf-8-sig'), newline='')
+        reader = csv.DictReader(text, strict=True)
         rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as err:
         raise InputError(f'cannot read {path}: {err}') from err
     header = reader.fieldnames or []
-    if rows and header == journal and not text.endswith('\n'):
-        line, _ = rows.pop()
-        return header, rows, (f'{path}: line {line} was cut off and is left out',)
+    if len(whole) < len(data):
+        return header, rows, (f'{path}: line {reader.line_num + 1} was cut off and is left out',)
     return header, rows, ()
 
 

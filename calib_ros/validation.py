@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib_ros.chain import DH_KINDS, Chain
+from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
@@ -20,6 +20,8 @@ from calib_ros.se3 import FloatArray
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
+SPARE = 6
+"""Equations that a fit to a part of the configurations must have to spare."""
 MOST_OUTLIERS = 0.35
 """Share of outliers beyond which nothing is accepted."""
 
@@ -131,11 +133,6 @@ def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Compar
     )
 
 
-def is_length(name: str) -> bool:
-    """Tell whether a parameter is a length [m]; the others are angles [rad]."""
-    return name.partition('.')[2] in ('a', 'd', 'x', 'y', 'z')
-
-
 def validate(
     problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust
 ) -> tuple[Comparison | None, str]:
@@ -149,15 +146,15 @@ def validate(
         if problem.loss != 'none':
             distances = distances_of(after, names, problem.system(problem.judging))
             comparison = replace(comparison, judged=np.concatenate(distances) <= OUTLIER)
-        return comparison, f'{len(comparison.judged)} held-out pairs'
+        return comparison, f'{len(comparison.judged)} held-out samples'
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
     groups = [each.configurations for each in problem.sets]
     counts = [len(np.unique(group)) for group in groups]
-    folds = min(problem.folds, sum(counts))
     rows = sum(count * kind.rows for count, kind in zip(counts, problem.kinds, strict=True))
-    if folds < 2 or rows * (folds - 1) // folds < len(names) + 6:
+    folds = _folds(problem, names, counts, rows)
+    if folds < 2:
         return None, 'nothing: too few configurations to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     firsts = np.cumsum([0, *(len(each) for each in problem.sets)])
@@ -198,6 +195,22 @@ def validate(
         ),
         f'{folds}-fold cross-validation over {sum(counts)} distinct configurations',
     )
+
+
+def _folds(problem: Problem, names: Sequence[str], counts: Sequence[int], rows: int) -> int:
+    """Return into how many parts to deal the configurations; 0 where all are needed for the fit.
+
+    The other parts must determine what is fitted, with some equations to spare. Where they do so
+    by priors only, one configuration is left out at a time.
+    """
+    folds = min(problem.folds, sum(counts))
+    if folds > 1 and rows * (folds - 1) // folds >= len(names) + SPARE:
+        return folds
+    folds = max(counts)
+    unknown = set(names) - problem.informed
+    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + SPARE:
+        return 0
+    return folds
 
 
 def _joined(

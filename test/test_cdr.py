@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros import messages
-from calib_ros.cdr import decode
+from calib_ros.cdr import decode, readings
 from calib_ros.messages import DECODERS, JOINT_STATE
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -37,7 +37,7 @@ def message(kind, head, child, numbers):
     if kind == 'geometry_msgs/msg/PointStamped':
         return cls(head, TYPES['geometry_msgs/msg/Point'](*numbers[:3]))
     if kind == 'sensor_msgs/msg/Range':
-        return cls(head, 0, *np.float32(numbers[:4]))
+        return cls(head, 0, *np.float32(numbers[:5]))
     if kind == 'geometry_msgs/msg/TransformStamped':
         shift = TYPES['geometry_msgs/msg/Vector3'](*numbers[:3])
         turn = TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
@@ -126,3 +126,57 @@ def test_broken_messages_are_left_to_others(cut):
     decoded = decode(JOINT_STATE, [blob[:cut]])
     assert decoded is None or decoded.numbers.shape == (1, 2)
     assert decode(JOINT_STATE, [b'\x00\x00' + blob[2:]]) is None  # big-endian
+
+
+VALID = [1.0, -2.0, 0.5, 0.6, 0.0, -0.8, 0.0]
+
+
+def read(kind, blobs):
+    given_ = [STORE.deserialize_cdr(blob, kind) for blob in blobs]
+    decoder = messages.joint_state if kind == JOINT_STATE else DECODERS[kind]
+    return [decoder(each) for each in given_]
+
+
+def blob_of(kind, numbers, child='hand', seconds=5):
+    head = header(seconds, 7, 'tracker')
+    made = message(kind, head, child, numbers)
+    if hasattr(getattr(made, 'pose', None), 'covariance'):
+        made.pose.covariance[:] = np.diag(np.arange(1.0, 7.0)).ravel()
+    return bytes(STORE.serialize_cdr(made, kind))
+
+
+@pytest.mark.parametrize('kind', sorted(DECODERS))
+def test_batches_are_read_as_single_messages_are(kind):
+    blobs = [blob_of(kind, VALID, seconds=s) for s in (5, 6, 7)]
+    expected = read(kind, blobs)
+    for found, single in zip(readings(kind, blobs), expected, strict=True):
+        assert found[:4] == single[:4]
+        assert found.covariance == single.covariance
+        assert found.distance == pytest.approx(single.distance)
+        assert found.child == single.child
+
+
+def test_batches_of_joint_states_are_read_as_single_messages_are():
+    blobs = [joint_blob(['a', 'b'], [value, 2.0]) for value in (0.0, 1.0)]
+    for found, single in zip(readings(JOINT_STATE, blobs), read(JOINT_STATE, blobs), strict=True):
+        assert found.stamp_ns == single.stamp_ns
+        assert list(found.names) == list(single.names)
+        assert list(found.values) == list(single.values)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'numbers', 'child', 'seconds'),
+    [
+        ('geometry_msgs/msg/PoseStamped', [np.nan, *VALID[1:]], 'hand', 5),
+        ('geometry_msgs/msg/PoseStamped', [*VALID[:6], 1.0], 'hand', 5),
+        ('geometry_msgs/msg/PointStamped', [np.inf, *VALID[1:]], 'hand', 5),
+        ('geometry_msgs/msg/TransformStamped', VALID, 'ha\nnd', 5),
+        ('sensor_msgs/msg/Range', [0.0] * 7, 'hand', 5),
+    ],
+)
+def test_what_a_decoder_refuses_is_left_to_it(kind, numbers, child, seconds):
+    assert readings(kind, [blob_of(kind, VALID)]) is not None
+    bad = blob_of(kind, numbers, child, seconds)
+    assert readings(kind, [bad]) is None
+    with pytest.raises(messages.MessageError):
+        read(kind, [bad])

@@ -141,9 +141,9 @@ def test_the_identified_parameters_are_the_true_ones(identified, table):
 def test_without_json_one_line_says_the_result(run, table):
     status, out, err = run('identify', '--csv', table, '--chain', 'ur5e')
     assert (status, err) == (0, '')
-    assert out.startswith('accepted: 30 pairs, RMS ')
+    assert out.startswith('accepted: 30 samples, RMS ')
     assert out.count('\n') == 1
-    assert f'{TEST} held-out pairs' in out
+    assert f'{TEST} held-out samples' in out
 
 
 def test_out_writes_four_files(run, table, tmp_path):

@@ -120,3 +120,33 @@ def test_orientation_error_turns_the_model_onto_the_measurement(seed, angle):
     found = orientation_error(columns, list(np.ascontiguousarray(model.transpose(2, 1, 0)))).T
     np.testing.assert_allclose(se3.exp_rotation(found) @ model, measured, rtol=0, atol=1e-7)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), angle, rtol=1e-6, atol=1e-15)
+
+
+@given(chains(), st.integers(0, 2**32 - 1))
+def test_the_column_of_a_delay_is_the_central_difference(drawn, seed):
+    """A later device saw the target where the joints had been before."""
+    chain, q = drawn
+    velocity = np.random.default_rng(seed).normal(size=q.shape)
+    names = ['base.x', 'base.delay', f'{chain.joint_names[0]}.theta']
+    model = ErrorModel(chain, names)
+    column = model.jacobian(q, velocity=velocity)[:, :, 1]
+    step = 1e-6
+    ahead, behind = (chain.forward(q - sign * step * velocity) for sign in (1.0, -1.0))
+    turn = ahead[:, :3, :3] @ np.swapaxes(behind[:, :3, :3], 1, 2)
+    shift = ahead[:, :3, 3] - behind[:, :3, 3]
+    difference = np.concatenate([shift, se3.log_rotation(turn)], axis=1) / (2 * step)
+    np.testing.assert_allclose(column, difference, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(model.jacobian(q)[:, :, 1], 0.0)
+
+
+def test_the_delay_is_that_of_its_own_device():
+    chain = Chain('one', 'standard', (Joint('joint_1', a=1.0),))
+    chain = chain.with_frame('base_B', Frame(delay=0.1))
+    names = ['base.delay', 'base_B.delay']
+    q, velocity = np.zeros((2, 1)), np.ones((2, 1))
+    first = ErrorModel(chain, names).jacobian(q, velocity=velocity)
+    second = ErrorModel(chain, names, 'base_B').jacobian(q, velocity=velocity)
+    np.testing.assert_array_equal(first[:, :, 1], 0.0)
+    np.testing.assert_array_equal(second[:, :, 0], 0.0)
+    np.testing.assert_allclose(first[:, 1, 0], -1.0)
+    np.testing.assert_allclose(second[:, 1, 1], -1.0)

@@ -454,3 +454,59 @@ def test_what_another_robot_leaves_is_never_accepted():
         true = faulty(other, Cell(), rng)
         seen = measure(true, other.random_joints(60, rng), rng, 5e-5, 2e-4)
         assert not identify(Problem(nominal, seen)).accepted
+
+
+TOLERANCES = {'*.a': 5e-4, '*.d': 5e-4, '*.alpha': 1e-3, '*.theta': 1e-3, '*.beta': 1e-3}
+
+
+@pytest.mark.parametrize(
+    ('oriented', 'count', 'share'), [(True, 6, 0.4), (False, 8, 0.5), (False, 10, 0.2)]
+)
+def test_few_poses_and_manufacturing_tolerances_are_judged_by_leaving_out_one(
+    oriented, count, share
+):
+    """Six poses hold as many equations as needed without priors and none to judge by."""
+    nominal_errors, errors, estimates, sigmas = [], [], [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        q, unseen = UR10E.random_joints(count, rng), UR10E.random_joints(300, rng)
+        seen = measure(true, q, rng, 5e-5, 2e-4, oriented)
+        sigmas_given = {'sigma_position': 5e-5, 'sigma_orientation': 2e-4}
+        result = identify(Problem(UR10E, seen, priors=TOLERANCES, **sigmas_given))
+        assert result.accepted
+        assert not result.outliers
+        assert result.validated_by.startswith(f'{count}-fold')
+        wanted = true.forward(unseen)[:, :3, 3]
+        for chain, found in ((result.before, nominal_errors), (result.chain, errors)):
+            error = chain.forward(unseen)[:, :3, 3] - wanted
+            found.append(1e3 * np.sqrt((error**2).sum(axis=1).mean()))
+        estimates.append(result.validation.figures[1].rms_mm)
+        sigmas.append(1e3 * np.sqrt((result.predicted_sigma() ** 2).mean()))
+    assert np.max(np.divide(errors, nominal_errors)) < share
+    # the estimate by fits to one pose less is cautious, the predicted sigma is right
+    assert 1.0 < np.median(np.divide(estimates, errors)) < 2.5
+    assert np.median(np.divide(errors, sigmas)) == pytest.approx(1.0, abs=0.35)
+
+
+@pytest.mark.parametrize('priors', [{}, {'*.a': 0.05, '*.alpha': 0.1}])
+def test_few_poses_without_priors_that_say_anything_stay_refused(priors):
+    rng = np.random.default_rng(0)
+    true = faulty(UR10E, Cell(), rng)
+    for seen in (
+        measure(true, UR10E.random_joints(6, rng), rng, 5e-5, 2e-4),
+        measure(true, UR10E.random_joints(10, rng), rng, 5e-5, oriented=False),
+    ):
+        result = identify(Problem(UR10E, seen, priors=priors))
+        assert not result.accepted
+        assert result.validation is None
+
+
+def test_few_poses_and_priors_of_an_arm_without_errors_gain_nothing():
+    accepted = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        true = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
+        seen = measure(true, UR10E.random_joints(8, rng), rng, 5e-5, 2e-4)
+        accepted += identify(Problem(UR10E, seen, priors=TOLERANCES)).accepted
+    assert accepted <= 3  # of 20 by a one-sided test of 95 %

@@ -112,7 +112,7 @@ def test_a_killed_node_goes_on_with_all_its_samples(tmp_path, recording):
         cell.spin_until(lambda: len(samples_in(tmp_path)) == 20)
         answer = cell.call('identify')
         assert answer.success, answer.message
-        assert '22 pairs' in answer.message  # two stops waited when it was killed
+        assert '22 samples' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
     expected.finish()
     survived = [s for s in expected.samples if not 10.0 < (s.stamp_ns - START) * 1e-9 < 12.0]

@@ -389,6 +389,7 @@ BAD_POSES = [
     (pose_stamped(105 * MS, quat=(0, 0, np.nan, 1)), 'poses: quaternion not of length 1'),
     (point_stamped(105 * MS, (0, -np.inf, 0)), 'poses: NaN or infinite position'),
     (transform_stamped(0), 'poses: zero stamp'),
+    (transform_stamped(105 * MS, child='a\nb'), 'poses: child frame whose name cannot be printed'),
     (transform_stamped(105 * MS, quat=(1, 1, 1, 1)), 'poses: quaternion not of length 1'),
     (pose_with_covariance(105 * MS, NAN), 'poses: covariance with NaN or infinite values'),
     (pose_with_covariance(105 * MS, SKEW), 'poses: covariance not symmetric'),

@@ -174,3 +174,10 @@ def test_a_path_that_holds_no_file_is_refused(tmp_path):
     for path in (tmp_path, tmp_path / 'missing.csv'):
         with pytest.raises(InputError, match=f'cannot read {path}'):
             read_table(path, 2)
+
+
+@pytest.mark.parametrize('flag', ['yes', 'True', '2'])
+def test_a_flag_that_is_none_is_named_with_its_line(read, flag):
+    text = f'q1,q2,x,y,z,qx,qy,qz,qw,eye_in_hand\n1,0,1,0,0,0,0,0,1,{flag}\n'
+    with pytest.raises(InputError, match=f"line 2: eye_in_hand must be 0 or 1, not '{flag}'"):
+        read(text)

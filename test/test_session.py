@@ -1,0 +1,348 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from streams import (
+    POSE,
+    RANGE,
+    TRACKER,
+    TRANSFORM,
+    distance,
+    joint_state,
+    pose,
+    stamps,
+    stops,
+    transform,
+)
+
+from calib_ros.config import Settings, load_chain
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.samples import Sample
+from calib_ros.session import CalibrationSession
+from calib_ros.simulation import Cell, faulty, measure, random_frame
+from calib_ros.sources import Source
+
+UR5E = load_chain('ur5e')
+TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))
+NOISE = (5e-5, 2e-4)
+SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
+
+
+def samples(count=30, seed=5, true=TRUE, start=0, **more):
+    rng = np.random.default_rng(seed)
+    joints = UR5E.random_joints(count, rng)
+    seen = measure(true, joints, rng, *NOISE)
+    return [
+        Sample(
+            start + k + 1,
+            joints[k],
+            position=seen.positions[k],
+            rotation=seen.rotations[k],
+            **more,
+        )
+        for k in range(count)
+    ]
+
+
+def session(*given, **settings):
+    made = CalibrationSession(UR5E, Settings(**SIGMAS | settings))
+    made.restore([each for some in given for each in some])
+    return made
+
+
+def drive(made, configurations, sources, start=0.0, rate=50.0):
+    """Let an arm stand at each configuration while sources (source, type, maker) measure."""
+    motion = stops(configurations, 0.8, 0.8)
+    end = 1.6 * len(configurations)
+    times = np.arange(0.0, end, 1.0 / rate)
+    rows = motion(times)
+    for row, stamp in zip(rows, stamps(times + start).tolist(), strict=True):
+        made.take_joints(joint_state(stamp, UR5E.joint_names, row.tolist()))
+        for source, kind, make in sources:
+            made.take(source, kind, make(stamp, row))
+    return end
+
+
+def tracker(true=TRUE, seed=3):
+    rng = np.random.default_rng(seed)
+
+    def seen(stamp, row):
+        found = measure(true, row[np.newaxis], rng, *NOISE)
+        return pose(stamp, found.positions[0], found.rotations[0])
+
+    return TRACKER, POSE, seen
+
+
+# Samples
+
+
+def test_samples_are_told_of_as_they_are_taken():
+    heard = []
+    made = CalibrationSession(UR5E, on_sample=heard.append)
+    drive(made, UR5E.random_joints(4, np.random.default_rng(1)), [tracker()])
+    assert 2 <= len(heard) <= 3
+    made.finish()
+    assert made.samples == heard
+    assert len(heard) == 4
+
+
+def test_the_last_sample_is_taken_back():
+    made = session(samples())
+    last = made.samples[-1]
+    assert made.remove_last() is last
+    assert len(made.samples) == 29
+    with pytest.raises(InputError, match='no sample to remove'):
+        CalibrationSession(UR5E).remove_last()
+
+
+def test_a_sample_that_was_taken_back_is_in_the_account():
+    made = CalibrationSession(UR5E)
+    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), [tracker()])
+    made.finish()
+    taken = made.remove_last()
+    account = made.account()
+    assert account.unused['poses: of a sample that was taken back'] == taken.count
+    assert account.samples == 2
+
+
+def test_restored_samples_come_first_and_are_as_good_as_new():
+    made = session(samples(15), samples(15, seed=6, start=100))
+    whole = session(samples(15, seed=6, start=100))
+    whole.restore(samples(15))
+    assert [each.stamp_ns for each in whole.samples] == [each.stamp_ns for each in made.samples]
+    first, second = made.identify(), whole.identify()
+    for one, other in zip(first.parameters, second.parameters, strict=True):
+        assert one == other
+
+
+def test_samples_of_another_robot_are_not_restored():
+    made = session(samples())
+    with pytest.raises(InputError, match='have 7 joint values, chain "ur5e" has 6 joints'):
+        made.restore([Sample(1, np.zeros(7), position=np.zeros(3))])
+    assert len(made.samples) == 30
+
+
+def test_clear_forgets_samples_and_counts_but_not_the_calibration():
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    drive(made, UR5E.random_joints(30, np.random.default_rng(1)), [tracker()])
+    made.finish()
+    result = made.identify()
+    assert result.accepted
+    made.clear()
+    assert made.samples == []
+    assert made.account() == CalibrationSession(UR5E).account()
+    assert made.calibration.chain is result.chain
+
+
+# Sources
+
+
+def test_devices_and_targets_have_frames_of_their_own():
+    """Two markers of one tracker by their child frames, and a wire with an origin of its own."""
+    rng = np.random.default_rng(7)
+    ball = replace(TRUE, tool=random_frame(rng, 0.2))
+
+    def marker(stamp, row):
+        where = ball.forward(row[np.newaxis])[0]
+        return transform(stamp, where[:3, 3], 'ball', where[:3, :3])
+
+    def wire(stamp, row):
+        return distance(stamp, np.linalg.norm(TRUE.forward(row[np.newaxis])[0, :3, 3]))
+
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    sources = [
+        tracker(),
+        (Source('marker'), TRANSFORM, marker),
+        (Source('wire', device='wire'), RANGE, wire),
+    ]
+    drive(made, UR5E.random_joints(5, rng), sources)
+    made.finish()
+    sets = made.problem().sets
+    # streams of one stop come in the order of their names
+    assert {(each.base, each.tool, each.distances is not None) for each in sets} == {
+        ('base', 'tool', False),
+        ('base', 'tool_ball', False),
+        ('base_wire', 'tool', True),
+    }
+    assert [len(each) for each in sets] == [5, 5, 5]
+
+
+def test_the_frames_of_two_devices_may_differ():
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    source, kind, seen = tracker()
+
+    def elsewhere(stamp, row):
+        message = seen(stamp, row)
+        message.header.frame_id = 'other'
+        return message
+
+    two = [(source, kind, seen), (Source('b', device='B'), kind, elsewhere)]
+    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), two)
+    assert len(made.problem().sets) == 2
+    same = CalibrationSession(UR5E, Settings(**SIGMAS))
+    two = [(source, kind, seen), (Source('b'), kind, elsewhere)]
+    drive(same, UR5E.random_joints(3, np.random.default_rng(1)), two)
+    with pytest.raises(InputError, match=r'different frames \(other, tracker\)'):
+        same.problem()
+
+
+# Judging
+
+
+def test_without_a_calibration_or_new_samples_nothing_is_judged():
+    made = session(samples())
+    with pytest.raises(InputError, match='no calibration to judge'):
+        made.validate()
+    made.identify()
+    with pytest.raises(InputError, match='measure some new poses first'):
+        made.validate()
+
+
+def test_new_samples_judge_the_calibration():
+    made = session(samples())
+    result = made.identify()
+    drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker()])
+    now, nominal = made.validate()
+    assert now.count == 8
+    assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
+    assert made.calibration.chain is result.chain
+
+
+def test_a_bumped_robot_is_noticed():
+    made = session(samples())
+    made.identify()
+    bumped = TRUE.with_offsets({'elbow_joint.theta': 3e-3})
+    drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker(bumped)])
+    now, _ = made.validate()
+    assert now.rms_mm > 0.5
+
+
+def test_a_loaded_calibration_is_judged_without_a_nominal_one():
+    chain = session(samples()).identify().chain
+    made = session()
+    made.load(chain, 0.1, 'tracker')
+    drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker()])
+    now, nominal = made.validate()
+    assert now.rms_mm < 0.15
+    assert nominal is None
+
+
+def test_what_was_there_before_does_not_judge():
+    """Neither samples before the calibration, nor those of an earlier session."""
+    made = session(samples(30))
+    made.identify()
+    made.remove_last()
+    drive(made, UR5E.random_joints(4, np.random.default_rng(1)), [tracker()])
+    now, _ = made.validate()
+    assert now.count == 4
+
+
+def test_the_calibration_of_another_robot_is_refused():
+    made = session(samples())
+    with pytest.raises(InputError, match='the calibration has the joints panda_joint1'):
+        made.load(load_chain('franka_panda'))
+    assert made.calibration is None
+
+
+def test_samples_on_a_target_that_the_calibration_does_not_know_are_no_judges():
+    made = session(samples())
+    made.identify()
+    _, kind, seen = tracker()
+    drive(
+        made,
+        UR5E.random_joints(3, np.random.default_rng(1)),
+        [(Source('x', target='new'), kind, seen)],
+    )
+    with pytest.raises(InputError, match='does not know'):
+        made.validate()
+
+
+def test_a_result_that_is_not_accepted_keeps_the_last_good_one():
+    made = session(samples())
+    good = made.identify()
+    made.clear()
+    made.restore(samples(30, true=UR5E, start=500))
+    assert not made.identify().accepted
+    assert made.calibration.chain is good.chain
+
+
+# Settings and words
+
+
+def test_settings_change_without_losing_anything():
+    made = session(samples())
+    made.change(replace(made.settings, fixed=('*.alpha',)))
+    result = made.identify()
+    assert len(made.samples) == 30
+    assert {p.name for p in result.parameters if p.status == 'fixed'} == {
+        f'{name}.alpha' for name in UR5E.joint_names
+    }
+
+
+def test_settings_that_cannot_be_change_nothing():
+    made = session(samples())
+    before = made.settings
+    with pytest.raises(ConfigError, match='nowhere'):
+        made.change(replace(before, fixed=('nowhere.*',)))
+    assert made.settings is before
+
+
+def test_the_way_of_a_stop_can_be_changed_while_it_runs():
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    where = UR5E.random_joints(3, np.random.default_rng(1))
+    end = drive(made, where, [tracker()])
+    made.finish()
+    made.change(replace(made.settings, shortest_stop=2.0))
+    drive(made, where + 0.1, [tracker()], start=end)
+    made.finish()
+    assert len(made.samples) == 3
+    assert made.account().unused['poses: the stop was too short'] > 0
+
+
+def test_the_status_tells_how_far_it_is():
+    made = session(samples(6))
+    assert made.status().startswith('6 samples')
+    assert 'waiting for joint states' in made.status()
+    made.restore(samples(60, start=100))
+    assert 'mm expected' in made.status()
+    made.change(replace(made.settings, wanted_accuracy=1e-2))
+    assert 'enough for the accuracy wanted' in made.status()
+    made.change(replace(made.settings, wanted_accuracy=1e-6))
+    assert 'more expected for 0.001 mm' in made.status()
+
+
+def test_the_status_names_a_sample_that_does_not_fit():
+    given = samples(50)
+    made = session(given[:45])
+    assert 'does not fit' not in made.status()
+    made.samples.append(replace(given[45], position=given[45].position + 0.01))
+    assert 'sample 46 does not fit to the others' in made.status()
+    made.remove_last()
+    assert 'does not fit' not in made.status()
+
+
+def test_the_status_names_joints_that_hardly_moved():
+    given = samples(10)
+    joints = [np.array([*each.joints[:5], 0.01 * k]) for k, each in enumerate(given)]
+    made = session([replace(each, joints=q) for each, q in zip(given, joints, strict=True)])
+    assert 'hardly moved so far: wrist_3_joint' in made.status()
+
+
+def test_the_status_is_never_an_error():
+    only_judging = session(samples(10, validation=True))
+    assert only_judging.status().startswith('0 samples')
+    (one,) = samples(1)
+    same_place = session([replace(one, stamp_ns=k) for k in range(1, 20)])
+    assert same_place.status().startswith('19 samples')
+    assert CalibrationSession(UR5E).status().startswith('0 samples')
+
+
+def test_identifying_nothing_says_what_came():
+    made = CalibrationSession(UR5E)
+    with pytest.raises(InputError, match='no samples to fit: 0 joint states and 0 poses'):
+        made.identify()
+    made.restore(samples(3))
+    with pytest.raises(InputError, match='too few'):
+        made.identify()
