@@ -8,7 +8,9 @@ Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading
 of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013).
 Positions: a point set registration of the flange positions (Umeyama 1991) that leaves the tool
 out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row.
-Translations are linear once R_B is known. Every start is polished by least squares on the frames
+Translations are linear once R_B is known.
+Distances: their squares are linear in the base's position and its square, solved for the better
+half of the samples. Every start is polished by least squares on the frames
 alone; the best one counts. Where none fits (few or degenerate poses), the 24 rotations of a cube
 are tried as well.
 """
@@ -29,6 +31,8 @@ from calib_ros.robust import robust_fit
 from calib_ros.se3 import FloatArray
 
 SUBSET = 200
+DRAWS, DRAWN = 500, 8
+"""How many starts a place by distances has, and from how many samples, of 4 unknowns."""
 CONVINCING = 0.03
 """A start is taken without a search when its RMS error is below this share of the spread."""
 
@@ -88,7 +92,8 @@ def _start_one(
     system = System((Samples(subset, sigma_position, sigma_orientation),))
     arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
     if subset.distances is not None:
-        return minimise(_trilaterated(chain, arm, subset), names, system, tolerance=1e-3).chain
+        start = _trilaterated(chain, arm, subset, loss != 'none')
+        return robust_fit(start, names, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     best, best_error = chain, np.inf
     for candidates in (_closed_form(chain, arm, subset), _search()):
@@ -129,11 +134,14 @@ def _typical_error(chain: Chain, observations: Observations) -> float:
     return float(np.median(np.linalg.norm(observations.positions - predicted, axis=1)))
 
 
-def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
+def _trilaterated(
+    chain: Chain, arm: FloatArray, observations: Observations, robust: bool
+) -> Chain:
     """Return the chain placed by distances from the world's origin.
 
     L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
-    world, because no distance from its origin tells.
+    world, because no distance from its origin tells. Against gross errors it is solved for the
+    half of the samples that fits best, by the least median of many draws (Rousseeuw 1984).
     """
     if chain.frame('base').fixed:
         return chain
@@ -141,8 +149,16 @@ def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> 
     points = arm[:, :3, 3] + arm[:, :3, :3] @ chain.frame('tool').matrix[:3, 3]
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
+    chosen = np.arange(len(points))
+    if robust and len(points) > DRAWN:
+        draws = np.random.default_rng(0).random((DRAWS, len(points))).argsort(axis=1)[:, :DRAWN]
+        found = (np.linalg.pinv(columns[draws]) @ wanted[draws, np.newaxis])[:, :3, 0]
+        lengths = np.linalg.norm(points + found[:, np.newaxis], axis=2)
+        misfits = np.abs(lengths - observations.distances)
+        best = misfits[np.argmin(np.median(misfits, axis=1))]
+        chosen = np.argsort(best)[: max(len(points) // 2, DRAWN)]
     matrix = np.eye(4)
-    matrix[:3, 3] = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
+    matrix[:3, 3] = np.linalg.lstsq(columns[chosen], wanted[chosen], rcond=None)[0][:3]
     return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
 
 

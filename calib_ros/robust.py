@@ -99,6 +99,9 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
     distances = distances_of(fit.chain, names, system)
     if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
         return Robust(fit, distances, True, iterations, loss)
+    if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # led away from a good start
+        fit = replace(fit, chain=chain)
+        distances = distances_of(chain, names, system)
     for _ in range(REWEIGHTINGS):
         before = distances
         _weigh(system, [np.minimum(1.0, 1.0 / np.maximum(d, 1e-12)) for d in distances])

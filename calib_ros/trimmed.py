@@ -4,9 +4,10 @@
 
 Least trimmed squares: the fit to that half of the samples that fits best (Rousseeuw 1984), found
 as in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few configurations drawn
-at random; from each, concentration steps lead downhill: take the half with the shortest residuals,
-fit it, and again. On the linearised model all fits are done at once, as products of matrices;
-it is linearised anew at the best one until its half stands still.
+at random, as near to the start as they allow. From each, concentration steps lead downhill: take
+the half with the shortest residuals, fit it, and again. On the linearised model all fits are done
+at once, as products of matrices; it is linearised anew at the best one until its half stands
+still.
 
 Half means half of every set of observations, and somewhat more: with P parameters and R equations
 (1 + P / R) / 2 of the samples, which stands the most gross errors, (1 - P / R) / 2 of them
@@ -36,8 +37,8 @@ SUBSET = 300
 """Samples that are searched, evenly spread over all; the fit that follows takes all."""
 LEAST = 30
 """Samples of a set that are searched, however many sets there are."""
-SPARE = 1.1
-"""Equations of a start per parameter."""
+DRAWN = 0.5
+"""Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
 RIDGE = 1e-9
 """Weight that keeps what a start leaves open where it is, against that of all samples."""
 
@@ -125,7 +126,7 @@ class _Halves:
         for group in self._groups:
             count = int(group.max(initial=-1)) + 1
             rank = np.argsort(rng.random((STARTS, count)), axis=1)
-            masks.append((rank < np.ceil(SPARE * need * count))[:, group])
+            masks.append((rank < np.ceil(DRAWN * need * count))[:, group])
         return np.concatenate(masks, axis=1)
 
     def concentrate(self, squares: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:

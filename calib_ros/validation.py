@@ -15,7 +15,7 @@ from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
-from calib_ros.robust import OUTLIER, Robust, distances_of, reweighted, weights_of
+from calib_ros.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.se3 import FloatArray
 
 CONFIDENCE = 0.95
@@ -162,10 +162,8 @@ def validate(
     def part(fold: int, inside: bool) -> tuple[list[NDArray[np.intp]], System]:
         chosen = [np.flatnonzero((group % folds == fold) == inside) for group in groups]
         sets = [each.select(index) for each, index in zip(problem.sets, chosen, strict=True)]
-        system = problem.system(sets)
-        for samples, index, distance in zip(system.sets, chosen, robust.distances, strict=True):
-            samples.weights = np.sqrt(weights_of(distance[index], problem.loss))
-        return chosen, system
+        pairs = zip(robust.distances, chosen, strict=True)
+        return chosen, _weighted(problem, sets, [distances[index] for distances, index in pairs])
 
     def training(fold: int) -> System:
         return part(fold, inside=False)[1]
@@ -195,6 +193,16 @@ def validate(
         ),
         f'{folds}-fold cross-validation over {sum(counts)} distinct configurations',
     )
+
+
+def _weighted(
+    problem: Problem, sets: Sequence[Observations], distances: Sequence[FloatArray]
+) -> System:
+    """Return sets with the weights of samples at distances (N,) in the fit to all."""
+    system = problem.system(sets)
+    for samples, distance in zip(system.sets, distances, strict=True):
+        samples.weights = np.sqrt(weights_of(distance, problem.loss))
+    return system
 
 
 def _folds(problem: Problem, names: Sequence[str], counts: Sequence[int], rows: int) -> int:
@@ -246,18 +254,22 @@ def _leave_one_place_out(
     """Judge both chains on places of sockets that were not fitted.
 
     Where the sockets of a place are is unknown; it is fitted to the place's own pairs, by arm and
-    tool of the others.
+    tool of the others. Outliers keep the weight that they have in the fit to all.
     """
+    pairs = list(zip(problem.sets, robust.distances, strict=True))
+
+    def part(place: set[str], inside: bool) -> System:
+        chosen = [pair for pair in pairs if (pair[0].base in place) == inside]
+        return _weighted(problem, [pair[0] for pair in chosen], [pair[1] for pair in chosen])
+
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]
     for place in places:
-        inside = [each for each in problem.sets if each.base in place]
-        others = problem.system([each for each in problem.sets if each.base not in place])
         own = [name for name in names if name.partition('.')[0] in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
             elsewhere = [name for name in fitted if name not in own]
-            trained = reweighted(chain, elsewhere, others, problem.loss).fit.chain
-            found.append(minimise(trained, own, problem.system(inside)).chain)
+            trained = minimise(chain, elsewhere, part(place, inside=False)).chain
+            found.append(minimise(trained, own, part(place, inside=True)).chain)
     number = {base: k for k, place in enumerate(places) for base in place}
     parts = [
         compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])

@@ -95,16 +95,40 @@ def test_noisy_distances_are_honest_about_their_size(rng):
     assert np.sqrt(np.mean(left**2)) < 0.5 * NOISE[0]
 
 
-def test_distances_of_gross_error_are_named(rng):
-    true = faulty(UR10E, Cell(), rng)
-    seen = wire(true, 200, rng, noise=NOISE[0])
-    wrong = rng.choice(200, 20, replace=False)
-    lengths = seen.distances.copy()
-    lengths[wrong] += rng.choice([-1.0, 1.0], 20) * rng.uniform(5e-3, 50e-3, 20)
-    result = identify(Problem(UR10E, replace(seen, distances=lengths), sigma_position=NOISE[0]))
-    assert {outlier.sample for outlier in result.outliers} == set(wrong.tolist())
-    left = residuals(result.chain, wire(true, 300, rng)).position[:, 0]
-    assert np.sqrt(np.mean(left**2)) < NOISE[0]
+def one_sided(count, rng):
+    return rng.uniform(5e-3, 50e-3, count)
+
+
+GROSS = {
+    'scattered': lambda count, rng: rng.choice([-1.0, 1.0], count) * one_sided(count, rng),
+    'one-sided': one_sided,
+    'all alike': lambda count, rng: np.repeat(one_sided(1, rng), count),
+    'a metre': lambda count, rng: rng.uniform(0.3, 1.5, count),
+}
+
+
+@pytest.mark.parametrize('errors', GROSS)
+@pytest.mark.parametrize(('count', 'share'), [(200, 0.1), (200, 0.3), (100, 0.3)])
+def test_distances_of_gross_error_are_named_and_do_no_harm(count, share, errors):
+    """A wire that slipped from its hook, or another one measured."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = wire(true, count, rng, noise=NOISE[0])
+        wrong = rng.choice(count, round(share * count), replace=False)
+        lengths = seen.distances.copy()
+        lengths[wrong] = np.abs(lengths[wrong] + GROSS[errors](len(wrong), rng))
+        result = identify(Problem(UR10E, replace(seen, distances=lengths), sigma_position=5e-5))
+        assert result.accepted
+        assert {outlier.sample for outlier in result.outliers} == set(wrong.tolist())
+        good = seen.select(np.setdiff1d(np.arange(count), wrong))
+        best = identify(Problem(UR10E, good, sigma_position=5e-5, loss='none'))
+        unseen = wire(true, 300, rng)
+        error, least = (
+            np.sqrt(np.mean(residuals(each.chain, unseen).position[:, 0] ** 2))
+            for each in (result, best)
+        )
+        assert error < 1.1 * least
 
 
 def test_distances_and_poses_in_one_problem(rng):

@@ -120,6 +120,29 @@ def test_a_ball_on_the_last_axis_leaves_it_near_nominal(seed, offset):
     assert difference(result.chain, true) < 1.5 * difference(far.chain, other) + 1e-4
 
 
+@pytest.mark.parametrize('agree', [False, True])
+@pytest.mark.parametrize('seed', range(2))
+def test_poses_outside_the_socket_are_named_and_do_no_harm(seed, agree):
+    """At 30 % of the poses of every socket the ball sat 5-50 mm beside it."""
+    rng = np.random.default_rng(seed)
+    true, problem = cell(seed, noise=1e-4)
+    sets, good, wrong = [], [], set()
+    for number, each in enumerate(problem.sets):
+        beside = rng.choice(len(each), 9, replace=False)
+        shift = rng.normal(size=(1 if agree else 9, 3))
+        shift *= rng.uniform(5e-3, 50e-3, (len(shift), 1)) / np.linalg.norm(shift, axis=1)[:, None]
+        q = each.joints.copy()
+        q[beside] = led_to(true, q[beside], true.forward(q[beside])[:, :3, 3] + shift)
+        sets.append(replace(each, joints=q))
+        good.append(each.select(np.setdiff1d(np.arange(len(each)), beside)))
+        wrong |= {(number, sample) for sample in beside.tolist()}
+    result = identify(replace(problem, observations=sets[0], more=sets[1:]))
+    assert result.accepted
+    assert {(outlier.set, outlier.sample) for outlier in result.outliers} == wrong
+    best = identify(replace(problem, observations=good[0], more=good[1:], loss='none'))
+    assert difference(result.chain, true) < 1.1 * difference(best.chain, true)
+
+
 def test_well_determined_parameters_get_no_prior():
     result = identify(cell(0, noise=5e-4)[1])
     assert not result.weak
