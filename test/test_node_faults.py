@@ -89,6 +89,19 @@ def cell_and_child(**parameters):
         Cell() as cell,
         Child(domain=cell.domain, chain='ur10e', **reliable, **parameters) as child,
     ):
+        reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        probes = [
+            (cell.publisher(JointState, 'joint_states'), JointState()),
+            (cell.publisher(PoseStamped, 'measured_pose'), PoseStamped()),
+        ]
+
+        def hears():  # that the peer knows of the child does not say that it hears the peer
+            for publisher, probe in probes:
+                publisher.publish(probe)
+            values = {v.key: v.value for r in reports[-1:] for v in r.status[0].values}
+            return all(int(values.get(stream, 0)) for stream in ('joint states', 'poses'))
+
+        cell.spin_until(hears)
         yield cell, child
 
 
