@@ -38,7 +38,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
-        (f'{SHARE}/config', glob('config/*.yaml')),
+        (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
         (f'{SHARE}/launch', glob('launch/*.launch.py')),
     ],

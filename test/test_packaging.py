@@ -18,6 +18,7 @@ import calib_ros
 from calib_ros.config import Settings
 
 ROOT = Path(__file__).parents[1]
+CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz')
 
 
 @pytest.mark.parametrize('arguments', [[], ['--symlink-install']])
@@ -37,7 +38,7 @@ def test_colcon_build_puts_everything_where_ros2_looks(tmp_path, arguments):
     prefix = tmp_path / 'install' / 'calib_ros'
     share = prefix / 'share' / 'calib_ros'
     assert (prefix / 'share/ament_index/resource_index/packages/calib_ros').is_file()
-    for name in ('package.xml', 'launch/calibration.launch.py', 'config/calibration_node.yaml'):
+    for name in ('package.xml', 'launch/calibration.launch.py', *CONFIG):
         assert (share / name).is_file()
     robots = {path.name for path in (ROOT / 'config/robots').iterdir()}
     assert {path.name for path in (share / 'config/robots').iterdir()} == robots
@@ -88,3 +89,21 @@ def test_the_parameter_file_states_the_defaults():
             assert stated[item.name] == item.default
         else:
             assert stated[item.name] == pytest.approx(item.default, rel=1e-5)
+
+
+def test_rviz_shows_what_the_node_publishes():
+    content = yaml.safe_load((ROOT / 'config/calibration.rviz').read_text())
+    manager = content['Visualization Manager']
+    topics = {d['Class']: d['Topic'] for d in manager['Displays'] if 'Topic' in d}
+    node = (ROOT / 'calib_ros/node.py').read_text()
+    for topic in topics.values():
+        assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in node
+    # The residuals are published once: a display that comes later must ask for the last ones.
+    residuals = topics['rviz_default_plugins/MarkerArray']
+    assert residuals['Durability Policy'] == 'Transient Local'
+
+
+def test_the_document_of_the_node_lists_every_setting():
+    text = (ROOT / 'docs/node.md').read_text()
+    for item in fields(Settings):
+        assert f'`{item.name}`' in text, item.name
