@@ -215,7 +215,8 @@ def _identify(options: argparse.Namespace) -> int:
         samples = session.account().as_document()
     for warning in warnings:
         print(f'warning: {warning}', file=sys.stderr)
-    _write_result(options.out, result, samples, warnings)
+    configuration = report.configuration_yaml(options.chain, settings)
+    _write_result(options.out, result, samples, warnings, configuration)
     if options.json:
         document = report.as_document(result, samples) | {'warnings': list(warnings)}
         print(json.dumps(document, indent=2))
@@ -344,7 +345,8 @@ def _demo(options: argparse.Namespace) -> int:
     print(f'3. identified: {report.summary(result)}')
     print('4. identified offsets against the true ones [mm, mrad]:')
     print(report.against_truth(result, load_chain(truth)))
-    _write_result(options.out, result, session.account().as_document(), ())
+    configuration = report.configuration_yaml(options.chain, session.settings)
+    _write_result(options.out, result, session.account().as_document(), (), configuration)
     print(f'5. wrote {options.out}/: {", ".join(RESULT_FILES)}')
     return 0 if result.accepted else NOT_ACCEPTED
 
@@ -379,7 +381,13 @@ def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
     return path
 
 
-RESULT_FILES = ('calibration.yaml', 'result.json', 'report.md', 'before_after.png')
+RESULT_FILES = (
+    'calibration.yaml',
+    'result.json',
+    'report.md',
+    'before_after.png',
+    'settings.yaml',
+)
 
 
 def _refuse_overwriting(options: argparse.Namespace) -> None:
@@ -394,7 +402,11 @@ def _refuse_overwriting(options: argparse.Namespace) -> None:
 
 
 def _write_result(
-    out: Path | None, result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]
+    out: Path | None,
+    result: Identification,
+    samples: dict[str, Any],
+    warnings: tuple[str, ...],
+    configuration: str,
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
 
@@ -413,6 +425,7 @@ def _write_result(
         'result.json': json.dumps(document, indent=2) + '\n',
         'report.md': report.markdown(result, samples, warnings),
         'before_after.png': before_after_png(result),
+        'settings.yaml': configuration,
     }
     earlier = out / 'calibration.yaml'
     if result.accepted:

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from calib_ros import simulation
 from calib_ros.cli import NOT_ACCEPTED, RESULT_FILES, main
@@ -146,12 +147,13 @@ def test_without_json_one_line_says_the_result(run, table):
     assert f'{TEST} held-out samples' in out
 
 
-def test_out_writes_four_files(run, table, tmp_path):
+def test_out_writes_every_file(run, table, tmp_path):
     out = tmp_path / 'deep' / 'result'
     assert run('identify', '--csv', table, '--chain', 'ur5e', '--out', out)[0] == 0
     files = contents(out)
-    assert files.keys() == {'calibration.yaml', 'result.json', 'report.md', 'before_after.png'}
     assert files.keys() == set(RESULT_FILES)
+    settings = yaml.safe_load(files['settings.yaml'])['/**']['ros__parameters']
+    assert settings['sigma_position'] == 1e-4
     assert files['before_after.png'].startswith(b'\x89PNG')
     assert json.loads(files['result.json'])['accepted'] is True
     assert 'wrist_1_joint.theta' in files['report.md'].decode()
@@ -312,7 +314,7 @@ def test_where_nothing_is_to_gain_nothing_is_claimed(run, tmp_path, seed, held_o
     assert NOT_ACCEPTED == 3
     assert 'NOT accepted' in said
     assert 'no gain on held-out poses' in said
-    assert contents(out).keys() == {'result.json', 'report.md', 'before_after.png'}
+    assert contents(out).keys() == set(RESULT_FILES) - {'calibration.yaml'}
     document = json.loads((out / 'result.json').read_text())
     assert document['accepted'] is False
     assert 'no gain on held-out poses' in document['refusals'][0]
