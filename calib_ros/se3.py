@@ -35,12 +35,16 @@ def invert(matrix: FloatArray) -> FloatArray:
 
 def from_quat(quat_xyzw: FloatArray) -> FloatArray:
     """Turn (..., 4) quaternions, normalised here, into (..., 3, 3) rotation matrices."""
+    if not quat_xyzw.size:  # older versions of scipy take none
+        return np.zeros((*quat_xyzw.shape[:-1], 3, 3))
     flat = Rotation.from_quat(_own(quat_xyzw, 4)).as_matrix()
     return np.asarray(flat).reshape(*quat_xyzw.shape[:-1], 3, 3)
 
 
 def to_quat(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 4) quaternions with w >= 0."""
+    if not rotation.size:
+        return np.zeros((*rotation.shape[:-2], 4))
     quat = np.asarray(Rotation.from_matrix(_own(rotation, 3, 3)).as_quat())
     quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
     return quat.reshape(*rotation.shape[:-2], 4)
@@ -54,6 +58,8 @@ def exp_rotation(vector: FloatArray) -> FloatArray:
 
 def log_rotation(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 3) rotation vectors [rad]."""
+    if not rotation.size:
+        return np.zeros((*rotation.shape[:-2], 3))
     flat = Rotation.from_matrix(_own(rotation, 3, 3)).as_rotvec()
     return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
 
