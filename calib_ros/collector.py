@@ -411,10 +411,12 @@ class Collector:
             steps = unwrapped(motion.joints[mean.used] - motion.joints[0], self._revolute)
             joints = motion.joints[0] + steps.mean(axis=0)
             velocity = acceleration = None
-            approach = motion.approach[0]
+            approach = motion.approach[0].copy()  # a view would keep the whole stop
         else:
-            joints, approach = motion.joints[which], motion.approach[which]
-            velocity, acceleration = motion.velocity[which], motion.acceleration[which]
+            joints, approach, velocity, acceleration = (
+                each[which].copy()
+                for each in (motion.joints, motion.approach, motion.velocity, motion.acceleration)
+            )
         self._fresh.append(
             Sample(
                 stamp_ns=stamp_ns,
