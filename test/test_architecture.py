@@ -18,9 +18,9 @@ ORDER = [
     {'effects'},
     {'chain'},
     {'config', 'differential', 'observations'},
-    {'identifiability', 'leastsquares', 'messages', 'tables'},
-    {'robust', 'simulation'},
-    {'frames'},
+    {'identifiability', 'inverse', 'leastsquares', 'messages', 'tables'},
+    {'compensation', 'robust', 'simulation'},
+    {'frames', 'programs'},
     {'problem'},
     {'validation'},
     {'identification'},
@@ -36,7 +36,7 @@ ONLY = {
     'geometry_msgs': {'node'},
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config'},
+    'yaml': {'config', 'programs'},
 }
 
 
