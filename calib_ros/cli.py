@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | simulate | csv2bag | chain | demo`.
+"""The command line: `calib_ros identify | compensate | export | simulate | demo | ...`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
-result is not accepted.
+result is not accepted, or a program has samples that cannot be compensated.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
+from calib_ros.commands import NOT_ACCEPTED, add_chain, add_commands
 from calib_ros.errors import CalibrationError, InputError
 
 if TYPE_CHECKING:
     from calib_ros.chain import Chain
     from calib_ros.identification import Identification
-
-NOT_ACCEPTED = 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar='M',
         help='between two sockets of a place, 0.05 if not given',
     )
-    _add_chain(identify)
+    add_chain(identify)
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
     identify.add_argument('--force', action='store_true', help='overwrite files in --out')
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
@@ -85,26 +84,28 @@ def _parser() -> argparse.ArgumentParser:
         'simulate', _simulate, 'write the bag of a simulated robot cell, with the true chain'
     )
     simulate.add_argument('bag', type=Path, help='folder of the bag to write')
-    _add_chain(simulate)
+    add_chain(simulate)
     _add_simulation(simulate)
 
     csv2bag = command('csv2bag', _csv2bag, 'write a table of measured poses as a bag')
     csv2bag.add_argument('csv', type=Path, help='the table')
     csv2bag.add_argument('bag', type=Path, help='folder of the bag to write')
     csv2bag.add_argument('--session', help='session of the table to use')
-    _add_chain(csv2bag)
+    add_chain(csv2bag)
     _add_storage(csv2bag)
 
     export = command(
         'export', _export, 'write a calibration in the forms that controllers and others read'
     )
     export.add_argument('calibration', type=Path, help='calibration.yaml of an identification')
-    _add_chain(export)
+    add_chain(export)
     export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
     export.add_argument('--base-link', help='of the URDF: where the arm starts')
     export.add_argument('--tip-link', help='of the URDF: where the arm ends')
     export.add_argument('--out', type=Path, required=True, help='folder to write')
     export.add_argument('--force', action='store_true', help='overwrite files in --out')
+
+    add_commands(command)
 
     chain = command('chain', _chain, 'print the chain file of a robot, to read and to edit')
     chain.add_argument('robot', help='URDF, chain file, or a robot by its name (ur10e, ...)')
@@ -121,12 +122,6 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument('--force', action='store_true', help='overwrite an earlier demo')
     _add_simulation(demo)
     return parser
-
-
-def _add_chain(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--chain', required=True, help='chain file, URDF, or a robot by its name (ur10e, ...)'
-    )
 
 
 def _add_storage(parser: argparse.ArgumentParser) -> None:

@@ -19,17 +19,17 @@ ORDER = [
     {'chain'},
     {'urdf'},
     {'config', 'differential', 'observations'},
-    {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
-    {'cdr', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
+    {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
+    {'cdr', 'compensation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
     {'robust'},
-    {'collector', 'export', 'frames', 'journal'},
+    {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
     {'live', 'validation'},
     {'identification'},
     {'selection', 'salvage'},
     {'session', 'plots'},
     {'replay', 'report'},
-    {'deferred', 'outgoing'},
+    {'commands', 'deferred', 'outgoing'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
@@ -40,7 +40,7 @@ ONLY = {
     'geometry_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config', 'export'},
+    'yaml': {'config', 'export', 'programs'},
 }
 
 
