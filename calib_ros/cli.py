@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | simulate | csv2bag | demo`.
+"""The command line: `calib_ros identify | plan | simulate | csv2bag | demo`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
 result is not accepted.
@@ -25,9 +25,12 @@ from calib_ros.errors import CalibrationError, InputError
 
 if TYPE_CHECKING:
     from calib_ros.chain import Chain
+    from calib_ros.config import Settings
     from calib_ros.identification import Identification
 
 NOT_ACCEPTED = 3
+TASK_POSES = 300
+"""Random poses at which a plan is to be accurate when no task is given."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,6 +86,10 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
     _add_settings(identify)
 
+    plan = command('plan', _plan, 'choose the poses to measure, and say how accurate they make')
+    _add_chain(plan)
+    _add_plan(plan)
+
     simulate = command(
         'simulate', _simulate, 'write the bag of a simulated robot cell, with the true chain'
     )
@@ -125,10 +132,38 @@ def _add_simulation(parser: argparse.ArgumentParser) -> None:
     _add_storage(parser)
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
+def _add_plan(parser: argparse.ArgumentParser) -> None:
+    from calib_ros.planning import CRITERIA
+
+    add = parser.add_argument
+    add('--poses', type=int, metavar='N', help='how many; 25, or what --accuracy needs')
+    add('--accuracy', type=float, metavar='MM', help='wanted RMS position error at the task poses')
+    add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
+    add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
+    add('--draw', type=int, default=2000, metavar='N', help='random candidates without a file')
+    add('--task', type=Path, metavar='FILE', help='CSV q1..qn; random poses if not given')
+    add('--taken', type=Path, metavar='FILE', help='CSV q1..qn of poses measured already')
+    add('--measured', choices=('pose', 'position'), default='pose', help='at each pose')
+    add('--apart', type=float, default=1e-3, help='least move of a joint between poses [rad, m]')
+    add('--velocity', type=float, nargs='+', default=[1.0], help='of the joints [rad/s, m/s]')
+    add('--box', type=float, nargs=6, metavar='M', help='measurable region: lower, upper corner')
+    add('--tracker', type=float, nargs=3, metavar='M', help='where the device stands')
+    add('--axis', type=float, nargs=3, default=[0.0, 0.0, 1.0], help='of the target, to face it')
+    add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
+    add('--world', action='store_true', help='box and tracker are in the world, not in the base')
+    add('--seed', type=int, default=0, help='of the random numbers')
+    add('--out', type=Path, metavar='FILE', help='CSV q1..qn to write, in order of visit')
+    add('--force', action='store_true', help='overwrite --out')
+    _add_settings(parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed'))
+
+
+def _add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
+    """Add options for the settings of some names, or for all."""
     from calib_ros.config import Settings
 
     for item in fields(Settings):
+        if names and item.name not in names:
+            continue
         many = isinstance(item.default, tuple)
         parser.add_argument(
             f'--{item.name.replace("_", "-")}',
@@ -141,7 +176,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 
 def _identify(options: argparse.Namespace) -> int:
     from calib_ros import report
-    from calib_ros.config import Settings, load_chain
+    from calib_ros.config import load_chain
     from calib_ros.problem import Problem
     from calib_ros.selection import identify_model
 
@@ -157,10 +192,7 @@ def _identify(options: argparse.Namespace) -> int:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
-    given: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(Settings)}
-    for name in ('joint_names', 'fixed', 'priors'):
-        given[name] = tuple(part for text in given[name] for part in text.split(','))
-    settings = Settings(**given)
+    settings = _settings(options)
     _refuse_overwriting(options)
     warnings: tuple[str, ...] = ()
     if options.csv is not None:
@@ -208,6 +240,88 @@ def _identify(options: argparse.Namespace) -> int:
 
 def _sessions(options: argparse.Namespace) -> tuple[str, ...]:
     return tuple(options.session.split(',')) if options.session else ()
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    """Return the settings that are among the options, the others by default."""
+    from calib_ros.config import Settings
+
+    given = {
+        f.name: getattr(options, f.name) for f in fields(Settings) if hasattr(options, f.name)
+    }
+    for name in ('joint_names', 'fixed', 'priors'):
+        if name in given:
+            given[name] = tuple(part for text in given[name] for part in text.split(','))
+    return Settings(**given)
+
+
+def _plan(options: argparse.Namespace) -> int:
+    import numpy as np
+
+    from calib_ros import planning, report
+    from calib_ros.config import load_chain
+    from calib_ros.files import write_file
+    from calib_ros.problem import Problem
+    from calib_ros.simulation import measure
+    from calib_ros.tables import joints_csv, read_joints
+
+    _check_plan(options)
+    chain = load_chain(options.chain)
+    size = len(chain.joints)
+    rng = np.random.default_rng(options.seed)
+    imagined = measure(chain, np.zeros((1, size)), rng, oriented=options.measured == 'pose')
+    design = planning.Design.of(Problem(chain, imagined, **_settings(options).for_problem()))
+    visibility = planning.Visibility(
+        None if options.box is None else np.reshape(options.box, (2, 3)),
+        None if options.tracker is None else np.array(options.tracker),
+        tuple(options.axis),
+        np.radians(options.cone),
+        options.world,
+    )
+    if options.taken is not None:
+        design = design.after(read_joints(options.taken, size))
+    task = chain.random_joints(TASK_POSES, rng)
+    if options.task is not None:
+        task = read_joints(options.task, size)
+    if options.candidates is None:
+        candidates = planning.draw_candidates(design, options.draw, rng, visibility)
+    else:
+        candidates = read_joints(options.candidates, size)
+        candidates = candidates[visibility.sees(design, candidates)]
+        if not len(candidates):
+            raise InputError(f'the target can be measured at no pose of {options.candidates}')
+    choice = {'criterion': options.criterion, 'apart': options.apart}
+    needed = None
+    if options.accuracy is not None:
+        wanted = 1e-3 * options.accuracy
+        needed = planning.poses_needed(design, candidates, task, wanted, **choice)
+    if len(options.velocity) not in (1, size):
+        raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
+    velocities = np.broadcast_to(options.velocity, size)
+    count = options.poses or needed or 25
+    plan = planning.plan(design, candidates, task, count, **choice, velocities=velocities)
+    print(report.plan_in_words(plan, len(candidates), options.accuracy, needed))
+    if chain.tool is None:
+        x, y, z = planning.ASSUMED_TOOL
+        print(f'the tool is unknown: its target is taken to be at {x} {y} {z} m from the flange')
+    if options.out is not None:
+        write_file(options.out, joints_csv(plan.joints[plan.visit]), overwrite=options.force)
+        print(f'wrote {options.out}')
+    return 0
+
+
+def _check_plan(options: argparse.Namespace) -> None:
+    """Refuse options of `plan` that make no sense."""
+    for name, lowest in (('poses', 1), ('draw', 1), ('seed', 0)):
+        value = getattr(options, name)
+        if value is not None and value < lowest:
+            raise InputError(f'--{name} must be at least {lowest}, not {value}')
+    if options.accuracy is not None and not options.accuracy > 0.0:
+        raise InputError(f'--accuracy must be positive, not {options.accuracy}')
+    if options.apart < 0.0 or not all(value > 0.0 for value in options.velocity):
+        raise InputError('--apart must not be negative, and each --velocity must be positive')
+    if options.out is not None and options.out.exists() and not options.force:
+        raise InputError(f'{options.out} exists already: choose another name or --force')
 
 
 def _simulate(options: argparse.Namespace) -> int:

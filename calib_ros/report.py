@@ -16,6 +16,7 @@ from calib_ros import effects
 from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.config import dump_chain
 from calib_ros.identification import Identification
+from calib_ros.planning import Plan
 from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
 
 WEAK = 0.01
@@ -271,6 +272,33 @@ def _parameter_row(p: Parameter) -> str:
     offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
     note = '' if p.status == 'fitted' else p.status
     return f'| {p.name} | {p.value:.9f} | {offset} | {std} | {note} |'
+
+
+def plan_in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> str:
+    """Return what a plan promises: a table over the number of poses, and how good it is."""
+    count = len(plan.joints)
+    first = int(np.isfinite(plan.accuracy).sum())
+    shown = np.unique(np.linspace(count - first + 1, count, min(first, 12)).round().astype(int))
+    lines = ['predicted RMS position error [mm]', ' poses   planned   random']
+    for number in shown.tolist():
+        planned, random = (1e3 * each[number - 1] for each in (plan.accuracy, plan.at_random))
+        by_chance = f'{random:8.4f}' if np.isfinite(random) else '       -'
+        lines.append(f'{number:6} {planned:9.4f} {by_chance}')
+    if not first:
+        lines.append(f'{count:6}         - too few poses to determine all parameters')
+    text = f'{count} of {candidates} candidates'
+    if plan.efficiency is not None:
+        text += f', at least {100.0 * plan.efficiency:.0f} % of what the best choice would bring'
+    lines.append(f'{text}; moves take {plan.travel:.0f} s')
+    if needed is not None:
+        lines.append(f'{wanted_mm:g} mm: {needed} poses')
+    if plan.lacking:
+        lines.append(
+            f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '
+            'further and in more combinations, or fix these parameters'
+        )
+    lines.append('from the noise of the measurement alone; what the model lacks comes on top')
+    return '\n'.join(lines)
 
 
 def against_truth(result: Identification, truth: Chain) -> str:

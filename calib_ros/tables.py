@@ -23,6 +23,7 @@ from calib_ros import se3
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.observations import Observations
+from calib_ros.se3 import FloatArray
 
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 Rows: TypeAlias = list[tuple[int, dict[str, str]]]
@@ -114,6 +115,47 @@ def read_table(
         if not any(len(each) for each in fitted):
             raise InputError(f'{path} has no rows to fit, only such that are marked test')
     return Table(tuple(fitted), tuple(held_out), tuple(pairs))
+
+
+def read_joints(path: Path, joints: int) -> FloatArray:
+    """Read joint values (N, joints) [rad or m] from the columns q1 ... qn of a CSV.
+
+    Raises
+    ------
+    InputError
+        For a missing column, no row, or a value that is no number.
+
+    """
+    return _table(path, [f'q{k + 1}' for k in range(joints)])[0]
+
+
+def _table(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
+    """Return the values (N, C) of some columns, and the line of each row."""
+    header, rows = _read(path)
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise InputError(
+            f'{path} has no column {", ".join(missing)}; expected {", ".join(columns)}; found '
+            f'{", ".join(header) or "nothing"}'
+        )
+    if not rows:
+        raise InputError(f'{path} has no rows')
+    numbers = np.array([_numbers(path, line, row, columns) for line, row in rows])
+    return numbers, [line for line, _ in rows]
+
+
+def joints_csv(joints: FloatArray) -> str:
+    """Return the CSV text of joint values (N, n), as `read_joints` reads it."""
+    return csv_of([f'q{k + 1}' for k in range(joints.shape[1])], joints)
+
+
+def csv_of(columns: Sequence[str], values: FloatArray) -> str:
+    """Return the CSV text of values (N, C); NaN is left empty."""
+    rows = (
+        ','.join('' if math.isnan(value) else f'{value:.9f}' for value in row)
+        for row in values.tolist()
+    )
+    return '\n'.join([','.join(columns), *rows]) + '\n'
 
 
 def _plain(name: str) -> str:

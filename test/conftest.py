@@ -5,6 +5,8 @@ import os
 # Read by rclpy and its messages when they are imported.
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+# Read by numpy: small matrices only, a second thread costs more than it gives.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 import pytest

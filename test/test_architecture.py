@@ -24,7 +24,7 @@ ORDER = [
     {'problem'},
     {'validation'},
     {'identification'},
-    {'selection', 'salvage'},
+    {'selection', 'salvage', 'planning'},
     {'session', 'report', 'plots'},
     {'replay'},
     {'cli', 'node'},
