@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | plan | simulate | csv2bag | demo`.
+"""The command line: `calib_ros identify | plan | workspace | simulate | csv2bag | demo`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
 result is not accepted.
@@ -24,13 +24,19 @@ from calib_ros import __version__
 from calib_ros.errors import CalibrationError, InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from calib_ros.chain import Chain
     from calib_ros.config import Settings
     from calib_ros.identification import Identification
+    from calib_ros.se3 import FloatArray
+    from calib_ros.workspace import CalibratedArm
 
 NOT_ACCEPTED = 3
 TASK_POSES = 300
 """Random poses at which a plan is to be accurate when no task is given."""
+BOX_POSES = 30
+"""Random poses that stand for a task given as a box of joint values."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,6 +95,17 @@ def _parser() -> argparse.ArgumentParser:
     plan = command('plan', _plan, 'choose the poses to measure, and say how accurate they make')
     _add_chain(plan)
     _add_plan(plan)
+
+    workspace = command(
+        'workspace',
+        _workspace,
+        'map errors over the workspace, and place a task where they are least',
+    )
+    workspace.add_argument(
+        'result', type=Path, help='folder of identify --out, or a calibrated chain file alone'
+    )
+    _add_chain(workspace)
+    _add_workspace(workspace)
 
     simulate = command(
         'simulate', _simulate, 'write the bag of a simulated robot cell, with the true chain'
@@ -157,6 +174,23 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
     _add_settings(parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed'))
 
 
+def _add_workspace(parser: argparse.ArgumentParser) -> None:
+    from calib_ros.workspace import AIMS, MODELS
+
+    add = parser.add_argument
+    add('--out', type=Path, required=True, help='folder for tables, words and figures')
+    add('--poses', type=int, default=20_000, help='random poses of the survey')
+    add('--task', type=Path, metavar='FILE', help='CSV x y z qx qy qz qw in the frame of a task')
+    add('--joint-box', type=float, nargs='+', metavar='Q', help='task: lower, then upper values')
+    add('--aim', choices=AIMS, default='mean', help='error over the poses of the task')
+    add('--model', choices=MODELS, default='corrected', help='by which the arm is commanded')
+    add('--region', type=float, nargs=6, metavar='M', help='for the task, lower, upper corner')
+    add('--cells', type=int, default=9, help='placements along each axis')
+    add('--turns', type=int, default=1, help='turns of the task about the vertical to try')
+    add('--seed', type=int, default=0, help='of the random numbers')
+    add('--force', action='store_true', help='overwrite files in --out')
+
+
 def _add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
     """Add options for the settings of some names, or for all."""
     from calib_ros.config import Settings
@@ -193,7 +227,7 @@ def _identify(options: argparse.Namespace) -> int:
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
     settings = _settings(options)
-    _refuse_overwriting(options)
+    _refuse_overwriting(options, RESULT_FILES)
     warnings: tuple[str, ...] = ()
     if options.csv is not None:
         from calib_ros.tables import read_table
@@ -324,6 +358,70 @@ def _check_plan(options: argparse.Namespace) -> None:
         raise InputError(f'{options.out} exists already: choose another name or --force')
 
 
+def _workspace(options: argparse.Namespace) -> int:
+    import numpy as np
+
+    from calib_ros import plots, report, workspace
+    from calib_ros.config import load_chain
+    from calib_ros.files import write_file
+    from calib_ros.tables import csv_of, joints_csv
+
+    for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
+        if getattr(options, name) < lowest:
+            raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
+    _refuse_overwriting(options, WORKSPACE_FILES + PLACEMENT_FILES)
+    arm = workspace.CalibratedArm.read(options.result, load_chain(options.chain))
+    rng = np.random.default_rng(options.seed)
+    task = _task(options, arm, rng)
+    survey = workspace.survey(arm, options.poses, rng)
+    words = report.workspace_in_words(survey)
+    contents: dict[str, str | bytes] = {
+        'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
+        'workspace.png': plots.workspace_png(survey),
+    }
+    if task is not None:
+        region = None if options.region is None else np.reshape(options.region, (2, 3))
+        found = workspace.place(
+            arm, task, options.aim, options.model, region, options.cells, options.turns
+        )
+        words += '\n' + report.placements_in_words(found, options.aim, options.model)
+        table = np.column_stack([found.positions, found.turns, found.errors])
+        contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
+        contents['placements.png'] = plots.placements_png(found)
+        contents['placed_task.csv'] = joints_csv(found.joints[found.best])
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, content in (contents | {'workspace.md': words}).items():
+        write_file(options.out / name, content, overwrite=options.force)
+    print(words, end='')
+    return 0
+
+
+def _task(
+    options: argparse.Namespace, arm: CalibratedArm, rng: np.random.Generator
+) -> FloatArray | None:
+    """Return the poses (K, 4, 4) of the task to place, if there is one."""
+    import numpy as np
+
+    from calib_ros.tables import read_poses
+    from calib_ros.workspace import in_base, task_of
+
+    if options.task is not None and options.joint_box is not None:
+        raise InputError('give either --task or --joint-box')
+    if options.task is not None:
+        return read_poses(options.task)
+    if options.joint_box is None:
+        return None
+    size = len(arm.after.joints)
+    if len(options.joint_box) != 2 * size:
+        raise InputError(
+            f'--joint-box: give {size} lower and {size} upper values, not '
+            f'{len(options.joint_box)} in all'
+        )
+    lower, upper = np.reshape(options.joint_box, (2, size))
+    joints = rng.uniform(lower, upper, (BOX_POSES, size))
+    return task_of(in_base(arm.commanded_by(options.model), joints))
+
+
 def _simulate(options: argparse.Namespace) -> int:
     from calib_ros.config import load_chain
 
@@ -364,7 +462,7 @@ def _demo(options: argparse.Namespace) -> int:
     from calib_ros.replay import replay
     from calib_ros.session import CalibrationSession
 
-    _refuse_overwriting(options)
+    _refuse_overwriting(options, RESULT_FILES)
     options.bag = options.out / 'bag'
     if options.force and options.bag.exists():
         import shutil
@@ -415,14 +513,16 @@ def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
     return path
 
 
+WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png')
+PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
 RESULT_FILES = ('calibration.yaml', 'result.json', 'report.md', 'before_after.png')
 
 
-def _refuse_overwriting(options: argparse.Namespace) -> None:
+def _refuse_overwriting(options: argparse.Namespace, names: Sequence[str]) -> None:
     """Refuse before any work is done."""
     if options.out is None or options.force:
         return
-    there = [name for name in RESULT_FILES if (options.out / name).exists()]
+    there = [name for name in names if (options.out / name).exists()]
     if there:
         raise InputError(
             f'{options.out} holds {", ".join(there)} already: choose another folder or --force'

@@ -17,7 +17,9 @@ from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.config import dump_chain
 from calib_ros.identification import Identification
 from calib_ros.planning import Plan
+from calib_ros.se3 import FloatArray
 from calib_ros.validation import Comparison, ErrorFigures, Parameter, is_length
+from calib_ros.workspace import Placements, Region, Spread, Survey, regions
 
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
@@ -117,6 +119,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'noise_in_sigma': asdict(result.noise),
         'outliers': [asdict(outlier) for outlier in result.outliers],
         'gauges': result.gauges,
+        'covariance': {'names': list(result.names), 'matrix': result.covariance.tolist()},
         'correlated': [list(pair) for pair in result.correlated()],
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),
@@ -299,6 +302,64 @@ def plan_in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: 
         )
     lines.append('from the noise of the measurement alone; what the model lacks comes on top')
     return '\n'.join(lines)
+
+
+def workspace_in_words(survey: Survey) -> str:
+    """Return the errors over the workspace as Markdown: figures, and where they are largest."""
+    parts = [('removed by the calibration', survey.removed)]
+    if np.isnan(survey.remaining).any():
+        rest = 'What remains is not known: the covariance is in the folder of the result.'
+    else:
+        parts += [
+            ('sigma of what remains', survey.sigma),
+            ('expected to remain', survey.remaining),
+        ]
+        rest = 'Expected to remain: sigma and the RMS error on poses that were not fitted.'
+    lines = [
+        f'Position errors [mm] at {len(survey.joints)} random poses of the joint range.',
+        '',
+        '| | RMS | mean | median | 95 % | max |',
+        '|---|---|---|---|---|---|',
+    ]
+    for label, errors in parts:
+        s = Spread.of(1e3 * errors)
+        figures = (s.rms, s.mean, s.median, s.percentile_95, s.max)
+        lines.append(f'| {label} | ' + ' | '.join(f'{value:.4f}' for value in figures) + ' |')
+    lines += ['', rest]
+    for label, errors in parts[:2]:
+        found = regions(survey.positions, errors)
+        lines += ['', f'Largest RMS, {label}:', '']
+        lines += [f'- {region_in_words(region)}' for region in found[:3]]
+        lines += ['', f'Least: {region_in_words(found[-1])}']
+    return '\n'.join(lines) + '\n'
+
+
+def region_in_words(region: Region) -> str:
+    """Return where a region is and its error."""
+    (near, far), (low, high) = region.radius, region.height
+    return (
+        f'{region.words}: {1e3 * region.rms:.4f} mm (radius {near:.2f} to {far:.2f} m, '
+        f'height {low:.2f} to {high:.2f} m, {region.poses} poses)'
+    )
+
+
+def placements_in_words(placements: Placements, aim: str, model: str) -> str:
+    """Return where to place a task, against the centre of all places."""
+    reached = placements.errors[~np.isnan(placements.errors)]
+    best, centre = (
+        f'{1e3 * placements.errors[k]:.4f} mm at {_place(placements.positions[k])} m in the base '
+        f'frame, turned by {np.degrees(placements.turns[k]):.0f} degrees'
+        for k in (placements.best, placements.centre)
+    )
+    return (
+        f'expected {aim} error of the task, {model} model; the arm reaches it at '
+        f'{len(reached)} of {len(placements.errors)} placements\n'
+        f'best:   {best}\ncentre: {centre}\nworst:  {1e3 * reached.max():.4f} mm\n'
+    )
+
+
+def _place(position: FloatArray) -> str:
+    return ' '.join(f'{value:.3f}' for value in position)
 
 
 def against_truth(result: Identification, truth: Chain) -> str:

@@ -129,6 +129,19 @@ def read_joints(path: Path, joints: int) -> FloatArray:
     return _table(path, [f'q{k + 1}' for k in range(joints)])[0]
 
 
+def read_poses(path: Path) -> FloatArray:
+    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV.
+
+    Raises
+    ------
+    InputError
+        For a missing column, no row, a value that is no number, or a quaternion that is none.
+
+    """
+    numbers, lines = _table(path, (*POSITION, *QUATERNION))
+    return se3.transform(_rotations(path, lines, numbers[:, 3:]), numbers[:, :3])
+
+
 def _table(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
     """Return the values (N, C) of some columns, and the line of each row."""
     header, rows = _read(path)
@@ -142,6 +155,18 @@ def _table(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
         raise InputError(f'{path} has no rows')
     numbers = np.array([_numbers(path, line, row, columns) for line, row in rows])
     return numbers, [line for line, _ in rows]
+
+
+def _rotations(path: Path, lines: Sequence[int], quat: FloatArray) -> FloatArray:
+    """Return the rotations (N, 3, 3) of quaternions (N, 4), and refuse what is none."""
+    length = np.linalg.norm(quat, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if wrong.size:
+        raise InputError(
+            f'{path}, line {lines[wrong[0]]}: quaternion qx qy qz qw has length '
+            f'{length[wrong[0]]:.6g}, expected 1'
+        )
+    return se3.from_quat(quat)
 
 
 def joints_csv(joints: FloatArray) -> str:
@@ -251,15 +276,7 @@ def _observations(path: Path, joints: int, rows: Rows, columns: Sequence[str]) -
         return replace(at_origin, distances=numbers[:, joints])
     rotations = None
     if 'qx' in columns:
-        quat = numbers[:, -4:]
-        length = np.linalg.norm(quat, axis=1)
-        wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
-        if wrong.size:
-            raise InputError(
-                f'{path}, line {rows[wrong[0]][0]}: quaternion qx qy qz qw has length '
-                f'{length[wrong[0]]:.6g}, expected 1'
-            )
-        rotations = se3.from_quat(quat)
+        rotations = _rotations(path, [line for line, _ in rows], numbers[:, -4:])
     return Observations.from_arrays(q, numbers[:, joints : joints + 3], rotations)
 
 
