@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | compensate | export | simulate | demo | ...`.
+"""The command line: `calib_ros identify | plan | workspace | compensate | export | ...`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
 result is not accepted, or a program has samples that cannot be compensated.
@@ -13,7 +13,6 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,14 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
-from calib_ros.commands import NOT_ACCEPTED, add_chain, add_commands
+from calib_ros.commands import (
+    NOT_ACCEPTED,
+    add_chain,
+    add_commands,
+    add_settings,
+    refuse_overwriting,
+    settings_of,
+)
 from calib_ros.errors import CalibrationError, InputError
 
 if TYPE_CHECKING:
@@ -78,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
     identify.add_argument('--force', action='store_true', help='overwrite files in --out')
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
-    _add_settings(identify)
+    add_settings(identify)
 
     simulate = command(
         'simulate', _simulate, 'write the bag of a simulated robot cell, with the true chain'
@@ -136,23 +142,9 @@ def _add_simulation(parser: argparse.ArgumentParser) -> None:
     _add_storage(parser)
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.config import Settings
-
-    for item in fields(Settings):
-        many = isinstance(item.default, tuple)
-        parser.add_argument(
-            f'--{item.name.replace("_", "-")}',
-            type=str if many else type(item.default),
-            action='append' if many else 'store',
-            default=[] if many else item.default,
-            help=item.metadata['text'],
-        )
-
-
 def _identify(options: argparse.Namespace) -> int:
     from calib_ros import report
-    from calib_ros.config import Settings, load_chain
+    from calib_ros.config import load_chain
     from calib_ros.problem import Problem
     from calib_ros.selection import identify_model
 
@@ -168,11 +160,8 @@ def _identify(options: argparse.Namespace) -> int:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
-    given: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(Settings)}
-    for name in ('joint_names', 'joint_topics', 'fixed', 'priors', 'sources'):
-        given[name] = tuple(part for text in given[name] for part in text.split(','))
-    settings = Settings(**given)
-    _refuse_overwriting(options)
+    settings = settings_of(options)
+    refuse_overwriting(options, RESULT_FILES)
     warnings: tuple[str, ...] = ()
     if options.csv is not None:
         from calib_ros.tables import read_table
@@ -271,12 +260,7 @@ def _export(options: argparse.Namespace) -> int:
         text = corrected_urdf(read_text(options.urdf), chain, *links)
         found = (*found, Export(f'{options.urdf.stem}_corrected.urdf', text, 0.0))
     options.out.mkdir(parents=True, exist_ok=True)
-    if not options.force:
-        there = [each.name for each in found if (options.out / each.name).exists()]
-        if there:
-            raise InputError(
-                f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
-            )
+    refuse_overwriting(options, [each.name for each in found])
     for each in found:
         write_file(options.out / each.name, each.content, overwrite=options.force)
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
@@ -324,7 +308,7 @@ def _demo(options: argparse.Namespace) -> int:
     from calib_ros.replay import replay
     from calib_ros.session import CalibrationSession
 
-    _refuse_overwriting(options)
+    refuse_overwriting(options, RESULT_FILES)
     options.bag = options.out / 'bag'
     if options.force and options.bag.exists():
         import shutil
@@ -385,17 +369,6 @@ RESULT_FILES = (
 )
 
 
-def _refuse_overwriting(options: argparse.Namespace) -> None:
-    """Refuse before any work is done."""
-    if options.out is None or options.force:
-        return
-    there = [name for name in RESULT_FILES if (options.out / name).exists()]
-    if there:
-        raise InputError(
-            f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
-        )
-
-
 def _write_result(
     out: Path | None,
     result: Identification,
@@ -405,7 +378,7 @@ def _write_result(
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
 
-    Files of an earlier result are in the way only with --force; `_refuse_overwriting` has seen
+    Files of an earlier result are in the way only with --force; `refuse_overwriting` has seen
     to it. A chain that was accepted earlier is kept under another name when this result is not.
     """
     if out is None:

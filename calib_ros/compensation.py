@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from calib_ros.chain import Chain
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.inverse import Follower
+from calib_ros.following import Follower
 from calib_ros.se3 import FloatArray
 
 EXACT, COMPROMISE = 1e-6, 0.02

@@ -1,307 +1,193 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The smallest change of the joints with which one arm reaches the pose of another.
+"""Joint values that bring the target to wanted poses, for any chain.
 
-With x the change of the joints in units of the largest that is allowed, e the pose error (position
-[m], rotation vector times a weight [m/rad]) and J = -de/dx, Gauss-Newton minimises
+Newton's method on the error e = (p_wanted - p, rotation vector from R to R_wanted), with
+J = -de/dq by the error model's columns (`differential.py`) for theta or d of every joint. The step
 
-    |e|^2 + x^T D x         step = (J^T J + D)^-1 (J^T e - D x)
+    dq = (J^T J + lambda I)^-1 J^T e
 
-D is next to nothing, so that x is the smallest change that reaches the pose, or the best
-compromise of an arm that cannot. Samples that would need more than is allowed, as near a
-singularity, are damped. With J = sum_k s_k u_k v_k^T at the command, a direction whose share
-e_k = u_k^T e of the error would need x_k = e_k / s_k > 1 gets x_k = s_k / e_k, which is what
-D = sum_k (e_k^2 - s_k^2) v_k v_k^T does: continuous where damping begins, zero at the singularity
-(variable damping after Nakamura and Hanafusa 1986), and exact in all other directions.
+is the shortest one that removes e (redundant arms). It is damped (Levenberg 1944, Marquardt 1963)
+until it lowers |e|, as near singular configurations.
 
-Arrays inside are laid out (component, sample), as in `differential.py`.
+Arrays are laid out (component, sample), as in `differential.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.chain import Chain, Frame
+from calib_ros.chain import Chain
 from calib_ros.differential import ErrorModel, orientation_error
-from calib_ros.se3 import FloatArray, transform
+from calib_ros.se3 import FloatArray
 
-Flags = NDArray[np.bool_]
-
-BLOCK = 2048
-ITERATIONS = 50
-STEP = 1e-8
-"""An iteration has converged when no joint moves by more, in units of the largest change."""
-EXACT = 1e-8
-"""Errors [m, rad] below which a pose is reached."""
-EVEN = 1e-12
-"""Share by which the cost may change and count as the same."""
-CAUTION = 1e-3
-"""Damping, as a share of the diagonal, after a step that raised the cost."""
+LEVER = 0.3
+"""Length [m] at which a turn counts as much as a shift."""
+TOLERANCE = 1e-9
+"""A pose is reached when it is missed by less [m, and rad times LEVER]."""
+ITERATIONS = 100
+DAMPING = (1e-12, 1e-6, 1e3)
+"""Least damping, the first one, and that beyond which no step helps [m^2]."""
 DIFFERENCE = 1e-6
 """Step [rad or m] for the derivatives of effects: exact to 1e-9 of them."""
-RIDGE = 1e-8
-"""Root of D [m]; against regular singular values, from 1e-4 up, it does not show."""
-NULL_SPACE_RIDGE = 1e-6
-"""The same for arms with more joints than freedoms, whose J^T J is singular everywhere."""
-FULL_WEIGHT = 0.3
-"""Metres that a radian counts where both can be reached: it serves the conditioning only."""
-POSITION_FIRST = 1e-3
-"""The same for arms that cannot reach every orientation: position is met, then orientation."""
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
-    """Changes of the joints, and the errors with and without them.
+class Inverse:
+    """Joint values for wanted poses, and what is left.
 
     Attributes
     ----------
-    change : (N, n)
-        To be added to the commands [rad or m].
-    held : (N, n) bool
-        Joints that are held at a limit.
-    converged, damped : (N,) bool
-        Damped samples would need more than the largest change: they get a part of it.
-    iterations : int
-        Of the slowest sample.
-    errors, errors_before : (N, 2)
-        Lengths of position [m] and orientation error [rad].
+    joints : (N, n)
+        Joint values [rad or m], within the limits.
+    position, orientation : (N,)
+        Distance [m] and angle [rad] to the wanted pose.
+    converged : (N,)
+        Whether the pose is reached. Others are out of reach, or need another start.
 
     """
 
-    change: FloatArray
-    held: Flags
-    converged: Flags
-    damped: Flags
-    iterations: int
-    errors: FloatArray
-    errors_before: FloatArray
+    joints: FloatArray
+    position: FloatArray
+    orientation: FloatArray
+    converged: NDArray[np.bool_]
 
 
-def mobility(chain: Chain) -> int:
-    """Return how many freedoms of its flange an arm controls, 6 at most."""
-    q = chain.random_joints(10, np.random.default_rng(0))
-    return int(np.linalg.matrix_rank(ErrorModel(chain, _driven(chain)).jacobian(q), 1e-6).max())
-
-
-class Follower:
-    """Joint changes with which the `follower` arm reaches the poses of the `leader`.
-
-    `lower` and `upper` (n,) are the limits of the leader's joints. An arm is `complete` when it
-    can reach every position and orientation nearby.
+def solve(
+    chain: Chain,
+    poses: FloatArray,
+    start: FloatArray,
+    base: str = 'base',
+    tool: str = 'tool',
+) -> Inverse:
+    """Return the joint values near a start that bring the target to wanted poses.
 
     Parameters
     ----------
-    leader, follower : Chain
-        Arms with the same joints. Their base and tool frames are left aside.
-    tool : three floats
-        The point [m] in the flange frame whose position counts.
-    unit : (n,)
-        Largest change of each joint [rad or m].
-    weight : float, optional
-        Metres that a radian counts.
+    chain : Chain
+        The arm, with its frames.
+    poses : (N, 4, 4)
+        Wanted T_world_target.
+    start : (N, n)
+        Joint values [rad or m] to start from.
+    base, tool : str
+        Frames at the ends of the chain.
 
     """
+    aim = Aim(chain, base, tool)
+    lower, upper = (end[:, np.newaxis] for end in limits(chain))
+    turns = np.array([[2.0 * np.pi * (joint.type == 'revolute')] for joint in chain.joints])
+    positions = np.ascontiguousarray(poses[:, :3, 3].T)
+    axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
-    def __init__(
+    def within(q: FloatArray) -> FloatArray:
+        """Bring joint values into the limits, by a full turn where that helps."""
+        q = np.where((q > upper) & (q - turns >= lower), q - turns, q)
+        q = np.where((q < lower) & (q + turns <= upper), q + turns, q)
+        return np.clip(q, lower, upper)
+
+    q = within(np.array(start, dtype=float).T)
+    error, columns = aim.linearise(q, None, positions, axes, LEVER)
+    size = np.linalg.norm(error, axis=0)
+    least, first, most = DAMPING
+    damping = np.full(len(poses), first)
+    diagonal = np.diag_indices(len(q))
+    for _ in range(ITERATIONS):
+        (active,) = np.nonzero((size > TOLERANCE) & (damping < most))
+        if not active.size:
+            break
+        part = columns[:, :, active]
+        normal = np.einsum('ikb,jkb->ijb', part, part)
+        normal[diagonal] += damping[active]
+        slope = np.einsum('ikb,kb->ib', part, error[:, active])
+        tried = within(q[:, active] + solve_positive(normal, slope))
+        new_error, new_columns = aim.linearise(
+            tried, None, positions[:, active], axes[:, :, active], LEVER
+        )
+        new_size = np.linalg.norm(new_error, axis=0)
+        better = new_size < size[active]
+        damping[active] *= np.where(better, 0.1, 10.0)
+        damping = np.maximum(damping, least)
+        moved = active[better]
+        q[:, moved], error[:, moved] = tried[:, better], new_error[:, better]
+        columns[:, :, moved], size[moved] = new_columns[:, :, better], new_size[better]
+    return Inverse(
+        q.T,
+        np.linalg.norm(error[:3], axis=0),
+        np.linalg.norm(error[3:], axis=0) / LEVER,
+        size <= TOLERANCE,
+    )
+
+
+class Aim:
+    """How far the target of an arm is from wanted poses, and what the joints change of it."""
+
+    def __init__(self, chain: Chain, base: str = 'base', tool: str = 'tool') -> None:
+        self._chain = chain
+        self._model = ErrorModel(chain, driven(chain), base, tool)
+        self._signs = np.array([float(joint.sign) for joint in chain.joints])[:, None, None]
+        kinds = [joint.type for joint in chain.joints]
+        self._turning = np.flatnonzero([kind == 'revolute' for kind in kinds])
+
+    def linearise(
         self,
-        leader: Chain,
-        follower: Chain,
-        tool: Sequence[float],
-        unit: FloatArray,
-        weight: float | None,
-    ) -> None:
-        point = Frame(transform(np.eye(3), np.array(tool, dtype=np.float64)))
-        self._leader, self._follower = (
-            replace(chain, base=Frame(), tool=point) for chain in (leader, follower)
-        )
-        self._model = ErrorModel(self._follower, _driven(follower))
-        self._unit = unit[:, np.newaxis]
-        ends = [(joint.lower, joint.upper) for joint in leader.joints]
-        self.lower = np.array([-np.inf if lower is None else lower for lower, _ in ends])
-        self.upper = np.array([np.inf if upper is None else upper for _, upper in ends])
-        freedoms = mobility(leader)
-        self.complete = freedoms == 6
-        self._weight = weight or (FULL_WEIGHT if self.complete else POSITION_FIRST)
-        self._first_weight = FULL_WEIGHT if self.complete else self._weight
-        ridge = NULL_SPACE_RIDGE if len(unit) > freedoms else RIDGE
-        self._ridge = ridge**2 * np.eye(len(unit))[:, :, np.newaxis]
-        self._diagonal = np.diag_indices(len(unit))
-        signs = np.array([float(joint.sign) for joint in follower.joints])
-        self._signs = signs[:, np.newaxis, np.newaxis]
-        self._turning = np.array(
-            [k for k, joint in enumerate(follower.joints) if joint.type == 'revolute'], dtype=int
-        )
-
-    def solve(
-        self, joints: FloatArray, approach: FloatArray | None = None, bounded: bool = True
-    ) -> Solution:
-        """Return the changes for commands (N, n), within the limits of the joints if bounded."""
-        parts = []
-        for start in range(0, len(joints), BLOCK):
-            rows = slice(start, start + BLOCK)
-            came = None if approach is None else np.ascontiguousarray(approach[rows].T)
-            parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ('change', 'held', 'converged', 'damped', 'errors', 'errors_before')
-        }
-        return Solution(iterations=max(part.iterations for part in parts), **joined)
-
-    def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
-        """Solve for commands (n, B).
-
-        A joint that would go beyond a limit is held there, and the others do without it.
-        """
-        axes, origin = self._leader.trace(self._leader.effective(q, approach))
-        shape = (3, q.shape[1])
-        task = _Task(
-            q,
-            approach,
-            np.stack([np.broadcast_to(axis, shape) for axis in axes]),
-            np.broadcast_to(origin, shape),
-            np.zeros(q.shape, dtype=bool),
-            np.zeros_like(q),
-        )
-        before = self._errors(task, task.start)
-        x, errors, converged, damped, iterations = self._attempt(task)
-        lower, upper = (((end - q.T).T / self._unit) for end in (self.lower, self.upper))
-        while bounded:
-            beyond = ~task.held & ((x < lower) | (x > upper))
-            rest = np.flatnonzero(beyond.any(axis=0))
-            if not rest.size:
-                break
-            held = task.held | beyond
-            task = replace(task, held=held, start=np.where(held, np.clip(x, lower, upper), 0.0))
-            x[:, rest], errors[rest], converged[rest], damped[rest], more = self._attempt(
-                task.select(rest)
-            )
-            iterations += more
-        return Solution(
-            (self._unit * x).T,
-            task.held.T,
-            converged,
-            damped,
-            iterations,
-            errors,
-            before,
-        )
-
-    def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags, int]:
-        """Return x (n, B), errors (B, 2), what converged and is damped (B,), and the iterations.
-
-        Where the first attempt fails the weight of the orientation makes the compromise.
-        """
-        x, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
-        errors = self._errors(task, x)
-        damped = np.zeros_like(converged)
-        rest = np.flatnonzero(~converged | (self.complete & (errors > EXACT).any(axis=1)))
-        if rest.size:
-            part = task.select(rest)
-            stiffness, damped[rest] = self._stiffness(part)
-            x[:, rest], converged[rest], more = self._minimise(
-                part, stiffness, self._weight, settle=True
-            )
-            errors[rest] = self._errors(part, x[:, rest])
-            iterations += more
-        return x, errors, converged, damped, iterations
-
-    def _minimise(
-        self, task: _Task, stiffness: FloatArray, weight: float, settle: bool = False
-    ) -> tuple[FloatArray, Flags, int]:
-        """Minimise |e|^2 + x^T D x, the cost.
-
-        A step that raises the cost is not taken, and tried again with more damping (Marquardt
-        1963). Samples settle for a cost that does not fall any more if told so; else they are
-        given up when x is longer than 1.
-
-        Returns
-        -------
-        x, converged, iterations : (n, B), (B,), int
-
-        """
-        found = task.start.copy()
-        converged = np.zeros(found.shape[1], dtype=bool)
-        active = np.arange(found.shape[1])
-        stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], active.size))
-        x, caution, still = task.start, np.zeros(active.size), np.zeros(active.size, dtype=bool)
-        error, columns = self._linearise(task, x, weight)
-        iterations = 0
-        while iterations < ITERATIONS:
-            iterations += 1
-            normal = np.einsum('ikb,jkb->ijb', columns, columns) + stiffness
-            normal[self._diagonal] *= 1.0 + caution
-            slope = np.einsum('ikb,kb->ib', columns, error)
-            slope -= np.einsum('ijb,jb->ib', stiffness, x)
-            step = solve_positive(normal, np.where(task.held | still, 0.0, slope))
-            new = x + step
-            found[:, active] = new
-            settled = still | (np.abs(step).max(axis=0) <= STEP)
-            far = ~(settle | (np.einsum('ib,ib->b', new, new) <= 1.0))
-            converged[active[settled & ~far]] = True
-            going = np.flatnonzero(~settled & ~far)
-            if not going.size:
-                break
-            active, task = active[going], task.select(going)
-            x, new, error, columns, stiffness, caution = (
-                part[..., going] for part in (x, new, error, columns, stiffness, caution)
-            )
-            new_error, new_columns = self._linearise(task, new, weight)
-            cost, new_cost = _cost(error, x, stiffness), _cost(new_error, new, stiffness)
-            taken = new_cost <= cost * (1.0 + EVEN)
-            still = settle & taken & (new_cost >= cost * (1.0 - EVEN))
-            x = np.where(taken, new, x)
-            error = np.where(taken, new_error, error)
-            columns = np.where(taken, new_columns, columns)
-            caution = np.where(taken, 0.1 * caution, np.maximum(10.0 * caution, CAUTION))
-        else:
-            found[:, active] = x
-        return found, converged, iterations
-
-    def _linearise(
-        self, task: _Task, x: FloatArray, weight: float
+        q: FloatArray,
+        approach: FloatArray | None,
+        positions: FloatArray,
+        axes: FloatArray,
+        lever: float,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the weighted error (6, B), and what x changes of the pose (n, 6, B)."""
-        q = task.q + self._unit * x
-        axes, origin, shift, turn = self._model.linearise(q, task.approach)
-        order, turning = self._model.order, self._turning
+        """Return the error (6, B), and what the joints change of the pose (n, 6, B).
+
+        Parameters
+        ----------
+        q : (n, B)
+            Joint values [rad or m].
+        approach : (n, B), optional
+            Signs of the velocities before, for backlash.
+        positions, axes : (3, B), (3, 3, B)
+            Wanted positions [m], and wanted axes; the first index counts them.
+        lever : float
+            Metres that a radian counts.
+
+        """
+        model, turning = self._model, self._turning
+        found, origin, shift, turn = model.linearise(q, approach)
         columns = np.zeros((len(q), 6, q.shape[1]))
-        columns[:, :3] = self._signs * shift[order]
-        columns[turning, 3:] = weight * self._signs[turning] * turn[order[turning]]
-        if self._follower.effects:
-            columns = np.einsum('jib,jkb->ikb', self._effects_slope(q, task.approach), columns)
-        columns *= self._unit[:, np.newaxis] * ~task.held[:, np.newaxis]
-        turned = orientation_error(task.axes, axes)
-        return np.concatenate([task.origin - origin, weight * turned]), columns
+        columns[:, :3] = self._signs * shift[model.order]
+        columns[turning, 3:] = lever * self._signs[turning] * turn[model.order[turning]]
+        if self._chain.effects:
+            columns = np.einsum('jib,jkb->ikb', self._effects_slope(q, approach), columns)
+        turned = lever * orientation_error(axes, found)
+        return np.concatenate([positions - origin, turned]), columns
 
     def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
         """Return the derivative (n, n, B) of the effective joint values by those reported."""
-        here = self._follower.effective(q, approach)
+        here = self._chain.effective(q, approach)
         slope = np.empty((len(q), *q.shape))
         for k in range(len(q)):
             moved = q.copy()
             moved[k] += DIFFERENCE
-            slope[:, k] = (self._follower.effective(moved, approach) - here) / DIFFERENCE
+            slope[:, k] = (self._chain.effective(moved, approach) - here) / DIFFERENCE
         return slope
 
-    def _stiffness(self, task: _Task) -> tuple[FloatArray, Flags]:
-        """Return D (n, n, B) against too large changes, and which samples (B,) it damps."""
-        error, columns = self._linearise(task, task.start, self._weight)
-        left, values, right = np.linalg.svd(columns.transpose(2, 1, 0), full_matrices=False)
-        share = np.einsum('bik,ib->bk', left, error)
-        added = np.maximum(share**2 - values**2, 0.0)
-        stiffness = np.einsum('bki,bk,bkj->ijb', right, added, right)
-        return stiffness + self._ridge, (added > 0.0).any(axis=1)
 
-    def _errors(self, task: _Task, x: FloatArray) -> FloatArray:
-        """Return the lengths (B, 2) of position [m] and orientation error [rad]."""
-        q = task.q + self._unit * x
-        axes, origin = self._follower.trace(self._follower.effective(q, task.approach))
-        errors = np.stack([task.origin - origin, orientation_error(task.axes, axes)])
-        return np.asarray(np.sqrt(np.einsum('kib,kib->bk', errors, errors)))
+def driven(chain: Chain) -> list[str]:
+    """Return the parameter that each joint drives."""
+    kinds = {'revolute': 'theta', 'prismatic': 'd'}
+    return [f'{joint.name}.{kinds[joint.type]}' for joint in chain.joints]
+
+
+def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
+    """Return the lower and the upper limits (n,) of the joints [rad or m], infinite if none."""
+    ends = [(joint.lower, joint.upper) for joint in chain.joints]
+    return (
+        np.array([-np.inf if lower is None else lower for lower, _ in ends]),
+        np.array([np.inf if upper is None else upper for _, upper in ends]),
+    )
 
 
 def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -315,41 +201,3 @@ def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
         x[k] -= np.einsum('jb,jb->b', rows[k, k + 1 :], x[k + 1 :])
         x[k] /= rows[k, k]
     return x
-
-
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """Samples to solve: commands (n, B), wanted axes (3, 3, B) and origins (3, B).
-
-    Joints that are `held` (n, B) keep the x that they have at the `start` (n, B).
-    """
-
-    q: FloatArray
-    approach: FloatArray | None
-    axes: FloatArray
-    origin: FloatArray
-    held: Flags
-    start: FloatArray
-
-    def select(self, index: NDArray[np.intp]) -> _Task:
-        """Return some of the samples."""
-        return _Task(
-            self.q[:, index],
-            None if self.approach is None else self.approach[:, index],
-            self.axes[..., index],
-            self.origin[:, index],
-            self.held[:, index],
-            self.start[:, index],
-        )
-
-
-def _cost(error: FloatArray, x: FloatArray, stiffness: FloatArray) -> FloatArray:
-    """Return |e|^2 + x^T D x (B,)."""
-    pull = np.einsum('ijb,jb->ib', stiffness, x)
-    return np.asarray(np.einsum('kb,kb->b', error, error) + np.einsum('ib,ib->b', x, pull))
-
-
-def _driven(chain: Chain) -> list[str]:
-    """Return the parameter that each joint drives."""
-    kinds = {'revolute': 'theta', 'prismatic': 'd'}
-    return [f'{joint.name}.{kinds[joint.type]}' for joint in chain.joints]

@@ -154,6 +154,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'noise_in_sigma': asdict(result.noise),
         'outliers': [asdict(outlier) for outlier in result.outliers],
         'gauges': result.gauges,
+        'covariance': {'names': list(result.names), 'matrix': result.covariance.tolist()},
         'correlated': [list(pair) for pair in result.correlated()],
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),

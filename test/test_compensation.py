@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from calib_ros import effects, inverse, se3
+from calib_ros import effects, following, se3
 from calib_ros.chain import Chain, Frame, Joint
 from calib_ros.cli import NOT_ACCEPTED, main
 from calib_ros.compensation import (
@@ -23,8 +23,9 @@ from calib_ros.compensation import (
 )
 from calib_ros.config import dump_chain, load_chain, shipped_robots
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.following import POSITION_FIRST, mobility
 from calib_ros.identification import Problem, identify
-from calib_ros.inverse import POSITION_FIRST, mobility, solve_positive
+from calib_ros.inverse import solve_positive
 from calib_ros.programs import read_program
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
@@ -409,7 +410,7 @@ def test_what_is_reached_near_a_singularity_is_never_worse_than_nothing(name):
 
 
 def test_a_sample_that_does_not_converge_is_refused(monkeypatch):
-    monkeypatch.setattr(inverse, 'ITERATIONS', 1)
+    monkeypatch.setattr(following, 'ITERATIONS', 1)
     tolerant = Compensator(UR, UR_TRUE, largest_position_error=1.0, largest_orientation_error=1.0)
     result = compensate(tolerant, regular(UR, 3))
     assert not result.converged.any()
