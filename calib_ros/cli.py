@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | plan | workspace | compensate | export | ...`.
+"""The command line: `calib_ros plan | identify | workspace | compensate | verify | ...`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
-result is not accepted, or a program has samples that cannot be compensated.
+result is not accepted, a program has samples that cannot be compensated, or a corrected arm does
+not pass.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
-from calib_ros.commands import (
+from calib_ros.commands import add_commands
+from calib_ros.errors import CalibrationError, InputError
+from calib_ros.options import (
     NOT_ACCEPTED,
     add_chain,
-    add_commands,
     add_settings,
     refuse_overwriting,
     settings_of,
 )
-from calib_ros.errors import CalibrationError, InputError
 
 if TYPE_CHECKING:
     from calib_ros.chain import Chain

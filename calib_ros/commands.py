@@ -1,25 +1,33 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands before and after an identification: `plan | workspace | compensate`.
+"""The commands before and after an identification: `plan | workspace | compensate |
+verify`.
 
-They are added to those of `cli.py`, which holds what exit status means.
+They are added to those of `cli.py`, which says what the exit status means.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from calib_ros.errors import InputError
+from calib_ros.options import (
+    NOT_ACCEPTED,
+    add_chain,
+    add_settings,
+    refuse_overwriting,
+    settings_of,
+)
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from calib_ros.config import Settings
+    from calib_ros.candidates import Visibility
+    from calib_ros.design import Design
     from calib_ros.se3 import FloatArray
     from calib_ros.workspace import CalibratedArm
 
@@ -29,58 +37,7 @@ TASK_POSES = 300
 """Random poses at which a plan is to be accurate when no task is given."""
 BOX_POSES = 30
 """Random poses that stand for a task given as a box of joint values."""
-NOT_ACCEPTED = 3
-"""Exit status when the input was used, but what came out does not do."""
-
 Command: TypeAlias = Callable[[str, Callable[[Any], int], str], argparse.ArgumentParser]
-
-
-def add_chain(parser: argparse.ArgumentParser) -> None:
-    """Add the option that names the nominal robot."""
-    parser.add_argument(
-        '--chain', required=True, help='chain file, URDF, or a robot by its name (ur10e, ...)'
-    )
-
-
-def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
-    """Add options for the settings of some names, or for all."""
-    from calib_ros.config import Settings
-
-    for item in fields(Settings):
-        if names and item.name not in names:
-            continue
-        many = isinstance(item.default, tuple)
-        parser.add_argument(
-            f'--{item.name.replace("_", "-")}',
-            type=str if many else type(item.default),
-            action='append' if many else 'store',
-            default=[] if many else item.default,
-            help=item.metadata['text'],
-        )
-
-
-def settings_of(options: argparse.Namespace) -> Settings:
-    """Return the settings that are among the options, the others by default."""
-    from calib_ros.config import Settings
-
-    given: dict[str, Any] = {
-        f.name: getattr(options, f.name) for f in fields(Settings) if hasattr(options, f.name)
-    }
-    for name, value in given.items():
-        if isinstance(value, list):
-            given[name] = tuple(part for text in value for part in text.split(','))
-    return Settings(**given)
-
-
-def refuse_overwriting(options: argparse.Namespace, names: Iterable[str]) -> None:
-    """Refuse before any work is done, when files of these names are in the way."""
-    if options.out is None or options.force:
-        return
-    there = [name for name in names if (options.out / name).exists()]
-    if there:
-        raise InputError(
-            f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
-        )
 
 
 def add_commands(command: Command) -> None:
@@ -95,6 +52,9 @@ def add_commands(command: Command) -> None:
             'map errors over the workspace, and place a task where they are least',
         )
     )
+    _add_verify(
+        command('verify', _verify, 'judge a corrected arm on new measurements: PASS or FAIL')
+    )
     _add_compensate(
         command(
             'compensate', _compensate, 'correct the joint values of a program by a calibration'
@@ -108,6 +68,7 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
     add_chain(parser)
     add = parser.add_argument
     add('--poses', type=int, metavar='N', help='how many; 25, or what --accuracy needs')
+    add('--iso9283', action='store_true', help='the five test poses of ISO 9283 instead')
     add('--accuracy', type=float, metavar='MM', help='wanted RMS position error at the task poses')
     add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
     add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
@@ -146,6 +107,22 @@ def _add_workspace(parser: argparse.ArgumentParser) -> None:
     add('--turns', type=int, default=1, help='turns of the task about the vertical to try')
     add('--seed', type=int, default=0, help='of the random numbers')
     add('--force', action='store_true', help='overwrite files in --out')
+
+
+def _add_verify(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('measured', type=Path, help='table of new measurements: q1..qn as reported, x y z ...')
+    add_chain(parser)
+    add(
+        '--calibration',
+        type=Path,
+        required=True,
+        help='folder of identify --out, or calibration.yaml alone',
+    )
+    add('--tolerance', type=float, required=True, metavar='MM', help='wanted RMS position error')
+    add('--confidence', type=float, default=0.95, help='of the verdict')
+    add('--session', help='session of the table')
+    add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
 
 
 def _add_compensate(parser: argparse.ArgumentParser) -> None:
@@ -191,20 +168,19 @@ def _add_compensate(parser: argparse.ArgumentParser) -> None:
 def _plan(options: argparse.Namespace) -> int:
     import numpy as np
 
-    from calib_ros import planning
-    from calib_ros.candidates import Visibility, draw_candidates
+    from calib_ros.candidates import Visibility
     from calib_ros.config import load_chain
     from calib_ros.design import ASSUMED_TOOL, Design
     from calib_ros.files import write_file
     from calib_ros.problem import Problem
     from calib_ros.simulation import measure
-    from calib_ros.waypoints import joints_csv, read_joints
+    from calib_ros.waypoints import joints_csv
 
     _check_plan(options)
     chain = load_chain(options.chain)
-    size = len(chain.joints)
     rng = np.random.default_rng(options.seed)
-    imagined = measure(chain, np.zeros((1, size)), rng, oriented=options.measured == 'pose')
+    nowhere = np.zeros((1, len(chain.joints)))
+    imagined = measure(chain, nowhere, rng, oriented=options.measured == 'pose')
     design = Design.of(Problem(chain, imagined, **settings_of(options).for_problem()))
     visibility = Visibility(
         None if options.box is None else np.reshape(options.box, (2, 3)),
@@ -213,9 +189,34 @@ def _plan(options: argparse.Namespace) -> int:
         np.radians(options.cone),
         options.world,
     )
+    planned = _plan_tests if options.iso9283 else _plan_measurement
+    joints, words = planned(options, design, visibility, rng)
+    print(words)
+    if chain.tool is None:
+        x, y, z = ASSUMED_TOOL
+        print(f'the tool is unknown: its target is taken to be at {x} {y} {z} m from the flange')
+    if options.out is not None:
+        write_file(options.out, joints_csv(joints), overwrite=options.force)
+        print(f'wrote {options.out}')
+    return 0
+
+
+def _plan_measurement(
+    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+) -> tuple[FloatArray, str]:
+    """Return the poses to measure in the order of visit, and what they promise."""
+    import numpy as np
+
+    from calib_ros import planning
+    from calib_ros.candidates import draw_candidates
+    from calib_ros.waypoints import read_joints
+
+    size = len(design.chain.joints)
+    if len(options.velocity) not in (1, size):
+        raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
         design = design.after(read_joints(options.taken, size))
-    task = chain.random_joints(TASK_POSES, rng)
+    task = design.chain.random_joints(TASK_POSES, rng)
     if options.task is not None:
         task = read_joints(options.task, size)
     if options.candidates is None:
@@ -230,19 +231,24 @@ def _plan(options: argparse.Namespace) -> int:
     if options.accuracy is not None:
         wanted = 1e-3 * options.accuracy
         needed = planning.poses_needed(design, candidates, task, wanted, **choice)
-    if len(options.velocity) not in (1, size):
-        raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
-    velocities = np.broadcast_to(options.velocity, size)
     count = options.poses or needed or 25
-    plan = planning.plan(design, candidates, task, count, **choice, velocities=velocities)
-    print(planning.in_words(plan, len(candidates), options.accuracy, needed))
-    if chain.tool is None:
-        x, y, z = ASSUMED_TOOL
-        print(f'the tool is unknown: its target is taken to be at {x} {y} {z} m from the flange')
-    if options.out is not None:
-        write_file(options.out, joints_csv(plan.joints[plan.visit]), overwrite=options.force)
-        print(f'wrote {options.out}')
-    return 0
+    speeds = np.broadcast_to(options.velocity, size)
+    plan = planning.plan(design, candidates, task, count, **choice, velocities=speeds)
+    words = planning.in_words(plan, len(candidates), options.accuracy, needed)
+    return plan.joints[plan.visit], words
+
+
+def _plan_tests(
+    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+) -> tuple[FloatArray, str]:
+    """Return the test poses of ISO 9283, and what to do with them."""
+    from calib_ros.testposes import iso_9283_poses
+
+    found = iso_9283_poses(design, rng, visibility)
+    return found.joints, (
+        f'P1 to P5 of ISO 9283 in a cube of {found.edge:.3f} m, one orientation: go to them in '
+        'turn, 30 times, and measure. Collisions are not looked at'
+    )
 
 
 def _check_plan(options: argparse.Namespace) -> None:
@@ -322,6 +328,29 @@ def _task(
     lower, upper = np.reshape(options.joint_box, (2, size))
     joints = rng.uniform(lower, upper, (BOX_POSES, size))
     return task_of(in_base(arm.commanded_by(options.model), joints))
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from calib_ros.config import load_chain
+    from calib_ros.tables import read_table
+    from calib_ros.verification import in_words, verify
+    from calib_ros.workspace import CalibratedArm
+
+    nominal = load_chain(options.chain)
+    arm = CalibratedArm.read(options.calibration, nominal)
+    sessions = tuple(options.session.split(',')) if options.session else ()
+    table = read_table(options.measured, len(nominal.joints), sessions)
+    found = verify(
+        arm,
+        (*table.fitted, *table.held_out),
+        1e-3 * options.tolerance,
+        options.confidence,
+        options.new_base,
+    )
+    for warning in table.warnings:
+        print(f'warning: {warning}', file=sys.stderr)
+    print(in_words(found))
+    return 0 if found.verdict == 'PASS' else NOT_ACCEPTED
 
 
 def _compensate(options: argparse.Namespace) -> int:

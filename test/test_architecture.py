@@ -37,10 +37,11 @@ ORDER = [
     {'live', 'validation'},
     {'identification'},
     {'design', 'salvage', 'selection', 'workspace'},
-    {'candidates', 'placement'},
-    {'planning', 'plots', 'session'},
+    {'candidates', 'placement', 'verification'},
+    {'planning', 'plots', 'session', 'testposes'},
     {'replay', 'report'},
-    {'commands', 'deferred', 'outgoing'},
+    {'deferred', 'options', 'outgoing'},
+    {'commands'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from calib_ros import effects, following, se3
 from calib_ros.chain import Chain, Frame, Joint
-from calib_ros.cli import NOT_ACCEPTED, main
+from calib_ros.cli import main
 from calib_ros.compensation import (
     Compensator,
     Program,
@@ -26,6 +26,7 @@ from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.following import POSITION_FIRST, mobility
 from calib_ros.identification import Problem, identify
 from calib_ros.inverse import solve_positive
+from calib_ros.options import NOT_ACCEPTED
 from calib_ros.programs import read_program
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
