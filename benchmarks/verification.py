@@ -109,7 +109,7 @@ def main():
     parser.add_argument('--quick', action='store_true', help='fewer draws')
     parser.add_argument('--json', action='store_true')
     options = parser.parse_args()
-    table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 100)}
+    table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 200)}
     for name, session in SETS:
         if DATA.is_dir():
             table[f'{name}/{session}'] = measured(name, session, 100 if options.quick else 2000)

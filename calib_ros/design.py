@@ -21,6 +21,7 @@ from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError
 from calib_ros.identifiability import independent, structurally_independent
 from calib_ros.identification import Identification
+from calib_ros.live import Estimate
 from calib_ros.problem import Problem
 from calib_ros.se3 import FloatArray
 
@@ -59,12 +60,13 @@ class Design:
     tool: str = 'tool'
 
     @classmethod
-    def of(cls, problem: Problem, result: Identification | None = None) -> Design:
+    def of(cls, problem: Problem, result: Identification | Estimate | None = None) -> Design:
         """Return the design of a problem: nothing but the priors is known yet.
 
-        With the result of an identification that is known as well, and poses to come have the
-        noise that it found. Measured values do not count otherwise: `simulation.measure` can make
-        the observations of a problem before anything is measured.
+        With the result of an identification, or an estimate while samples come, that is known as
+        well, and poses to come have the noise that it found. Measured values do not count
+        otherwise: `simulation.measure` can make the observations of a problem before anything is
+        measured.
 
         Raises
         ------
@@ -86,10 +88,12 @@ class Design:
         else:
             model = result.chain
             names = (*result.names, *(name for name in names if name not in result.names))
-            known = np.zeros((result.rank, len(names)))
-            known[:, : result.rank] = _root_of_inverse(result.covariance)
+            known = np.zeros((len(result.names), len(names)))
+            known[:, : len(result.names)] = _root_of_inverse(result.covariance)
             noise = result.noise
-            if not noise.consistent:
+            if isinstance(noise, float):
+                scales = (noise, noise)
+            elif not noise.consistent:
                 scales = (noise.position, noise.orientation or noise.position)
         return cls(
             chain=model,

@@ -10,15 +10,19 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib_ros.compensation import Program
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
+
+RATES = ('positions', 'velocities', 'accelerations')
+"""What a point of a JointTrajectory holds that a correction changes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,37 +124,17 @@ def _read_yaml(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
         raise InputError(
             f'{where} must be a trajectory_msgs/JointTrajectory with joint_names and points'
         )
-    places = tuple(f'point {k + 1}' for k in range(len(points)))
-    for point, place in zip(points, places, strict=True):
+    for k, point in enumerate(points):
         if not isinstance(point, dict):
             raise InputError(
-                f'{where}, {place} must be a mapping, not {point!r}; a message that was cut short '
-                'is printed as a whole by ros2 topic echo --full-length'
+                f'{where}, point {k + 1} must be a mapping, not {point!r}; a message that was cut '
+                'short is printed as a whole by ros2 topic echo --full-length'
             )
-
-    def values(key: str) -> FloatArray | None:
-        given = [point.get(key) or [] for point in points]
-        if not any(given):
-            return None
-        return np.array(
-            [
-                _row(row, len(names), f'{where}, {place}: {key}')
-                for row, place in zip(given, places, strict=True)
-            ]
-        )
-
-    positions = values('positions')
-    if positions is None:
-        raise InputError(f'{where} has no positions')
-    program = Program(
-        tuple(map(str, names)), positions, values('velocities'), values('accelerations')
-    )
+    program = trajectory_program(names, points, where)
 
     def text_with(corrected: Program) -> str:
         arrays = {
-            key: array.tolist()
-            for key in ('positions', 'velocities', 'accelerations')
-            if (array := getattr(corrected, key)) is not None
+            key: array.tolist() for key in RATES if (array := getattr(corrected, key)) is not None
         }
         new = [
             point | {key: rows[k] for key, rows in arrays.items()}
@@ -167,7 +151,40 @@ def _read_yaml(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
             )
         )
 
-    return ProgramFile(program, places, text_with)
+    return ProgramFile(program, tuple(f'point {k + 1}' for k in range(len(points))), text_with)
+
+
+def trajectory_program(
+    names: Sequence[object], points: Sequence[Mapping[str, Any]], where: str
+) -> Program:
+    """Return the program of a JointTrajectory: joint names, and points with lists of numbers.
+
+    Velocities and accelerations are those of all points or of none.
+
+    Raises
+    ------
+    InputError
+        For lists that do not fit the names, and values that are no numbers; `where` names it.
+
+    """
+
+    def values(key: str) -> FloatArray | None:
+        given = [point.get(key) or [] for point in points]
+        if not any(given):
+            return None
+        return np.array(
+            [
+                _row(row, len(names), f'{where}, point {k + 1}: {key}')
+                for k, row in enumerate(given)
+            ]
+        )
+
+    positions = values('positions')
+    if positions is None:
+        raise InputError(f'{where} has no positions')
+    return Program(
+        tuple(map(str, names)), positions, values('velocities'), values('accelerations')
+    )
 
 
 def _row(value: object, count: int, where: str) -> list[float]:

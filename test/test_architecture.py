@@ -41,15 +41,16 @@ ORDER = [
     {'planning', 'plots', 'session', 'testposes'},
     {'replay', 'report'},
     {'deferred', 'options', 'outgoing'},
-    {'commands'},
+    {'commands', 'guide'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'outgoing'}
+ROS = {'node', 'deferred', 'guide', 'outgoing'}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,
     'geometry_msgs': ROS,
+    'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
     'yaml': {'config', 'export', 'programs'},

@@ -21,8 +21,11 @@ from calib_ros.differential import ErrorModel
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identifiability import observability
 from calib_ros.identification import Problem, identify
+from calib_ros.live import LOOK, LiveEstimate
 from calib_ros.planning import choose
+from calib_ros.samples import Sample
 from calib_ros.se3 import invert, transform
+from calib_ros.session import CalibrationSession
 from calib_ros.tables import read_table
 from calib_ros.waypoints import joints_csv, read_joints
 
@@ -111,6 +114,27 @@ def test_predicted_errors_are_those_of_the_identification(oriented):
     assert predicted(known.after(more), task) == pytest.approx(
         np.sqrt(np.trace(spread, axis1=1, axis2=2).mean()), rel=0.02
     )
+
+
+def test_what_the_live_estimate_knows_is_known():
+    """The sigma that it predicts, before and after further poses."""
+    chain = arm()
+    rng = np.random.default_rng(4)
+    true = simulation.faulty(chain, simulation.Cell(), rng)
+    seen = simulation.measure(true, some(chain, 60), rng, *SIGMAS)
+    samples = [
+        Sample(int(stamp), joints, position=position, rotation=rotation)
+        for stamp, joints, position, rotation in zip(
+            seen.stamps_ns, seen.joints, seen.positions, seen.rotations, strict=True
+        )
+    ]
+    session = CalibrationSession(chain)
+    first, both = (LiveEstimate(session.problem_of).update(samples[:n]) for n in (30, 60))
+    design = Design.of(session.problem_of(samples[:30]), first)
+    look = first.chain.random_joints(LOOK, np.random.default_rng(0))
+    assert predicted(design, look) == pytest.approx(first.sigma, rel=1e-3)
+    same_noise = both.sigma * first.noise / both.noise
+    assert predicted(design.after(seen.joints[30:]), look) == pytest.approx(same_noise, rel=0.03)
 
 
 def test_poses_to_come_have_the_noise_that_was_found():
