@@ -87,12 +87,13 @@ def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
     cell.play({k: v[len(part(recording, 3)[k]) :] for k, v in rest.items()})
     cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'True')
     assert float(values_of(diagnostics[-1])['expected [mm]']) < 0.1
-    last = [list(message.position) for message in early][-1]
+    cell.spin_until(lambda: len({tuple(message.position) for message in early}) > 1)
     late = cell.listen(JointState, f'{NODE}/next_pose')
     cell.spin_until(lambda: late)
     limits = np.array([[joint.lower, joint.upper] for joint in UR.joints])
-    assert ((limits[:, 0] <= last) & (last <= limits[:, 1])).all()
-    assert len({tuple(message.position) for message in early}) > 1
+    for message in (*early, *late):
+        assert (limits[:, 0] <= message.position).all()
+        assert (message.position <= limits[:, 1]).all()
 
 
 def test_the_next_pose_is_one_of_the_candidates_that_was_not_taken(tmp_path, recording):
