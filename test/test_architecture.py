@@ -34,7 +34,7 @@ ORDER = [
     {'compensation', 'robust', 'waypoints'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
-    {'live', 'validation'},
+    {'chance', 'live', 'validation'},
     {'identification'},
     {'design', 'salvage', 'selection', 'workspace'},
     {'candidates', 'placement', 'verification'},
