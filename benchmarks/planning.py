@@ -14,6 +14,10 @@ poses. `bound` is the least that any 25 of the candidates could predict for the 
 the tangent at the plan. Ranges: all within the limits; facing the tracker, which stands 3 m in
 front of the arm, within 30 degrees; and 0.6 rad about one posture.
 
+Placement: a circle of 0.3 m, tool down, placed where a simulated UR10e is expected to miss least, against the centre of all places that it reaches: expected and true error, of the arm
+that its nominal model commands (one arm) and that its identified one does (the RMS over draws of
+the measured noise, at the places that the first draw chose).
+
 Measured robots: half of the fitted rows, and 30 of them, chosen by `d` without their measured
 values, against random ones and all; RMS on held-out rows. `sigma` is the spread of held-out
 residuals over their predicted standard deviation with the noise that the fit found, which holds
@@ -39,8 +43,11 @@ from calib_ros.chain import Frame
 from calib_ros.config import load_chain
 from calib_ros.design import Candidates, Design, accuracy, predicted
 from calib_ros.identification import Problem, identify
+from calib_ros.placement import place
 from calib_ros.planning import choose
+from calib_ros.se3 import transform
 from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.workspace import CalibratedArm
 
 POSTURE = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
 SIGMAS = (1e-4, 1e-4 / 0.3)
@@ -79,11 +86,11 @@ def naive(design, candidates, count):
     changed = True
     while changed:
         changed = False
-        for place in range(count):
-            others = chosen[:place] + chosen[place + 1 :]
+        for k in range(count):
+            others = chosen[:k] + chosen[k + 1 :]
             new = best(others, [k for k in range(len(rows)) if k not in others])
-            changed |= new != chosen[place]
-            chosen[place] = new
+            changed |= new != chosen[k]
+            chosen[k] = new
     return chosen
 
 
@@ -173,6 +180,36 @@ def simulated(arm, oriented, draws):
     return found
 
 
+def placement(draws):
+    """Return expected and true errors [mm] of a task at the best place and at the centre."""
+    nominal, rng = load_chain('ur10e'), np.random.default_rng(0)
+    true = faulty(nominal, Cell(), rng)
+    joints = nominal.random_joints(40, rng)
+    results = [
+        identify(Problem(nominal, measure(true, joints, np.random.default_rng(seed), *SIGMAS)))
+        for seed in range(draws)
+    ]
+    arm = CalibratedArm.of(results[0])
+    angle = 2.0 * np.pi * np.arange(12) / 12
+    circle = np.column_stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros(12)])
+    task = transform(np.tile(np.diag([1.0, -1.0, -1.0]), (12, 1, 1)), circle)
+    found = place(arm, task, 'mean', 'nominal')
+    row = {}
+    for label, which in (('best', found.best), ('centre', found.centre)):
+        there = found.joints[which]
+        missed = (true.forward(there) - arm.before.forward(there))[:, :3, 3]
+        row[f'{label}_mm'] = 1e3 * float(found.errors[which])
+        row[f'{label}_true_mm'] = 1e3 * float(np.linalg.norm(missed, axis=1).mean())
+    rows = {'nominal model': row}
+    found, row = place(arm, task, 'mean', 'corrected'), {}
+    for label, which in (('best', found.best), ('centre', found.centre)):
+        there = found.joints[which]
+        left = [(r.chain.forward(there) - true.forward(there))[:, :3, 3] for r in results]
+        row[f'{label}_mm'] = 1e3 * float(np.sqrt(np.mean(arm.sigma(there) ** 2)))
+        row[f'{label}_true_mm'] = 1e3 * float(np.sqrt((np.array(left) ** 2).sum(axis=2).mean()))
+    return rows | {'identified model': row}
+
+
 def spread(problem, result, sigma_position):
     """Return the standard deviation of held-out position residuals over predicted sigma."""
     left = result.validation.after.position[result.validation.judged]
@@ -230,6 +267,7 @@ def main():
         for kind, oriented in (('pose', True), ('position', False)):
             rows = simulated(arm, oriented, 20 if options.quick else 200)
             found['simulated'] |= {f'{arm}, {kind}, {label}': row for label, row in rows.items()}
+    found['placement'] = placement(10 if options.quick else 100)
     for (name, session), tracker in SETS.items():
         if DATA.is_dir() and not (options.quick and session == 'A'):
             found['measured'][f'{name}/{session}'] = measured(
@@ -243,7 +281,7 @@ def main():
     print(f'{clock["ratio"]:.0f} x faster than naive; same choice: {clock["same_choice"]}')
     if not DATA.is_dir():
         print(f'no measured robots at {DATA}; set CALIB_ROS_DATA')
-    for table in ('simulated', 'measured'):
+    for table in ('simulated', 'placement', 'measured'):
         columns = dict.fromkeys(key for row in found[table].values() for key in row)
         print('\n' + f'{table:42}' + ' '.join(f'{column:>17}' for column in columns))
         for label, row in found[table].items():

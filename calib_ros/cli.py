@@ -106,6 +106,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument('calibration', type=Path, help='calibration.yaml of an identification')
     add_chain(export)
+    export.add_argument(
+        '--measured',
+        type=Path,
+        help='table with q1 ... qn where tables that cannot be exact are to be best; if not '
+        'given, the whole joint range',
+    )
     export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
     export.add_argument('--base-link', help='of the URDF: where the arm starts')
     export.add_argument('--tip-link', help='of the URDF: where the arm ends')
@@ -249,13 +255,18 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from calib_ros.config import load_chain, read_text
+    from calib_ros.config import calibration_record, load_chain, read_text
     from calib_ros.export import Export, exports
     from calib_ros.files import write_file
     from calib_ros.urdf import corrected_urdf
+    from calib_ros.waypoints import read_joints
 
     chain = load_chain(options.calibration)
-    found = exports(chain, load_chain(options.chain))
+    measured = None
+    if options.measured is not None:
+        measured = read_joints(options.measured, len(chain.joints))
+    origin = calibration_record(read_text(options.calibration))
+    found = exports(chain, load_chain(options.chain), measured, origin)
     if options.urdf is not None:
         links = (options.base_link, options.tip_link)
         text = corrected_urdf(read_text(options.urdf), chain, *links)
