@@ -14,9 +14,10 @@ poses. `bound` is the least that any 25 of the candidates could predict for the 
 the tangent at the plan. Ranges: all within the limits; facing the tracker, which stands 3 m in
 front of the arm, within 30 degrees; and 0.6 rad about one posture.
 
-Placement: a circle of 0.3 m, tool down, placed where a simulated UR10e is expected to miss least, against the centre of all places that it reaches: expected and true error, of the arm
-that its nominal model commands (one arm) and that its identified one does (the RMS over draws of
-the measured noise, at the places that the first draw chose).
+Placement: a circle of 0.3 m, tool down, placed where a simulated UR10e is expected to miss least,
+against the centre of all places that it reaches: expected and true error, of the arm that its
+nominal model commands (one arm; mean over the circle) and that its identified one does (RMS over
+draws of the measured noise, at the places that the first draw chose).
 
 Measured robots: half of the fitted rows, and 30 of them, chosen by `d` without their measured
 values, against random ones and all; RMS on held-out rows. `sigma` is the spread of held-out
