@@ -120,6 +120,12 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
         help='folder of identify --out, or calibration.yaml alone',
     )
     add('--tolerance', type=float, required=True, metavar='MM', help='wanted RMS position error')
+    add(
+        '--commanded',
+        type=Path,
+        metavar='FILE',
+        help='the program before its correction, q1..qn: judge against the poses that it means',
+    )
     add('--confidence', type=float, default=0.95, help='of the verdict')
     add('--session', help='session of the table')
     add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
@@ -334,18 +340,23 @@ def _verify(options: argparse.Namespace) -> int:
     from calib_ros.config import load_chain
     from calib_ros.tables import read_table
     from calib_ros.verification import in_words, verify
+    from calib_ros.waypoints import read_joints
     from calib_ros.workspace import CalibratedArm
 
     nominal = load_chain(options.chain)
     arm = CalibratedArm.read(options.calibration, nominal)
     sessions = tuple(options.session.split(',')) if options.session else ()
     table = read_table(options.measured, len(nominal.joints), sessions)
+    commanded = None
+    if options.commanded is not None:
+        commanded = read_joints(options.commanded, len(nominal.joints))
     found = verify(
         arm,
         (*table.fitted, *table.held_out),
         1e-3 * options.tolerance,
         options.confidence,
         options.new_base,
+        commanded,
     )
     for warning in table.warnings:
         print(f'warning: {warning}', file=sys.stderr)

@@ -109,11 +109,11 @@ class Guide:
 
     def advise(self) -> None:
         """Look for the next pose if there are samples that it was not looked for with."""
-        samples = tuple(self._session.samples)
         busy = self._advising is not None and not self._advising.done()
-        fitted = [sample for sample in samples if not sample.validation]
-        moving = self._session.settings.mode == 'continuous'
-        if busy or moving or not fitted or samples == self._advised:
+        if busy or self._session.settings.mode == 'continuous':
+            return
+        samples = tuple(self._session.samples)
+        if samples == self._advised or all(sample.validation for sample in samples):
             return
         self._advised = samples
         problem = self._session.problem_of(samples)

@@ -4,7 +4,9 @@
 
 A controller that is corrected by a calibration C stands at joint values q where C means the pose
 that was wanted, so that it misses by measured - C(q); an uncorrected one would miss by
-measured - N(q). Both are known from the joint values that the controller reports.
+measured - N(q). Both are known from the joint values that the controller reports. Where the
+program is known as it was before its correction, the pose wanted is N(q_commanded), and a
+correction that did not arrive shows as well.
 
 The figure is the RMS position error over poses like those measured. Of K configurations with
 errors e_k the sum of squares is taken for theta / nu chi2(nu) (Satterthwaite 1946) with
@@ -45,6 +47,8 @@ MOST = 10_000
 """Configurations up to which it is said how many would decide."""
 BASE_SHARE = 2
 """Configurations whose errors a new base frame takes up: it has six freedoms, each has three."""
+FAR = 0.1
+"""Distance [rad or m] from commanded joint values that no correction makes."""
 MOST_LINES = 20
 """Configurations up to which each has a line in the report."""
 MOVED = 0.3
@@ -97,6 +101,7 @@ def verify(
     tolerance: float,
     confidence: float = 0.95,
     new_base: bool = False,
+    commanded: FloatArray | None = None,
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
@@ -113,12 +118,15 @@ def verify(
     new_base : bool
         The measuring device stands elsewhere than for the calibration: its frame is fitted, which
         costs the freedom of two configurations.
+    commanded : (M, n), optional
+        Joint values [rad or m] of the program before its correction: the nominal arm means there
+        what is wanted. The nearest belongs to a measurement.
 
     Raises
     ------
     InputError
-        For too few configurations, distances, or a device or target that the calibration does
-        not know.
+        For too few configurations, distances, a device or target that the calibration does not
+        know, or measurements far from all that was commanded.
 
     """
     if not tolerance > 0.0 or not 0.5 < confidence < 1.0:
@@ -129,9 +137,13 @@ def verify(
     for each in sets:
         _check(arm.after, each)
     before, after = arm.before, arm.after
+    wanted = sets
+    if commanded is not None:
+        after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
+        wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
     if new_base:
-        before, after = _rebased(before, sets), _rebased(after, sets)
-    comparison = compare(before, after, sets)
+        before, after = _rebased(before, sets), _rebased(after, wanted)
+    comparison = replace(compare(before, after, sets), after=compare(before, after, wanted).after)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = _moments(comparison.after.position, group)
     lost = BASE_SHARE if new_base else 0
@@ -145,7 +157,7 @@ def verify(
     freedom = float(np.trace(spread) ** 2 / np.trace(spread @ spread))
     rms = float(np.sqrt(np.trace(spread)))
 
-    shaped = compare(before, _rebased(after, sets), sets).after
+    shaped = compare(before, _rebased(after, wanted), wanted).after
     left = np.trace(_moments(shaped.position, group).sum(axis=0)) / max(count - BASE_SHARE, 1)
     common = 1.0 if new_base else float(np.sqrt(left)) / rms
     numbers = np.unique(np.geomspace(count, MOST, 200).astype(int))
@@ -191,6 +203,18 @@ def _check(chain: Chain, observations: Observations) -> None:
             f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
             f'{observations.base} and {observations.tool}: measure with the same device and target'
         )
+
+
+def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
+    """Return the commanded joint values (N, n) that are nearest to those measured (N, n)."""
+    away = np.abs(joints[:, np.newaxis] - commanded).max(axis=2)
+    far = np.flatnonzero(away.min(axis=1) > FAR)
+    if far.size:
+        raise InputError(
+            f'measurement {far[0] + 1} was taken {away.min(axis=1)[far[0]]:.3g} rad or m from '
+            'the nearest commanded joint values: is it of that program?'
+        )
+    return np.asarray(commanded[away.argmin(axis=1)])
 
 
 def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:

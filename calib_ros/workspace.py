@@ -148,7 +148,8 @@ def _in_frames_of(nominal: Chain, after: Chain) -> Chain:
     """Return the nominal chain with frames that bring it closest to the calibrated one."""
     joints = nominal.random_joints(FRAME_POSES, np.random.default_rng(0))
     wanted = measure(after, joints, np.random.default_rng(0))
-    start = replace(nominal, base=after.frame('base'), tool=after.frame('tool'))
+    base, tool = after.frame('base'), after.frame('tool')
+    start = replace(nominal, base=base, tool=tool, frames=after.frames)
     names = [
         f'{frame}.{kind}'
         for frame in ('base', 'tool')

@@ -109,6 +109,25 @@ def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
     assert before.rms_mm > 10.0 * after.rms_mm
 
 
+def test_a_correction_that_did_not_arrive_shows(cell, arm):
+    """Against what was commanded: corrected commands pass, uncorrected ones do not."""
+    true, result = cell
+    meant = iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints
+    moved = compensate(Compensator(UR, result.chain), meant).joints
+    for joints, verdict in ((moved, 'PASS'), (meant, 'FAIL')):
+        seen = [measured(true, joints[::-1])]
+        found = verify(arm, seen, 5e-4, commanded=meant)
+        assert found.verdict == verdict
+        assert verify(arm, seen, 5e-4).verdict == 'PASS'  # the calibration itself is right
+    corrected = verify(arm, [measured(true, moved)], 5e-4, commanded=meant)
+    by_model = verify(arm, [measured(true, moved)], 5e-4)
+    assert corrected.rms == pytest.approx(by_model.rms, rel=1e-6)
+    assert found.rms == pytest.approx(1e-3 * found.comparison.figures[0].rms_mm, rel=0.5)
+    moved[3, 5] += 0.3
+    with pytest.raises(InputError, match=r'measurement 10 was taken 0\.[23]\d* rad or m from'):
+        verify(arm, [measured(true, moved)], 1e-3, commanded=meant)
+
+
 def test_pass_fail_and_undecided(cell, arm):
     true, _ = cell
     seen = [measured(true, iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints)]
@@ -231,7 +250,8 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
     assert main([*correct, '--calibration', 'result/calibration.yaml']) == 0
     capsys.readouterr()
     write_table(folder / 'measured.csv', measured(true, read_joints(folder / 'corrected.csv', 6)))
-    judge = ['verify', 'measured.csv', '--chain', 'ur10e', '--calibration']
+    judge = ['verify', 'measured.csv', '--commanded', 'tests.csv', '--chain', 'ur10e']
+    judge.append('--calibration')
     for calibration in ('result', 'result/calibration.yaml'):
         for tolerance, status, word in (('1', 0, 'PASS'), ('0.01', NOT_ACCEPTED, 'FAIL')):
             assert main([*judge, calibration, '--tolerance', tolerance]) == status
