@@ -20,11 +20,13 @@ nominal model commands (one arm; mean over the circle) and that its identified o
 draws of the measured noise, at the places that the first draw chose).
 
 Measured robots: half of the fitted rows, and 30 of them, chosen by `d` without their measured
-values, against random ones and all; RMS on held-out rows. `sigma` is the spread of held-out
-residuals over their predicted standard deviation with the noise that the fit found, which holds
-what the model lacks; `predicted` the share of it that comes from the parameters. `a_priori` is
-the RMS error over that predicted from the tracker's own noise alone, 0.02 mm. Of UR10 A every
-fifth row is used.
+values, against random ones and all; RMS on held-out rows. `sigma` is the RMS of held-out residuals
+over their predicted standard deviation with the noise that the fit found, which holds what the
+model lacks; `predicted` the share of it that comes from the parameters. Held-out rows lie between
+fitted ones and share the remainder with them; `outer` is that RMS where they do not: over the
+lowest and highest fifth of every joint's values, left out one at a time, and `outer_noise` by the
+noise alone, without that of the parameters. `a_priori` is the RMS error over that predicted from
+the tracker's own noise alone, 0.02 mm. Of UR10 A every fifth row is used.
 """
 
 import argparse
@@ -212,11 +214,30 @@ def placement(draws):
 
 
 def spread(problem, result, sigma_position):
-    """Return the standard deviation of held-out position residuals over predicted sigma."""
+    """Return the RMS of held-out position residuals over predicted sigma."""
     left = result.validation.after.position[result.validation.judged]
     joints = np.concatenate([each.joints for each in problem.judging])[result.validation.judged]
     variance = np.diagonal(result.pose_covariance(joints), axis1=1, axis2=2)[:, :3]
-    return float((left / np.sqrt(variance + sigma_position**2)).std())
+    return float(np.sqrt(np.mean(left**2 / (variance + sigma_position**2))))
+
+
+def outer(problem):
+    """Return the RMS of residuals over predicted sigma, and over noise, in the outer fifths."""
+    joints = problem.observations.joints
+    scores, by_noise = [], []
+    for column in joints.T:
+        order = np.argsort(column)
+        fifth = len(order) // 5
+        for out in (order[:fifth], order[-fifth:]):
+            rest = np.setdiff1d(order, out)
+            part, fitted = (problem.observations.select(index) for index in (out, rest))
+            there = replace(problem, observations=fitted, held_out=part)
+            result = identify(there)
+            sigma = problem.sigma_position * result.noise.position
+            scores.append(spread(there, result, sigma) ** 2)
+            left = result.validation.after.position[result.validation.judged]
+            by_noise.append(np.mean((left / sigma) ** 2))
+    return float(np.sqrt(np.mean(scores))), float(np.sqrt(np.mean(by_noise)))
 
 
 def measured(name, session, tracker, draws):
@@ -248,6 +269,7 @@ def measured(name, session, tracker, draws):
         row[f'{label}_predicted_mm'] = 1e3 * predicted(
             Design.of(problem, planned), problem.judging[0].joints
         )
+    row['outer_sigma'], row['outer_noise'] = outer(problem)
     if tracker:
         told = replace(
             problem, sigma_position=TRACKER, sigma_orientation=TRACKER / WEIGHT_OF_ORIENTATION
