@@ -14,6 +14,7 @@ one core the next pose takes about 15 ms, the cloud 60 ms, 10,000 points of a tr
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
@@ -48,6 +49,8 @@ CLOUD = 10_000
 """Points of the cloud of errors."""
 MOST_POINTS = 50_000
 """Points of a trajectory; a longer one is refused."""
+MOST_WAITING = 10
+"""Trajectories that may wait; those that come on top are refused."""
 MOST_REASONS = 3
 """Refused points whose reasons are told."""
 
@@ -80,6 +83,7 @@ class Guide:
         self._candidates = candidates
         self._pool = ThreadPoolExecutor(1)
         self._pending: set[Future[None]] = set()
+        self._lock = threading.Lock()
         self._advised: tuple[Sample, ...] = ()
         self._advising: Future[None] | None = None
         self._compensator: tuple[Calibration, Compensator] | None = None
@@ -124,8 +128,9 @@ class Guide:
         self._start(self._show, result)
 
     def _start(self, work: Callable[..., None], *arguments: Any) -> Future[None]:
-        future = self._pool.submit(self._guarded(work), *arguments)
-        self._pending = {each for each in self._pending if not each.done()} | {future}
+        with self._lock:  # an identification calls from a thread of its own
+            future = self._pool.submit(self._guarded(work), *arguments)
+            self._pending = {each for each in self._pending if not each.done()} | {future}
         return future
 
     def _advise(self, problem: Problem, estimate: Estimate | None) -> None:
@@ -161,17 +166,23 @@ class Guide:
         )
 
     def _on_trajectory(self, message: Any) -> None:
-        self._start(self._correct, message, self._session.calibration)
+        if sum(not each.done() for each in self._pending) > MOST_WAITING:
+            self._refuse(f'{MOST_WAITING} others wait already, send them more slowly')
+        else:
+            self._start(self._correct, message, self._session.calibration)
 
     def _correct(self, message: Any, calibration: Calibration | None) -> None:
         """Publish a corrected trajectory, or nothing at all and log why."""
         try:
             corrected, self._last_trajectory = self._corrected_by(message, calibration)
         except CalibrationError as err:
-            self._last_trajectory = f'refused: {err}'
-            self._node.get_logger().warning(f'trajectory {self._last_trajectory}')
+            self._refuse(str(err))
         else:
             self._corrected.publish(corrected)
+
+    def _refuse(self, reason: str) -> None:
+        self._last_trajectory = f'refused: {reason}'
+        self._node.get_logger().warning(f'trajectory {self._last_trajectory}')
 
     def _corrected_by(self, message: Any, calibration: Calibration | None) -> tuple[Any, str]:
         if calibration is None:

@@ -92,6 +92,10 @@ def iso_9283_poses(
     best = cubes.select(travel.argmin()[np.newaxis])
     wanted = _poses(design, best.centres, INSIDE * best.edge)[0, PLANE]
     found = inverse.solve(design.chain, wanted, best.corners[0, PLANE], design.base, design.tool)
+    if not found.converged.all():
+        raise InputError(
+            'the arm does not reach the inside of the cube that it reaches: try --seed'
+        )
     return TestPoses(np.concatenate([best.middle, found.joints]), best.edge)
 
 
