@@ -142,9 +142,17 @@ def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Compar
 
 
 def validate(
-    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust
+    problem: Problem,
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+    explained: NDArray[np.bool_] | None = None,
 ) -> tuple[Comparison | None, str]:
     """Judge both chains on pairs that were not fitted.
+
+    Held-out pairs are outliers unless they are near what the fit predicts, or were `explained`
+    (N,) by a simpler model.
 
     Configurations are dealt out to the folds one by one, so that none is on both sides.
     Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
@@ -153,7 +161,10 @@ def validate(
         comparison = compare(before, after, problem.judging)
         if problem.loss != 'none':
             distances = distances_of(after, names, problem.system(problem.judging))
-            comparison = replace(comparison, judged=np.concatenate(distances) <= OUTLIER)
+            judged = np.concatenate(distances) <= OUTLIER
+            if explained is not None:
+                judged |= explained
+            comparison = replace(comparison, judged=judged)
         return comparison, f'{len(comparison.judged)} held-out samples'
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
