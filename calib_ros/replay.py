@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.cdr import readings
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
-from calib_ros.messages import DECODERS, JOINT_STATE, JointReading, Reading
+from calib_ros.intake import Stream, feed
+from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
@@ -153,49 +153,22 @@ def _feed(
     session: CalibrationSession, topics: Topics, raw: Iterator[tuple[str, bytes]]
 ) -> tuple[int, str | None]:
     """Feed serialised messages; return how many, and what is wrong with the others if any."""
+    streams = {t: Stream(t, kind, topics.sources.get(t)) for t, kind in topics.types.items()}
+    chosen = ((streams[topic], data) for topic, data in raw if topic in streams)
     count, problem, ended = 0, None, False
     while not ended:
-        batch: list[tuple[str, bytes]] = []
+        batch: list[tuple[Stream, bytes]] = []
         try:
-            for topic, data in itertools.islice(raw, BATCH):
-                batch.append((topic, data))
+            for each in itertools.islice(chosen, BATCH):
+                batch.append(each)
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        decoded = {
-            topic: iter(found)
-            for topic in {topic for topic, _ in batch} & set(topics.types)
-            if (found := readings(topics.types[topic], [d for t, d in batch if t == topic]))
-        }
-        for topic, data in batch:
-            kind = topics.types.get(topic)
-            if kind is None:
-                continue
-            if topic in decoded:
-                _take(session, topics, topic, next(decoded[topic]))
-                count += 1
-                continue
-            try:
-                message = _TYPESTORE.deserialize_cdr(data, kind)
-            except Exception as err:
-                problem = f'a message on {topic} cannot be decoded: {err!r}'
-                continue
-            if kind == JOINT_STATE:
-                session.take_joints(message)
-            else:
-                session.take(topics.sources[topic], kind, message)
-            count += 1
+        problems = feed(session, batch, _TYPESTORE.deserialize_cdr)
+        count += len(batch) - len(problems)
+        problem = (problem, *problems)[-1]
     session.finish()
     return count, problem
-
-
-def _take(
-    session: CalibrationSession, topics: Topics, topic: str, reading: JointReading | Reading
-) -> None:
-    if isinstance(reading, JointReading):
-        session.take_joint_reading(reading)
-    else:
-        session.take_reading(topics.sources[topic], reading)
 
 
 @dataclass(frozen=True, eq=False)

@@ -155,6 +155,8 @@ class CalibrationSession:
         self.samples: list[Sample] = []
         self.received: Counter[str] = Counter()
         """Messages that came so far, by stream."""
+        self.latest: tuple[int, Sequence[float]] | None = None
+        """Stamp [ns] and values of the last joint state that named all joints."""
         self._watch = None if continuous else Watch(len(self.chain.joints))
         self.delay: Delay | None = None
         """How late the measurements are stamped, as far as the motion shows."""
@@ -184,38 +186,40 @@ class CalibrationSession:
 
     # Messages
 
-    def take_joints(self, message: Any) -> Sequence[float] | None:
-        """Take a JointState; return its values in the order of the chain if it has all."""
+    def take_joints(self, message: Any) -> None:
+        """Take a JointState."""
         try:
             reading = messages.joint_state(message)
         except messages.MessageError as err:
             self.received['joints'] += 1
             self._dropped[f'joints: {err}'] += 1
-            return None
-        return self.take_joint_reading(reading)
+            return
+        self.take_joint_reading(reading)
 
-    def take_joint_reading(self, reading: messages.JointReading) -> Sequence[float] | None:
-        """Take decoded joint values; return them in the order of the chain if all are there."""
+    def take_joint_reading(self, reading: messages.JointReading) -> None:
+        """Take decoded joint values."""
         self.received['joints'] += 1
         try:
             columns, pick = self._layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
-            return None
+            return
         values = pick(reading.values)
         if not math.isfinite(sum(values)):
             self._dropped['joints: NaN or infinite joint value'] += 1
-            return None
+            return
+        complete = len(columns) == len(self.chain.joints)
+        if complete:
+            self.latest = (reading.stamp_ns, values)
         if not self.recording:
             self._unused['joints: not recording'] += 1
         else:
             self._watch_order('joints', reading.stamp_ns)
             self._look_for_delay(reading.stamp_ns)
-            if self._watch is not None and len(columns) == len(self.chain.joints):
+            if complete and self._watch is not None:
                 self._watch_clocks(reading.stamp_ns, values)
             self._collector.add_joints(columns, reading.stamp_ns, values)
             self._take()
-        return values if len(columns) == len(self.chain.joints) else None
 
     def take(self, source: Source, msgtype: str, message: Any) -> None:
         """Take a measurement of the message type named."""

@@ -28,7 +28,8 @@ ORDER = [
     {'identification'},
     {'selection', 'salvage'},
     {'session', 'plots'},
-    {'replay', 'report'},
+    {'intake', 'report'},
+    {'replay'},
     {'deferred', 'outgoing'},
     {'cli', 'node'},
 ]
