@@ -108,11 +108,20 @@ class Hearing:
     last: float | None = None
     deaf: bool = False
     """True when a publisher offers a QoS that is not asked for."""
+    lost: int = 0
+    """Messages that got lost on the way, as DDS tells by their numbers."""
+    full: int = 0
+    """How often the queue was found full, so that messages may be lost."""
+    lost_before: int = 0
+    losing: bool = False
+    """True when either has grown between the last two looks."""
 
     def look(self, now: float, span: float) -> None:
         """Note how many messages came in the last `span`."""
         fresh, self.before = self.count - self.before, self.count
         self.rate = fresh / span
+        lost, before = self.lost + self.full, self.lost_before
+        self.losing, self.lost_before = lost > before, lost
         if fresh:
             self.last = now
 
@@ -323,11 +332,6 @@ class CalibrationNode(Node):
     # Topics in
 
     def _subscribe(self) -> None:
-        qos = QoSProfile(
-            depth=INPUT_QUEUE,
-            reliability=qos_profile_sensor_data.reliability,
-            durability=qos_profile_sensor_data.durability,
-        )
         overriding = QoSOverridingOptions(
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
@@ -345,11 +349,13 @@ class CalibrationNode(Node):
                 _message_type(stream.type),
                 stream.topic,
                 lambda data: None,  # see `subscriptions`
-                qos,
-                qos_overriding_options=overriding,
-                event_callbacks=SubscriptionEventCallbacks(
-                    incompatible_qos=self._guarded(self._noting(heard))
+                QoSProfile(  # one for each: overriding changes it
+                    depth=INPUT_QUEUE,
+                    reliability=qos_profile_sensor_data.reliability,
+                    durability=qos_profile_sensor_data.durability,
                 ),
+                qos_overriding_options=overriding,
+                event_callbacks=self._noting(heard),
                 raw=True,
             )
             self._inputs[subscription] = stream, heard
@@ -366,6 +372,7 @@ class CalibrationNode(Node):
         for subscription, (stream, heard) in self._inputs.items():
             found = _waiting(subscription)
             heard.count += len(found)
+            heard.full += len(found) >= subscription.qos_profile.depth
             come += [(stamp, stream, data) for stamp, data in found]
         come.sort(key=itemgetter(0))
         batch = [(stream, data) for _, stream, data in come]
@@ -376,11 +383,16 @@ class CalibrationNode(Node):
         for problem in problems:
             self.get_logger().error(problem)
 
-    def _noting(self, heard: Hearing) -> Callable[[Any], None]:
-        def note(event: Any) -> None:
+    def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:
+        def note_deaf(event: Any) -> None:
             heard.deaf = True
 
-        return note
+        def note_lost(event: Any) -> None:
+            heard.lost += event.total_count_change
+
+        return SubscriptionEventCallbacks(
+            incompatible_qos=self._guarded(note_deaf), message_lost=self._guarded(note_lost)
+        )
 
     # The journal
 
@@ -567,6 +579,9 @@ class CalibrationNode(Node):
             for topic, heard in self._heard.items()
             if heard.deaf and not heard.count
         ]
+        losing = [topic for topic, heard in self._heard.items() if heard.losing]
+        if losing:
+            wrong.append(f'messages get lost on {", ".join(losing)}')
         fresh = {
             cause: count
             for cause, count in account.dropped.items()
@@ -600,6 +615,8 @@ class CalibrationNode(Node):
             'delay [s]': 'not known' if delay is None else f'{delay.seconds:.4f}',
             **{f'rate of {topic} [Hz]': f'{each.rate:.1f}' for topic, each in heard.items()},
             **{f'age of {topic} [s]': f'{now - each.last:.1f}' for topic, each in heard.items()},
+            **{f'lost on {topic}': each.lost for topic, each in heard.items()},
+            **{f'queue of {topic} full': each.full for topic, each in heard.items()},
             **{f'not used {cause}': count for cause, count in account.unused.items()},
             **{f'dropped {cause}': count for cause, count in account.dropped.items()},
             **{f'note {cause}': count for cause, count in account.notes.items()},
