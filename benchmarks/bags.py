@@ -128,10 +128,12 @@ class Nobody:
     settings = Settings()
     warnings = ()
 
-    def take_reading(self, *reading):
-        """Do nothing."""
+    def uneventful(self, readings):
+        """Return that nothing ever happens."""
+        return np.ones(len(readings.stamps_ns), dtype=bool)
 
-    take_joint_reading = take_reading
+    def keep(self, joints, measured):
+        """Do nothing."""
 
     def finish(self):
         """Do nothing."""

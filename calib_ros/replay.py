@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from calib_ros.session import CalibrationSession
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
-BATCH = 5000
+BATCH = 2000
 """Messages that are decoded at once."""
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
@@ -72,6 +72,18 @@ class Topics:
             raise _no_topic('pose topic', tuple(DECODERS), available)
         chosen = {source.topic: source for source in sources}
         return cls({topic: available[topic] for topic in (*joints, *chosen)}, chosen)
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """Return what comes on each topic."""
+        return {
+            topic: Stream(topic, k, self.sources.get(topic)) for topic, k in self.types.items()
+        }
+
+    def of(self, messages: Iterable[tuple[str, bytes]]) -> Iterator[tuple[Stream, bytes]]:
+        """Return those of some messages that are on these topics."""
+        streams = self.streams
+        return ((streams[topic], data) for topic, data in messages if topic in streams)
 
 
 def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
@@ -121,7 +133,7 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         if found is None:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
         topics = Topics.choose(found.topics, session.settings)
-        count, problem = _feed(session, topics, iter(found.messages))
+        count, problem = _feed(session, topics.of(found.messages))
         total = recorded(path if path.is_dir() else path.parent)
         lost = 'how many are lost is not known'
         if total is not None:
@@ -135,12 +147,13 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         topics = Topics.choose(available, session.settings)
         connections = [c for c in reader.connections if c.topic in topics.types]
         expected = sum(c.msgcount for c in connections)
-        raw = ((c.topic, data) for c, _, data in reader.messages(connections))
-        count, problem = _feed(session, topics, raw)
+        streams = topics.streams
+        messages = ((streams[c.topic], data) for c, _, data in reader.messages(connections))
+        count, problem = _feed(session, messages)
     if problem is not None and count == 0:
         found = salvage(path)
         if found is not None:
-            count, _ = _feed(session, topics, iter(found.messages))
+            count, _ = _feed(session, topics.of(found.messages))
     if problem is None:
         return session.warnings
     return (
@@ -150,16 +163,14 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
 
 
 def _feed(
-    session: CalibrationSession, topics: Topics, raw: Iterator[tuple[str, bytes]]
+    session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
 ) -> tuple[int, str | None]:
     """Feed serialised messages; return how many, and what is wrong with the others if any."""
-    streams = {t: Stream(t, kind, topics.sources.get(t)) for t, kind in topics.types.items()}
-    chosen = ((streams[topic], data) for topic, data in raw if topic in streams)
     count, problem, ended = 0, None, False
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
         try:
-            for each in itertools.islice(chosen, BATCH):
+            for each in itertools.islice(messages, BATCH):
                 batch.append(each)
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
