@@ -18,6 +18,7 @@ from scipy import stats
 
 from calib_ros import effects, identifiability
 from calib_ros.chain import FRAME_KINDS, Chain
+from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.frames import start_frames
@@ -88,6 +89,9 @@ class Identification:
     observability : Observability
     rank, iterations : int
     converged : bool
+    chance : float or None
+        Probability that errors shared by what was measured in succession, as of a drifting
+        tracker, would let the arm's parameters explain as much. None for a target in sockets.
     refusals : tuple of str
         Rules of acceptance that failed, in words; none when the result is accepted.
     weak : tuple of str
@@ -114,6 +118,7 @@ class Identification:
     world_frame: str
     iterations: int
     converged: bool
+    chance: float | None
     refusals: tuple[str, ...]
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
@@ -207,6 +212,7 @@ def identify(problem: Problem) -> Identification:
         )
     validation, validated_by = validate(problem, before.chain, fit.chain, names, robust)
     parameters = _parameters(problem, fit.chain, structural, names, covariance)
+    chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
     return Identification(
         chain=fit.chain,
@@ -225,8 +231,27 @@ def identify(problem: Problem) -> Identification:
         world_frame=problem.world_frame,
         iterations=robust.iterations,
         converged=converged,
-        refusals=refusals(problem, converged, parameters, validation),
+        chance=chance,
+        refusals=refusals(problem, converged, parameters, validation, chance),
     )
+
+
+def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
+    """Return how probable it is that what the arm's parameters explain is chance (`chance.py`).
+
+    None for a target in sockets: nothing measures there that could drift.
+    """
+    if any(each.socket for each in problem.sets):
+        return None
+    good = [distances <= OUTLIER for distances in robust.distances]
+    sets = [
+        _some(each.select(np.flatnonzero(which)))
+        for each, which in zip(problem.sets, good, strict=True)
+        if which.any()
+    ]
+    frames = [name for name in names if before.owns_frame(name)]
+    arm = [name for name in names if not before.owns_frame(name)]
+    return chance_of_gain(before, frames, arm, problem.system(sets))
 
 
 def _noise(

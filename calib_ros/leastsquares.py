@@ -148,6 +148,20 @@ class Samples:
         mixed = np.einsum('rsb,psb->prb', self.whitening[:, :, part], full, optimize=True)
         return np.ascontiguousarray(mixed).reshape(len(shift), -1)
 
+    def position_errors(self, residuals: FloatArray) -> FloatArray:
+        """Return position errors (N, 3) [m] of weighted residuals (rows,), sample by sample.
+
+        Of distances the error is the first component.
+        """
+        rows = residuals.reshape(self.count, -1)
+        if self.whitening is not None:  # lower triangular, so that position is not mixed
+            mixing = self.whitening[:3, :3].transpose(2, 0, 1)
+            return np.asarray(np.linalg.solve(mixing, rows[:, :3, np.newaxis])[..., 0])
+        errors = np.zeros((self.count, 3))
+        width = 1 if self.distances is not None else 3
+        errors[:, :width] = self.sigmas[0] * rows[:, :width]
+        return errors
+
     def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Return the residuals in sigma: position (N, 3 or 1), orientation (N, 3).
 

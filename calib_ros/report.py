@@ -152,6 +152,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'validation': None if validation is None else {'by': result.validated_by, **validation},
         'before_is': BEFORE,
         'noise_in_sigma': asdict(result.noise),
+        'chance_of_gain': result.chance,
         'outliers': [asdict(outlier) for outlier in result.outliers],
         'gauges': result.gauges,
         'correlated': [list(pair) for pair in result.correlated()],
@@ -191,6 +192,7 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
     lines += [
         f'- converged: {"yes" if result.converged else "no"}, {result.iterations} iterations',
         f'- {result.rank} parameters fitted; {noise_in_words(result)}',
+        *(f'- {text}' for text in chance_in_words(result)),
         *(f'- {text}' for text in priors_in_words(result)),
         '',
         '## Accuracy',
@@ -272,6 +274,16 @@ def noise_in_words(result: Identification) -> str:
     if noise.consistent:
         return f'{text}, which a chi-squared test lets pass'
     return f'{text}; the sigmas given are wrong, standard deviations follow the residuals'
+
+
+def chance_in_words(result: Identification) -> list[str]:
+    """Return how well the gain stands against errors in succession, where that can be told."""
+    if result.chance is None:
+        return []
+    return [
+        f'moved in time against the joint values, residuals are explained as well in '
+        f'{100.0 * result.chance:.1f} % of the shifts: the chance that a drift passes for the gain'
+    ]
 
 
 def identifiability_in_words(result: Identification) -> list[str]:

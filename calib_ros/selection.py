@@ -18,19 +18,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg
 
 from calib_ros import effects
+from calib_ros.chance import Columns, Shifts, chance
 from calib_ros.effects import Verdict
 from calib_ros.identifiability import RANK_TOLERANCE
 from calib_ros.identification import Identification, identify
-from calib_ros.leastsquares import BLOCK
 from calib_ros.problem import Problem
 from calib_ros.se3 import FloatArray
 from calib_ros.validation import log_gain
 
 PAYS = 0.999
 """One-sided confidence that the gain of a group or harmonic must have."""
+CHANCE = 0.01
+"""Probability from which a gain may be that of a drift (see `chance.py`)."""
 LEAST_GAIN = 0.005
 """Least decrease of the RMS error that is worth a group or a harmonic."""
 HARMONICS = range(3, 41)
@@ -98,7 +100,11 @@ def choose_effects(problem: Problem, geometric: Identification) -> Selection:
 
 
 class _Linear:
-    """The linear model about the geometric fit, with columns of effects made when asked for."""
+    """The linear model about the geometric fit, with columns of effects made when asked for.
+
+    Rows are sample by sample. Nothing measures at sockets that could drift, so nothing is moved
+    in time there, and no spectrum is searched.
+    """
 
     def __init__(self, problem: Problem, geometric: Identification) -> None:
         self._chain = geometric.chain
@@ -111,18 +117,35 @@ class _Linear:
         sets = [
             each.select(np.flatnonzero(good)[::share])
             for each, good in zip(problem.sets, judged, strict=True)
+            if good.any()
         ]
         self._system = problem.system(sets)
-        groups, first = [], 0
+        groups, blocks, first = [], [], 0
         for each in sets:
-            groups.append(each.configurations + first)
-            first += int(each.configurations.max(initial=-1)) + 1
+            own = each.configurations
+            count = int(own.max(initial=-1)) + 1
+            groups.append(own + first)
+            blocks.append(own * problem.folds // max(count, 1))  # every fold has some of each set
+            first += count
         self._groups = np.concatenate(groups)
-        count = problem.folds
-        self._dealings = (self._groups % count, self._groups * count // (self._groups.max() + 1))
+        self._dealings = (self._groups % problem.folds, np.concatenate(blocks))
+        rows = self._rows(self._names)
+        self._base = _stacked(rows)[:, :-1]
+        self._residual = _stacked(rows)[:, -1]
+        self._ends = np.cumsum([each[:, :, -1].size for each in rows])
+        widths = np.concatenate([np.full(len(each), each.shape[1]) for each in rows])
+        self._owner = np.repeat(np.arange(len(widths)), widths)
         self._columns: dict[str, FloatArray] = {}
-        self._owner, self._component = self._layout()
-        self._base, self._residual = self._rows(self._names)
+        self._seen: dict[str, Columns] = {}
+        self._pairs = [
+            tuple(f'{joint.name}.{wave}_{harmonic}' for wave in effects.WAVES)
+            for joint in self._chain.joints
+            if joint.type == 'revolute'
+            for harmonic in HARMONICS
+        ]
+        self._shifts: Shifts | None = None
+        if not any(each.socket for each in sets):
+            self._shifts = Shifts(self._system, [each[:, :, -1] for each in rows])
 
     def useful(self, names: Sequence[str]) -> list[str]:
         """Return those effects whose columns are independent of the geometric model."""
@@ -139,93 +162,64 @@ class _Linear:
 
     def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> Verdict:
         """Compare the errors on configurations left out, with and without some effects."""
-        richer = [*chosen, *(name for name in added if name not in chosen)]
+        new = [name for name in added if name not in chosen]
         found, pays = [], True
         for folds in self._dealings:
-            before, after = self._left_out(chosen, folds), self._left_out(richer, folds)
+            before, after = (self._left_out(names, folds) for names in (chosen, [*chosen, *new]))
             gain, limit = log_gain(before, after, self._groups, PAYS)
             pays = pays and gain > max(limit, LEAST_GAIN)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
+        if pays and self._shifts is not None:
+            known = self._moved([*self._names, *chosen])
+            pays = chance(self._shifts.shares(known, [self._moved(new)])[0]) < CHANCE
         return Verdict(what, found[0], found[1], bool(pays))
 
     def strongest_harmonic(self, chosen: Sequence[str]) -> list[str] | None:
-        """Return sine and cosine of the harmonic that explains most of what is left."""
-        columns = np.column_stack([self._base, self._of(chosen)])
-        weighted = np.concatenate([columns, np.diag(self._prior(chosen)[0])])
-        basis = np.linalg.qr(weighted)[0]
-        basis_rows = basis[: len(columns)]
-        residual = self._residual - basis_rows @ (basis_rows.T @ self._residual)
-        variance = float(residual @ residual) / max(len(residual) - columns.shape[1], 1)
-        best, tried = 0.0, 0
-        best_names: list[str] | None = None
-        for joint in self._chain.joints:
-            if joint.type != 'revolute':
-                continue
-            for harmonic in HARMONICS:
-                names = [f'{joint.name}.{wave}_{harmonic}' for wave in effects.WAVES]
-                if names[0] in chosen:
-                    continue
-                tried += 1
-                pair = self._of(names)
-                square = pair.T @ pair - (basis_rows.T @ pair).T @ (basis_rows.T @ pair)
-                square += np.eye(2) / effects.expected(names[0]) ** 2
-                right = pair.T @ residual
-                explained = float(right @ np.linalg.solve(square, right))
-                if explained > best:
-                    best, best_names = explained, names
-        chance = stats.chi2.sf(best / variance, 2) * max(tried, 1)
-        return best_names if chance < 1.0 - PAYS else None
+        """Return sine and cosine of the harmonic that explains most of what is left.
+
+        None where the strongest one of residuals moved in time often explains as much.
+        """
+        pairs = [pair for pair in self._pairs if pair[0] not in chosen]
+        if self._shifts is None or not pairs:
+            return None
+        known = self._moved([*self._names, *chosen])
+        shares = self._shifts.shares(known, [self._moved(pair) for pair in pairs])
+        if chance(shares.max(axis=0)) >= CHANCE:
+            return None
+        return list(pairs[int(np.argmax(shares[:, 0]))])
+
+    def _moved(self, names: Sequence[str]) -> Columns:
+        """Return the columns of parameters beside the moved residuals, each made once."""
+        assert self._shifts is not None
+        missing = [name for name in names if name not in self._seen]
+        if missing:
+            columns = [each[:, :, :-1] for each in self._rows(missing)]
+            found = self._shifts.columns(columns, self._priors(missing))
+            self._seen |= {name: found[[k]] for k, name in enumerate(missing)}
+        return Columns.side_by_side([self._seen[name] for name in names])
 
     def _of(self, names: Sequence[str]) -> FloatArray:
-        """Return the weighted columns (rows, E) of effects, made once."""
+        """Return the weighted columns (R, E) of effects, each made once."""
         missing = [name for name in names if name not in self._columns]
         if missing:
-            rows, _ = self._rows(missing)
+            rows = _stacked(self._rows(missing))[:, :-1]
             self._columns |= dict(zip(missing, rows.T, strict=True))
         if not names:
             return np.zeros((len(self._residual), 0))
         return np.column_stack([self._columns[name] for name in names])
 
-    def _layout(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the sample and the component (0-2 position, 3-5 orientation) of each row."""
-        owner, component, first = [], [], 0
-        for samples in self._system.sets:
-            width = (
-                1 if samples.distances is not None else 6 if samples.whitening is not None else 3
-            )
-            for start in range(0, samples.count, BLOCK):
-                block = np.arange(start, min(start + BLOCK, samples.count)) + first
-                for part in (range(width), range(3, 6)):
-                    if part.start == 3 and (samples.whitening is not None or not samples.oriented):
-                        continue
-                    owner += [block] * len(part)
-                    component += [np.full(len(block), k) for k in part]
-            first += samples.count
-        return np.concatenate(owner), np.concatenate(component)
-
-    def _rows(self, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return weighted Jacobian (rows, P) and residual (rows,), in the order of the layout."""
+    def _rows(self, names: Sequence[str]) -> list[FloatArray]:
+        """Return weighted Jacobian and residual (N, c, P + 1) of each set."""
         chain = self._chain.with_effects([name for name in names if name not in self._names])
-        found = []
-        for samples in self._system.sets:
-            for shift, turn, model in samples.blocks(chain, names):
-                order = [*model.order, len(names)]
-                found.append(shift.reshape(len(shift), -1)[order].T)
-                if len(turn):
-                    full = np.zeros((len(names) + 1, turn.shape[1]))
-                    full[: model.rotations] = turn[:-1]
-                    full[-1] = turn[-1]
-                    found.append(full[order].T)
-        stacked = np.concatenate(found)
-        return stacked[:, :-1], stacked[:, -1]
+        return [samples.rows_of(chain, names) for samples in self._system.sets]
 
     def _left_out(self, chosen: Sequence[str], dealing: NDArray[np.intp]) -> FloatArray:
         """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
         columns = np.column_stack([self._base, self._of(chosen)])
-        inverse, offset = self._prior(chosen)
+        extra, offset = self._extra(chosen)
         errors = np.empty(len(self._residual))
-        whole = columns.T @ columns + np.diag(inverse**2)
-        gradient = columns.T @ self._residual + inverse * offset
+        whole = columns.T @ columns + extra.T @ extra
+        gradient = columns.T @ self._residual + extra.T @ offset
         folds = dealing[self._owner]
         for fold in range(self._problem.folds):
             inside = folds == fold
@@ -236,15 +230,28 @@ class _Linear:
             right = gradient - part.T @ self._residual[inside]
             weights = scale * linalg.cho_solve(factor, scale * right)
             errors[inside] = self._residual[inside] - part @ weights
-        positions = np.zeros((len(self._groups), 3))
-        rows = self._component < 3
-        positions[self._owner[rows], self._component[rows]] = errors[rows]
-        return positions * self._problem.sigma_position
+        parts = np.split(errors, self._ends[:-1])
+        sets = self._system.sets
+        return np.concatenate([s.position_errors(p) for s, p in zip(sets, parts, strict=True)])
 
-    def _prior(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return 1 / sigma (P,) of the priors, zero without one, and their residuals in sigma."""
-        inverse, offset = np.zeros(len(self._names)), np.zeros(len(self._names))
-        if self._system.prior is not None:
-            inverse, offset = self._system.prior.rows(self._chain, self._names)
-        wide = [1.0 / effects.expected(name) for name in chosen]
-        return np.append(inverse, wide), np.append(offset, np.zeros(len(chosen)))
+    def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""
+        extra, offset = self._system.extra_rows(self._chain, self._names)
+        wide = np.diag([1.0 / effects.expected(name) for name in chosen])
+        return linalg.block_diag(extra, wide), np.append(offset, np.zeros(len(chosen)))
+
+    def _priors(self, names: Sequence[str]) -> FloatArray:
+        """Return 1 / sigma (P,) of the priors; zero without one."""
+        found = np.zeros(len(names))
+        known = {} if self._system.prior is None else self._system.prior.sigmas
+        for k, name in enumerate(names):
+            if name in known:
+                found[k] = 1.0 / known[name]
+            elif name not in self._names:
+                found[k] = 1.0 / effects.expected(name)
+        return found
+
+
+def _stacked(rows: Sequence[FloatArray]) -> FloatArray:
+    """Return (R, P) from (N, c, P) of each set."""
+    return np.concatenate([each.reshape(-1, each.shape[2]) for each in rows])

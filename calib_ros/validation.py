@@ -292,6 +292,7 @@ def refusals(
     converged: bool,
     parameters: Sequence[Parameter],
     validation: Comparison | None,
+    chance: float | None,
 ) -> tuple[str, ...]:
     """Return the rules of acceptance that fail, in words.
 
@@ -300,10 +301,12 @@ def refusals(
     3. The RMS position error on held-out poses is lower than before, by more than its
        uncertainty (one-sided 95 %, Student's t over configurations; see `log_gain`). The
        orientation must not get worse by the same measure.
-    4. No DH parameter is certainly (by three standard deviations) further from nominal than
+    4. The gain is no chance: where what is measured in succession shares errors, moved in time
+       they are explained as well (`chance.py`; 95 %).
+    5. No DH parameter is certainly (by three standard deviations) further from nominal than
        `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
        another robot, not a faulty one.
-    5. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
+    6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
     """
     failed = []
     if not converged:
@@ -350,6 +353,12 @@ def refusals(
         failed.append(
             f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
             f'before, {after.rms_mm:.3f} mm after)'
+        )
+    elif chance is not None and chance > 1.0 - CONFIDENCE:
+        failed.append(
+            'the gain may be that of a drift, as of the tracker: moved in time against the joint '
+            f'values, residuals are explained as well in {100.0 * chance:.0f} % of the shifts; '
+            'measure the poses in random order, further apart, or more of them'
         )
     if after.rms_mrad is not None:
         gain, limit = log_gain(

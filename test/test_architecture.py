@@ -24,7 +24,7 @@ ORDER = [
     {'robust'},
     {'collector', 'export', 'frames', 'journal'},
     {'archive', 'problem'},
-    {'live', 'validation'},
+    {'chance', 'live', 'validation'},
     {'identification'},
     {'selection', 'salvage'},
     {'session', 'plots'},

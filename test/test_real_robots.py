@@ -33,12 +33,16 @@ REFERENCES = {
     ('positioner_2axis_pose', 'all'): (0.461, 0.410, 14),
     ('fr3_camera_eyeinhand', 'all'): (4.727, 1.622, 34),
 }
+# Its first joint moves but once, slowly through the session, as a drift of the tracker would.
+DOUBTFUL = ('positioner_2axis_pose', 'all')
 SMALL = [key for key in REFERENCES if key != ('ur10_ipa_leica', 'A')]
 
 
 def run_json(capsys, *arguments):
-    assert main([*map(str, arguments), '--json']) == 0
-    return json.loads(capsys.readouterr().out)
+    code = main([*map(str, arguments), '--json'])
+    found = json.loads(capsys.readouterr().out)
+    assert code == (0 if found['accepted'] else 3)
+    return found
 
 
 @pytest.mark.parametrize(('name', 'session'), REFERENCES)
@@ -51,7 +55,7 @@ def test_held_out_errors_equal_the_reference(capsys, name, session):
     )
     nominal, calibrated, parameters = REFERENCES[name, session]
     assert found['converged']
-    assert found['accepted']
+    assert found['accepted'] == ((name, session) != DOUBTFUL)
     assert found['rank'] == parameters
     assert found['validation']['after']['rms_mm'] == pytest.approx(calibrated, rel=0.02)
     if nominal is not None:
@@ -66,7 +70,10 @@ def test_default_settings_are_as_good_as_the_reference(capsys, name, session):
         *('identify', '--csv', folder / 'uniform.csv', '--chain', folder / 'chain.yaml'),
         *('--session', session),
     )
-    assert found['accepted']
+    if (name, session) == DOUBTFUL:
+        assert [text for text in found['refusals'] if 'of a drift' in text] == found['refusals']
+    else:
+        assert found['accepted']
     assert found['validation']['after']['rms_mm'] < 1.02 * REFERENCES[name, session][1]
     if name.startswith('fr3'):  # of its three flagged rows one is held out
         assert [outlier['sample'] for outlier in found['outliers']] == [36, 90]
@@ -149,7 +156,10 @@ def test_table_and_running_node_give_the_same_parameters(capsys, tmp_path, name,
         cell.play({'joint_states': joints, topic: poses})
         texts = cell.listen(String, 'calibration_node/calibration', LATCHED)
         answer = cell.call('identify')
-        assert answer.success, answer.message
+        assert answer.success == table['accepted'], answer.message
+        if not table['accepted']:
+            assert 'of a drift' in answer.message
+            return
         cell.spin_until(lambda: texts)
         live = parse_chain(texts[0].data)
     for parameter, found in table['parameters'].items():

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Does a drifting tracker pass for a gain of the arm, or for effects?
+
+    python benchmarks/drift.py [--runs 30] [--quick] [--json]
+
+Simulated UR10e, measured along a path through 12 way-points (all of the joint range, or +-0.8 rad)
+with noise of 0.05 mm and 0.2 mrad, by a tracker that drifts by 0.3 mm: errors that fade over 10
+poses, a random walk, a swing of about one period, a ramp. Of arms without any error none should be
+accepted; `without` is how many would be without the test of `chance.py`. Of arms with errors of
+0.5 mm and 1 mrad all should be. `effects`: arms with such errors, on which `auto` chose an effect
+that is not there.
+"""
+
+import argparse
+import json
+import os
+from dataclasses import replace
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+from scipy.signal import lfilter
+
+from calib_ros.config import load_chain
+from calib_ros.identification import Problem, identify
+from calib_ros.selection import identify_model
+from calib_ros.simulation import Cell, faulty, measure
+
+NOISE = {'sigma_position': 5e-5, 'sigma_orientation': 2e-4}
+DRIFT = 3e-4
+WAYS = 12
+
+
+def along_path(nominal, count, width, rng):
+    """Return joint values (count, n) on straight lines through way-points."""
+    corners = nominal.random_joints(WAYS, rng)
+    if width is not None:
+        corners = rng.uniform(-1.0, 1.0, 6) + rng.uniform(-width, width, corners.shape)
+    share = np.arange(count // WAYS)[:, np.newaxis] / (count // WAYS)
+    ways = np.roll(corners, -1, axis=0) - corners
+    return (corners[:, np.newaxis] + share * ways[:, np.newaxis]).reshape(count, -1)
+
+
+def drift(kind, count, rng):
+    """Return how far (count, 3) [m] the tracker is off."""
+    share = np.arange(count)[:, np.newaxis] / count
+    if kind == 'walk':
+        return DRIFT * np.cumsum(rng.normal(size=(count, 3)), axis=0) / np.sqrt(count)
+    if kind == 'swing':
+        cycles, phase = rng.uniform(0.5, 1.5, 3), rng.uniform(0.0, 2.0 * np.pi, 3)
+        return DRIFT * np.sin(2.0 * np.pi * cycles * share + phase)
+    if kind == 'ramp':
+        return DRIFT * rng.normal(size=3) * share
+    decay = np.exp(-0.1)
+    steps = np.sqrt(1.0 - decay**2) * rng.normal(size=(count, 3))
+    return DRIFT * lfilter([1.0], [1.0, -decay], steps, axis=0)
+
+
+def session(nominal, seed, errors, count, width, kind):
+    """Return the problem of one session."""
+    rng = np.random.default_rng(seed)
+    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
+    q = along_path(nominal, count, width, rng)
+    seen = measure(faulty(nominal, cell, rng), q, rng, *NOISE.values(), oriented=bool(seed % 2))
+    return Problem(
+        nominal, replace(seen, positions=seen.positions + drift(kind, count, rng)), **NOISE
+    )
+
+
+def main():
+    """Run all kinds of drift and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--runs', type=int, default=30)
+    parser.add_argument('--quick', action='store_true', help='a few runs, under a minute')
+    parser.add_argument('--json', action='store_true')
+    options = parser.parse_args()
+    runs = 4 if options.quick else options.runs
+    nominal = load_chain('ur10e')
+    rows = []
+    for width in (None, 0.8):
+        for count in (60, 120):
+            for kind in ('fading', 'walk', 'swing', 'ramp'):
+                where = (count, width, kind)
+                healthy = [identify(session(nominal, s, 0.0, *where)) for s in range(runs)]
+                alone = [
+                    all('of a drift' in text for text in result.refusals) for result in healthy
+                ]
+                faulty_ones = [session(nominal, s, 1.0, *where) for s in range(runs)]
+                chosen = [identify_model(problem, 'auto') for problem in faulty_ones[: runs // 2]]
+                row = {
+                    'poses': count,
+                    'half_range_rad': width,
+                    'drift': kind,
+                    'runs': runs,
+                    'healthy_accepted': sum(result.accepted for result in healthy),
+                    'without': sum(alone),
+                    'faulty_accepted': sum(identify(p).accepted for p in faulty_ones),
+                    'effects': sum(bool(result.chain.effects) for result in chosen),
+                    'effects_runs': len(chosen),
+                }
+                rows.append(row)
+                if not options.json:
+                    print(', '.join(f'{key} {value}' for key, value in row.items()), flush=True)
+    keys = ('runs', 'healthy_accepted', 'without', 'faulty_accepted', 'effects', 'effects_runs')
+    total = {key: sum(row[key] for row in rows) for key in keys}
+    if options.json:
+        print(json.dumps({'total': total, 'rows': rows}, indent=2))
+    else:
+        print('total:', ', '.join(f'{key} {value}' for key, value in total.items()))
+
+
+if __name__ == '__main__':
+    main()
