@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calib_ros import effects, identifiability
 from calib_ros.chain import FRAME_KINDS, Chain
@@ -149,7 +149,7 @@ class Identification:
     def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position."""
         values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
-        length = np.sqrt(stats.chi2.ppf(level, 3) * np.maximum(values, 0.0))
+        length = np.sqrt(special.chdtri(3, 1.0 - level) * np.maximum(values, 0.0))
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 
     def predicted_sigma(self, count: int = 300) -> FloatArray:
@@ -281,7 +281,8 @@ def _noise(
     freedom = counts - [float(np.sum(plain * part)) for part in normal.parts]
     known = freedom > 1e-9
     variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
-    low, high = stats.chi2.interval(SIGMA_TEST, np.where(known, freedom, 1.0))
+    beyond = 0.5 * (1.0 - SIGMA_TEST)
+    low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
     found = Noise(
         float(np.sqrt(variances[0])),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
@@ -392,5 +392,5 @@ def log_gain(
     means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
     totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
     deviation = np.diff(means / totals, axis=0).std(ddof=1)
-    limit = stats.t.ppf(confidence, count - 1) * deviation / np.sqrt(count)
+    limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
     return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)
