@@ -17,10 +17,10 @@ convergence, each time in a process of its own (`solvers.py`):
 
 All but the first start with the frames of the nominal arm fitted for free, and with a model
 without gauge freedoms where they do not find it themselves. The error is the RMS of positions
-predicted at 300 configurations that nobody saw. Times are the shortest of several for fast
-programs. A program that exceeds the limit [s], or is expected to, is not tried with more poses.
-The three from PyPI get environments of their own in the folder named; `--quick` uses those that
-are there.
+predicted at 300 configurations that nobody saw. All run on one core (a second one slowed all of
+them down where it was not idle); times are the shortest of several for fast programs. A program
+that exceeds the limit [s], or is expected to, is not tried with more poses. The three from PyPI
+get environments of their own in the folder named; `--quick` uses those that are there.
 """
 
 import argparse
@@ -133,12 +133,15 @@ def urdf(chain):
 def run(python, name, folder, times, limit):
     """Let a solver solve the problem in a folder; return what it took, None beyond the limit."""
     variables = dict(os.environ, PYTHONPATH=str(Path(__file__).parents[1]))
-    if name == 'scipy' or name in PEERS:
-        del variables['OPENBLAS_NUM_THREADS']  # they may use all cores
     command = [python, Path(__file__).with_name('solvers.py'), name, folder, str(times)]
     try:
         done = subprocess.run(
-            command, env=variables, capture_output=True, text=True, timeout=limit, check=False
+            command,
+            env=variables,
+            capture_output=True,
+            text=True,
+            timeout=limit * times,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return None
@@ -169,7 +172,7 @@ def compare(options):
                     if before is None or before[1] * count / before[0] > 2.0 * options.limit:
                         continue
                     peer = name in PEERS or (name == 'one by one' and count > 500)
-                    times = 1 if peer else 7 if count <= 5000 else 2
+                    times = 1 if peer else 5 if count <= 5000 else 2
                     figures = run(python, name, folder, times, options.limit)
                     took = 'too long' if figures is None else f'{figures["seconds"]:.3g} s'
                     print(f'{kind}, {count} poses, {name}: {took}', file=sys.stderr, flush=True)
@@ -188,14 +191,15 @@ def judged(found):
     for kind, by_name in found.items():
         for name, by_count in by_name.items():
             for ours in ('calib_ros', 'fit'):
-                if name not in ('calib_ros', 'fit', 'streamed'):
+                if ours in by_name and name not in ('calib_ros', 'fit', 'streamed'):
                     ratios = {
                         n: each['seconds'] / by_name[ours][n]['seconds']
                         for n, each in by_count.items()
+                        if n in by_name[ours]
                     }
                     figures[f'{kind}: {name} / {ours}'] = ratios
         for name in ('calib_ros', 'fit', 'streamed'):
-            counts = np.array([n for n in by_name[name] if n >= 500])
+            counts = np.array([n for n in by_name.get(name, ()) if n >= 500])
             if len(counts) > 1:
                 times = [by_name[name][n]['seconds'] for n in counts]
                 slope = float(np.polyfit(np.log(counts), np.log(times), 1)[0])
