@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calib_ros import effects, identifiability
 from calib_ros.chain import FRAME_KINDS, Chain
@@ -28,14 +28,20 @@ from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
-from calib_ros.validation import Comparison, Parameter, compare, refusals, residuals, validate
+from calib_ros.validation import (
+    KNOWN,
+    Comparison,
+    Parameter,
+    compare,
+    refusals,
+    residuals,
+    validate,
+)
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
 SOME = 500
 """Pairs that are enough for a first fit."""
-KNOWN = 1e9
-"""Degrees of freedom beyond which the noise is known."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +157,8 @@ class Identification:
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
         freedom = self.uncertainty.freedom_of(shares)
         values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
-        square = 3.0 * stats.f.ppf(level, 3, np.minimum(freedom, KNOWN))
-        square = np.where(freedom > KNOWN, stats.chi2.ppf(level, 3), square)
+        square = 3.0 * special.fdtri(3, np.minimum(freedom, KNOWN), level)
+        square = np.where(freedom > KNOWN, special.chdtri(3, 1.0 - level), square)
         length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 

@@ -26,7 +26,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calib_ros.chain import Chain
 from calib_ros.errors import UnknownNameError
@@ -188,4 +188,4 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
 
 def _median_length(dimensions: int) -> float:
     """Return the median length of a vector of standard normal components."""
-    return float(np.sqrt(stats.chi2.ppf(0.5, dimensions)))
+    return float(np.sqrt(special.chdtri(dimensions, 0.5)))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
@@ -20,6 +20,8 @@ from calib_ros.se3 import FloatArray
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
+KNOWN = 1e9
+"""Degrees of freedom that are as good as infinite."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 MOST_OUTLIERS = 0.35
@@ -46,7 +48,7 @@ class Parameter:
         """Return half the width of the interval that holds the truth, by Student's t."""
         if self.std is None:
             return None
-        return self.std * float(stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
 
 
 @dataclass(frozen=True)
@@ -411,5 +413,5 @@ def log_gain(
     means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
     totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
     deviation = np.diff(means / totals, axis=0).std(ddof=1)
-    limit = stats.t.ppf(confidence, count - 1) * deviation / np.sqrt(count)
+    limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
     return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)
