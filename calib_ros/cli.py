@@ -120,7 +120,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     export.add_argument('--out', type=Path, required=True, help='folder to write')
     export.add_argument('--force', action='store_true', help='overwrite files in --out')
 
-    add_commands(command)
+    add_commands(command, given)
 
     chain = command('chain', _chain, 'print the chain file of a robot, to read and to edit')
     chain.add_argument('robot', help='URDF, chain file, or a robot by its name (ur10e, ...)')
