@@ -9,7 +9,8 @@ with noise of 0.05 mm and 0.2 mrad, by a tracker that drifts by 0.3 mm: errors t
 poses, a random walk, a swing of about one period, a ramp. Of arms without any error none should be
 accepted; `without` is how many would be without the test of `chance.py`. Of arms with errors of
 0.5 mm and 1 mrad all should be. `effects`: arms with such errors, on which `auto` chose an effect
-that is not there.
+that is not there. `coverage_95`: how many 95 % intervals of their DH parameters hold the truth;
+`independent`: without regard to what neighbours share.
 """
 
 import argparse
@@ -58,14 +59,22 @@ def drift(kind, count, rng):
 
 
 def session(nominal, seed, errors, count, width, kind):
-    """Return the problem of one session."""
+    """Return the true arm and the problem of one session."""
     rng = np.random.default_rng(seed)
     cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
     q = along_path(nominal, count, width, rng)
-    seen = measure(faulty(nominal, cell, rng), q, rng, *NOISE.values(), oriented=bool(seed % 2))
-    return Problem(
-        nominal, replace(seen, positions=seen.positions + drift(kind, count, rng)), **NOISE
-    )
+    true = faulty(nominal, cell, rng)
+    seen = measure(true, q, rng, *NOISE.values(), oriented=bool(seed % 2))
+    seen = replace(seen, positions=seen.positions + drift(kind, count, rng))
+    return true, Problem(nominal, seen, **NOISE)
+
+
+def hits(true, result):
+    """Return whether the intervals of the DH parameters hold the truth, by both covariances."""
+    arm = [p for p in result.parameters if p.std is not None and not true.owns_frame(p.name)]
+    deviation = np.abs([p.value - true.value(p.name) for p in arm])
+    widths = np.array([p.half_width() for p in arm])
+    return deviation <= widths, deviation <= widths / result.noise.widened
 
 
 def main():
@@ -82,12 +91,17 @@ def main():
         for count in (60, 120):
             for kind in ('fading', 'walk', 'swing', 'ramp'):
                 where = (count, width, kind)
-                healthy = [identify(session(nominal, s, 0.0, *where)) for s in range(runs)]
+                healthy = [
+                    identify(session(nominal, seed, 0.0, *where)[1]) for seed in range(runs)
+                ]
                 alone = [
                     all('of a drift' in text for text in result.refusals) for result in healthy
                 ]
-                faulty_ones = [session(nominal, s, 1.0, *where) for s in range(runs)]
-                chosen = [identify_model(problem, 'auto') for problem in faulty_ones[: runs // 2]]
+                sessions = [session(nominal, seed, 1.0, *where) for seed in range(runs)]
+                results = [identify(problem) for _, problem in sessions]
+                chosen = [identify_model(problem, 'auto') for _, problem in sessions[: runs // 2]]
+                pairs = [hits(true, r) for (true, _), r in zip(sessions, results, strict=True)]
+                covered, independent = (np.concatenate(part) for part in zip(*pairs, strict=True))
                 row = {
                     'poses': count,
                     'half_range_rad': width,
@@ -95,15 +109,19 @@ def main():
                     'runs': runs,
                     'healthy_accepted': sum(result.accepted for result in healthy),
                     'without': sum(alone),
-                    'faulty_accepted': sum(identify(p).accepted for p in faulty_ones),
+                    'faulty_accepted': sum(result.accepted for result in results),
                     'effects': sum(bool(result.chain.effects) for result in chosen),
                     'effects_runs': len(chosen),
+                    'coverage_95': round(float(covered.mean()), 3),
+                    'independent': round(float(independent.mean()), 3),
                 }
                 rows.append(row)
                 if not options.json:
                     print(', '.join(f'{key} {value}' for key, value in row.items()), flush=True)
     keys = ('runs', 'healthy_accepted', 'without', 'faulty_accepted', 'effects', 'effects_runs')
     total = {key: sum(row[key] for row in rows) for key in keys}
+    for key in ('coverage_95', 'independent'):
+        total[key] = float(np.mean([row[key] for row in rows]))
     if options.json:
         print(json.dumps({'total': total, 'rows': rows}, indent=2))
     else:

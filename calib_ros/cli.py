@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: `calib_ros identify | simulate | csv2bag | chain | demo`.
+"""The command line: `calib_ros plan | identify | workspace | compensate | verify | ...`.
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
-result is not accepted.
+result is not accepted, a program has samples that cannot be compensated, or a corrected arm does
+not pass.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +21,19 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
+from calib_ros.commands import add_commands
 from calib_ros.errors import CalibrationError, InputError
+from calib_ros.options import (
+    NOT_ACCEPTED,
+    add_chain,
+    add_settings,
+    refuse_overwriting,
+    settings_of,
+)
 
 if TYPE_CHECKING:
     from calib_ros.chain import Chain
     from calib_ros.identification import Identification
-
-NOT_ACCEPTED = 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,37 +82,45 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         metavar='M',
         help='between two sockets of a place, 0.05 if not given',
     )
-    _add_chain(identify)
+    add_chain(identify)
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
     identify.add_argument('--force', action='store_true', help='overwrite files in --out')
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
     if 'identify' in given:  # they know numpy, which takes longer than all the rest
-        _add_settings(identify)
+        add_settings(identify)
 
     simulate = command(
         'simulate', _simulate, 'write the bag of a simulated robot cell, with the true chain'
     )
     simulate.add_argument('bag', type=Path, help='folder of the bag to write')
-    _add_chain(simulate)
+    add_chain(simulate)
     _add_simulation(simulate)
 
     csv2bag = command('csv2bag', _csv2bag, 'write a table of measured poses as a bag')
     csv2bag.add_argument('csv', type=Path, help='the table')
     csv2bag.add_argument('bag', type=Path, help='folder of the bag to write')
     csv2bag.add_argument('--session', help='session of the table to use')
-    _add_chain(csv2bag)
+    add_chain(csv2bag)
     _add_storage(csv2bag)
 
     export = command(
         'export', _export, 'write a calibration in the forms that controllers and others read'
     )
     export.add_argument('calibration', type=Path, help='calibration.yaml of an identification')
-    _add_chain(export)
+    add_chain(export)
+    export.add_argument(
+        '--measured',
+        type=Path,
+        help='table with q1 ... qn where tables that cannot be exact are to be best; if not '
+        'given, the whole joint range',
+    )
     export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
     export.add_argument('--base-link', help='of the URDF: where the arm starts')
     export.add_argument('--tip-link', help='of the URDF: where the arm ends')
     export.add_argument('--out', type=Path, required=True, help='folder to write')
     export.add_argument('--force', action='store_true', help='overwrite files in --out')
+
+    add_commands(command, given)
 
     chain = command('chain', _chain, 'print the chain file of a robot, to read and to edit')
     chain.add_argument('robot', help='URDF, chain file, or a robot by its name (ur10e, ...)')
@@ -125,12 +139,6 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_chain(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        '--chain', required=True, help='chain file, URDF, or a robot by its name (ur10e, ...)'
-    )
-
-
 def _add_storage(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of the bag'
@@ -143,23 +151,9 @@ def _add_simulation(parser: argparse.ArgumentParser) -> None:
     _add_storage(parser)
 
 
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.config import Settings
-
-    for item in fields(Settings):
-        many = isinstance(item.default, tuple)
-        parser.add_argument(
-            f'--{item.name.replace("_", "-")}',
-            type=str if many else type(item.default),
-            action='append' if many else 'store',
-            default=[] if many else item.default,
-            help=item.metadata['text'],
-        )
-
-
 def _identify(options: argparse.Namespace) -> int:
     from calib_ros import report
-    from calib_ros.config import Settings, load_chain
+    from calib_ros.config import load_chain
     from calib_ros.problem import Problem
     from calib_ros.selection import identify_model
 
@@ -175,11 +169,8 @@ def _identify(options: argparse.Namespace) -> int:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
-    given: dict[str, Any] = {item.name: getattr(options, item.name) for item in fields(Settings)}
-    for name in ('joint_names', 'joint_topics', 'fixed', 'priors', 'sources'):
-        given[name] = tuple(part for text in given[name] for part in text.split(','))
-    settings = Settings(**given)
-    _refuse_overwriting(options)
+    settings = settings_of(options)
+    refuse_overwriting(options, RESULT_FILES)
     warnings: tuple[str, ...] = ()
     if options.csv is not None:
         from calib_ros.tables import read_table
@@ -266,24 +257,24 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from calib_ros.config import load_chain, read_text
+    from calib_ros.config import calibration_record, load_chain, read_text
     from calib_ros.export import Export, exports
     from calib_ros.files import write_file
     from calib_ros.urdf import corrected_urdf
+    from calib_ros.waypoints import read_joints
 
     chain = load_chain(options.calibration)
-    found = exports(chain, load_chain(options.chain))
+    measured = None
+    if options.measured is not None:
+        measured = read_joints(options.measured, len(chain.joints))
+    origin = calibration_record(read_text(options.calibration))
+    found = exports(chain, load_chain(options.chain), measured, origin)
     if options.urdf is not None:
         links = (options.base_link, options.tip_link)
         text = corrected_urdf(read_text(options.urdf), chain, *links)
         found = (*found, Export(f'{options.urdf.stem}_corrected.urdf', text, 0.0))
     options.out.mkdir(parents=True, exist_ok=True)
-    if not options.force:
-        there = [each.name for each in found if (options.out / each.name).exists()]
-        if there:
-            raise InputError(
-                f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
-            )
+    refuse_overwriting(options, [each.name for each in found])
     for each in found:
         write_file(options.out / each.name, each.content, overwrite=options.force)
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
@@ -331,7 +322,7 @@ def _demo(options: argparse.Namespace) -> int:
     from calib_ros.replay import replay
     from calib_ros.session import CalibrationSession
 
-    _refuse_overwriting(options)
+    refuse_overwriting(options, RESULT_FILES)
     options.bag = options.out / 'bag'
     if options.force and options.bag.exists():
         import shutil
@@ -392,17 +383,6 @@ RESULT_FILES = (
 )
 
 
-def _refuse_overwriting(options: argparse.Namespace) -> None:
-    """Refuse before any work is done."""
-    if options.out is None or options.force:
-        return
-    there = [name for name in RESULT_FILES if (options.out / name).exists()]
-    if there:
-        raise InputError(
-            f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
-        )
-
-
 def _write_result(
     out: Path | None,
     result: Identification,
@@ -412,7 +392,7 @@ def _write_result(
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
 
-    Files of an earlier result are in the way only with --force; `_refuse_overwriting` has seen
+    Files of an earlier result are in the way only with --force; `refuse_overwriting` has seen
     to it. A chain that was accepted earlier is kept under another name when this result is not.
     """
     if out is None:

@@ -3,6 +3,7 @@
 """A corrected chain in the forms that controllers and other software read.
 
     dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta; exact
+    dh_standard.yaml, dh_modified.yaml the same as chain files, with base and tool; exact
     kinematics.yaml                    x y z roll pitch yaw from joint to joint; exact
     dh_without_beta.csv                the best table for controllers that know no beta
     joint_offsets.csv                  the best correction by joint offsets alone
@@ -27,7 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.chain import DH_KINDS, Chain, Frame, Joint, JointType
-from calib_ros.config import dump_yaml
+from calib_ros.config import dump_chain, dump_yaml, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identifiability import structurally_independent
 from calib_ros.leastsquares import Samples, System, minimise
@@ -86,9 +87,13 @@ def exports(
     found = []
     for convention in ('standard', 'modified'):
         form = converted(arm, convention)
-        text = _csv(form, f'{convention} Denavit-Hartenberg table', lost)
+        what = f'{convention} Denavit-Hartenberg table'
+        text = _csv(form, what, lost)
         again = _read_csv(text, form)
         found.append(_checked(f'dh_{convention}.csv', text, arm, again.forward(q), q, lost))
+        text = _head(form, what, lost) + dump_chain(form, origin)
+        again = parse_chain(text)
+        found.append(_checked(f'dh_{convention}.yaml', text, arm, again.forward(q), q, lost))
     text = kinematics_yaml(arm, origin)
     found.append(_checked('kinematics.yaml', text, arm, forward_of(text, arm, q), q, lost))
     region = q if joints is None else np.asarray(joints, dtype=np.float64)
@@ -191,11 +196,15 @@ def _matrix(pose: Mapping[str, float]) -> FloatArray:
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
+def _head(chain: Chain, what: str, error: float) -> str:
+    exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
+    return f'# {chain.name}: {what}; metres and radians; {exact}\n'
+
+
 def _csv(chain: Chain, what: str, error: float) -> str:
     """Return the table of a chain with a line that says what it is."""
     text = io.StringIO()
-    exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
-    text.write(f'# {chain.name}: {what}; metres and radians; {exact}\n')
+    text.write(_head(chain, what, error))
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(ROW)
     for joint in chain.joints:

@@ -151,6 +151,38 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     return np.asarray(root @ root.T)
 
 
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Covariance of the fitted parameters, by source of error.
+
+    Attributes
+    ----------
+    parts : (K, P, P)
+        Share of each source: position, orientation, what was known before.
+    freedom : (K,)
+        Degrees of freedom from which the size of each source was estimated; infinite where it is
+        known.
+
+    """
+
+    parts: FloatArray
+    freedom: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Return the covariance (P, P) by all sources."""
+        return np.asarray(self.parts.sum(axis=0))
+
+    def freedom_of(self, variances: FloatArray) -> FloatArray:
+        """Return the degrees of freedom (...) of a sum of variances (K, ...) from the sources.
+
+        That of Satterthwaite (1946): the spread of the sum is that of a single estimate.
+        """
+        shares = variances / np.maximum(variances.sum(axis=0), 1e-300)
+        with np.errstate(divide='ignore'):
+            return np.asarray(1.0 / np.tensordot(1.0 / self.freedom, shares**2, axes=1))
+
+
 TRADE = 1e-4
 """Least share of a parameter in a trade to be named."""
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special
+from scipy import stats
 
 from calib_ros import effects, identifiability
 from calib_ros.chain import FRAME_KINDS, Chain
@@ -22,7 +22,8 @@ from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.frames import start_frames
-from calib_ros.leastsquares import Fit, System, minimise, triangular_factor
+from calib_ros.leastsquares import minimise, triangular_factor
+from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, thorough_fit
@@ -31,25 +32,10 @@ from calib_ros.validation import Comparison, Parameter, compare, refusals, resid
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
-SHARED = 1.2
-"""Ratio from which the errors of one configuration's pairs are taken to be correlated."""
 SOME = 500
 """Pairs that are enough for a first fit."""
-SIGMA_TEST = 0.999
-"""Confidence at which the chi-squared test of the sigmas given lets them pass."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Size of the residuals in units of the sigma given, for position and orientation.
-
-    `consistent` tells whether a chi-squared test lets the sigmas pass; then they are taken as they
-    are for the standard deviations, else those found.
-    """
-
-    position: float
-    orientation: float | None
-    consistent: bool
+KNOWN = 1e9
+"""Degrees of freedom beyond which the noise is known."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +60,7 @@ class Identification:
         Nominal chain with fitted frames.
     parameters : tuple of Parameter
         Every parameter of the model.
-    names, covariance : tuple of str, (P, P)
+    names, uncertainty : tuple of str, Uncertainty
         Fitted parameters and their covariance for the noise found in the residuals.
     fitted, validation : Comparison
         Residuals on the fitted pairs and on pairs that were not fitted. The latter is None when
@@ -106,7 +92,7 @@ class Identification:
     before: Chain
     parameters: tuple[Parameter, ...]
     names: tuple[str, ...]
-    covariance: FloatArray
+    uncertainty: identifiability.Uncertainty
     fitted: Comparison
     validation: Comparison | None
     validated_by: str
@@ -134,6 +120,11 @@ class Identification:
         return len(self.names)
 
     @property
+    def covariance(self) -> FloatArray:
+        """Return the covariance (P, P) of the fitted parameters."""
+        return self.uncertainty.covariance
+
+    @property
     def unidentifiable(self) -> tuple[str, ...]:
         """Return the parameters that were free but could not be determined."""
         return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))
@@ -147,9 +138,19 @@ class Identification:
         return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
 
     def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
-        """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position."""
+        """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
+
+        By the F distribution where the size of the noise was estimated from the residuals, by
+        chi-squared (its limit) where the sigmas given are right.
+        """
+        jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
+        sources = self.uncertainty.parts
+        shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
+        freedom = self.uncertainty.freedom_of(shares)
         values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
-        length = np.sqrt(special.chdtri(3, 1.0 - level) * np.maximum(values, 0.0))
+        square = 3.0 * stats.f.ppf(level, 3, np.minimum(freedom, KNOWN))
+        square = np.where(freedom > KNOWN, stats.chi2.ppf(level, 3), square)
+        length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 
     def predicted_sigma(self, count: int = 300) -> FloatArray:
@@ -204,14 +205,14 @@ def identify(problem: Problem) -> Identification:
     factor = fit.normal.factor()
     if factor is None:
         factor = triangular_factor(fit.chain, names, system)
-    noise, covariance = _noise(fit, names, system, factor)
-    weak = _weak(problem, names, covariance)
+    noise, uncertainty = noise_of(fit, names, system, factor)
+    weak = _weak(problem, names, uncertainty.covariance)
     if weak:
         return replace(
             identify(replace(problem, priors=weak | dict(problem.priors))), weak=tuple(weak)
         )
     validation, validated_by = validate(problem, before.chain, fit.chain, names, robust)
-    parameters = _parameters(problem, fit.chain, structural, names, covariance)
+    parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
     return Identification(
@@ -219,7 +220,7 @@ def identify(problem: Problem) -> Identification:
         before=before.chain,
         parameters=parameters,
         names=names,
-        covariance=covariance,
+        uncertainty=uncertainty,
         fitted=replace(compare(before.chain, fit.chain, problem.sets), judged=~robust.outliers),
         validation=validation,
         validated_by=validated_by,
@@ -252,53 +253,6 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
     return chance_of_gain(before, frames, arm, problem.system(sets))
-
-
-def _noise(
-    fit: Fit, names: Sequence[str], system: System, factor: FloatArray
-) -> tuple[Noise, FloatArray]:
-    """Return the noise found, and the covariance of the parameters that follows from it.
-
-    Each part (position, orientation) has as many degrees of freedom as equations, less its share
-    of the parameters, trace(H^-1 H_part).
-    """
-    chain, normal = fit.chain, fit.normal
-    plain = identifiability.covariance(factor)
-    sums, counts, joint_sums = np.zeros(2), np.zeros(2), np.zeros(2)
-    for samples in system.sets:
-        for k, part in enumerate(samples.whitened_residuals(chain)):
-            weights = np.ones(len(part)) if samples.weights is None else samples.weights**2
-            known = ~np.isnan(part[:, 0])
-            sums[k] += weights[known] @ (part[known] ** 2).sum(axis=1)
-            counts[k] += part.shape[1] * weights[known].sum()
-            groups = samples.observations.configurations[known]
-            together = np.zeros((int(groups.max(initial=-1)) + 1, part.shape[1]))
-            np.add.at(together, groups, np.sqrt(weights[known])[:, np.newaxis] * part[known])
-            joint_sums[k] += (together**2).sum()
-    if not normal.parts[1].any():  # whitened as a whole, or no orientation
-        sums, counts = np.array([sums.sum(), 0.0]), np.array([counts.sum(), 0.0])
-        joint_sums = np.array([joint_sums.sum(), 0.0])
-    freedom = counts - [float(np.sum(plain * part)) for part in normal.parts]
-    known = freedom > 1e-9
-    variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
-    beyond = 0.5 * (1.0 - SIGMA_TEST)
-    low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
-    consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
-    found = Noise(
-        float(np.sqrt(variances[0])),
-        float(np.sqrt(variances[1])) if known[1] else None,
-        consistent,
-    )
-    # Pairs of one configuration share what the model lacks: they count for fewer.
-    shared = np.maximum(joint_sums / np.maximum(sums, 1e-300), 1.0)
-    if consistent and shared.max() < SHARED:
-        return found, plain
-    if not consistent:
-        shared *= variances
-    middle = sum(factor * part for factor, part in zip(shared, normal.parts, strict=True))
-    extra, _ = system.extra_rows(chain, names)
-    middle = middle + extra.T @ extra
-    return found, identifiability.covariance(factor, middle)
 
 
 def _weak(problem: Problem, names: Sequence[str], covariance: FloatArray) -> dict[str, float]:
@@ -364,10 +318,12 @@ def _parameters(
     chain: Chain,
     structural: Sequence[str],
     names: Sequence[str],
-    covariance: FloatArray,
+    uncertainty: identifiability.Uncertainty,
 ) -> tuple[Parameter, ...]:
-    of_values = _for_values(chain, names, covariance)
-    std = dict(zip(names, np.sqrt(np.diag(of_values)).tolist(), strict=True))
+    change = _to_values(chain, names)
+    variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
+    std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
+    freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
     free = set(problem.free)
     rows = []
     for name in chain.parameter_names:
@@ -378,12 +334,13 @@ def _parameters(
         else:
             status = 'gauge' if name in free else 'fixed'
         offset = chain.offset(name, problem.model)
-        rows.append(Parameter(name, chain.value(name), offset, std.get(name), status))
+        value, spread = chain.value(name), std.get(name)
+        rows.append(Parameter(name, value, offset, spread, status, freedom.get(name, np.inf)))
     return tuple(rows)
 
 
-def _for_values(chain: Chain, names: Sequence[str], covariance: FloatArray) -> FloatArray:
-    """Return the covariance of the values: of rotation vectors, where frames were turned.
+def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
+    """Return the derivative (P, P) of the values: of rotation vectors, where frames were turned.
 
     A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
     """
@@ -394,4 +351,4 @@ def _for_values(chain: Chain, names: Sequence[str], covariance: FloatArray) -> F
         if len(index) == 3:
             vector = chain.frame(frame).offsets()[3:]
             change[np.ix_(index, index)] = left_jacobian_inverse(vector)
-    return np.asarray(change @ covariance @ change.T)
+    return change

@@ -124,19 +124,32 @@ class Samples:
             turn /= self.sigmas[1]
             yield flat, turn.reshape(len(turn), -1), model
 
+    def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
+        """Yield the same rows by position and orientation, (P + 1, c, B) each, a block at a time.
+
+        Parameters stand in the order of their names, the residual last. Where orientation is
+        whitened together with the position, or not measured, there is one part only.
+        """
+        for shift, turn, model in self.blocks(chain, names):
+            order = [*model.order, len(names)]
+            found = [shift[order]]
+            if len(turn):
+                full = np.zeros((len(names) + 1, turn.shape[1]))
+                full[: model.rotations] = turn[:-1]
+                full[-1] = turn[-1]
+                found.append(full[order])
+            count = shift.shape[1] // self.width
+            yield tuple(part.reshape(len(part), -1, count) for part in found)
+
+    @property
+    def width(self) -> int:
+        """Return the number of rows of a sample's position, or of all of it where whitened."""
+        return 1 if self.distances is not None else 6 if self.whitening is not None else 3
+
     def rows_of(self, chain: Chain, names: Sequence[str]) -> FloatArray:
         """Return (N, 6, 3 or 1, P + 1) the weighted rows sample by sample, the residual last."""
-        width = 1 if self.distances is not None else 6 if self.whitening is not None else 3
-        found = []
-        for shift, turn, model in self.blocks(chain, names):
-            rows = shift.reshape(len(shift), width, -1)
-            if len(turn):
-                oriented = np.zeros_like(rows)
-                oriented[: model.rotations] = turn[:-1].reshape(model.rotations, width, -1)
-                oriented[-1] = turn[-1].reshape(width, -1)
-                rows = np.concatenate([rows, oriented], axis=1)
-            found.append(rows[[*model.order, len(names)]].transpose(2, 1, 0))
-        return np.concatenate(found)
+        found = [np.concatenate(parts, axis=1) for parts in self.parts(chain, names)]
+        return np.concatenate(found, axis=2).transpose(2, 1, 0)
 
     def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
         """Return (P + 1, 6 B): position and orientation rows mixed by each sample's whitening."""

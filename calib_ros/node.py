@@ -71,6 +71,7 @@ from calib_ros.config import (
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.export import exports
+from calib_ros.guide import Guide
 from calib_ros.intake import Stream, feed
 from calib_ros.messages import JOINT_STATE
 from calib_ros.problem import Problem
@@ -79,6 +80,7 @@ from calib_ros.selection import identify_model
 from calib_ros.session import Account, CalibrationSession, check_settings
 from calib_ros.sources import STANDARD, parse_sources
 from calib_ros.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.waypoints import read_joints
 
 try:
     from rclpy.experimental import EventsExecutor
@@ -164,6 +166,9 @@ class CalibrationNode(Node):
         self._declare(
             'marker_scale', 200.0, 'residual vectors are drawn so many times as long', False
         )
+        candidates = self._declare(
+            'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'
+        )
         settings = Settings(
             **{item.name: self._declare_setting(item) for item in fields(Settings)}
         )
@@ -209,6 +214,13 @@ class CalibrationNode(Node):
         self._residuals = self.create_publisher(MarkerArray, '~/residuals', latched)
         self._corrected_pose = self.create_publisher(PoseStamped, '~/corrected_pose', 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._guide = Guide(
+            self,
+            self.session,
+            latched,
+            self._guarded,
+            read_joints(Path(candidates).expanduser(), len(chain.joints)) if candidates else None,
+        )
         self._identify = DeferredTrigger(
             self, '~/identify', self._answer, self._snapshot, self._run
         )
@@ -238,12 +250,13 @@ class CalibrationNode(Node):
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        finished = self._identify.join(JOIN_TIMEOUT) and self._export.join(JOIN_TIMEOUT)
+        working = (self._identify, self._export, self._guide)
+        ended = [each.join(JOIN_TIMEOUT) for each in working]
         self._take_messages()
         self.session.finish()
         self._archive.close()
         self.destroy_node()
-        return finished
+        return all(ended)
 
     def _load_robot(self, name: str, links: dict[str, str | None]) -> tuple[Chain, str]:
         """Return the nominal chain, and the URDF that it comes from if it does."""
@@ -447,6 +460,7 @@ class CalibrationNode(Node):
         if result.accepted:
             self.session.adopt(result, samples)
             self._publish_calibration(result.chain, report.calibration_yaml(result, origin))
+            self._guide.show(result)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
@@ -550,6 +564,7 @@ class CalibrationNode(Node):
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
+        self._guide.advise()
         now = time.monotonic()
         span, self._looked_at = now - self._looked_at, now
         for heard in self._heard.values():
@@ -605,6 +620,7 @@ class CalibrationNode(Node):
             'calibrated': self.session.calibration is not None,
             'last identification': self._last,
             'observability': self._observability,
+            **self._guide.figures(),
             'joint states': account.joint_states,
             'poses': account.poses,
             'poses waiting': account.waiting,

@@ -8,6 +8,7 @@ arrives as garbage: everything is made a plain Python value here.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,13 +16,14 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped
+from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros.chain import DH_KINDS, Chain
 from calib_ros.identification import Identification, residuals
 from calib_ros.observations import Observations
-from calib_ros.se3 import to_quat
+from calib_ros.se3 import FloatArray, to_quat
 
 MOST_ARROWS = 1000
 
@@ -48,6 +50,28 @@ def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) ->
     point, turn = message.pose.position, message.pose.orientation
     point.x, point.y, point.z = matrix[:3, 3].tolist()
     turn.x, turn.y, turn.z, turn.w = to_quat(matrix[:3, :3]).tolist()
+    return message
+
+
+def joints(names: Sequence[str], values: FloatArray, stamp: Any) -> JointState:
+    """Return joint values (n) by name."""
+    message = JointState(name=list(names), position=values.tolist())
+    message.header.stamp = stamp
+    return message
+
+
+def cloud(fields: Sequence[str], rows: FloatArray, frame_id: str, stamp: Any) -> PointCloud2:
+    """Return rows (N, C) as points with named fields of single precision."""
+    data = np.ascontiguousarray(rows, dtype='<f4')
+    message = PointCloud2(height=1, width=len(data), is_dense=bool(np.isfinite(data).all()))
+    message.header.stamp, message.header.frame_id = stamp, frame_id
+    message.fields = [
+        PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+        for k, name in enumerate(fields)
+    ]
+    message.point_step = 4 * len(fields)
+    message.row_step = data.nbytes
+    message.data = array('B', data.tobytes())
     return message
 
 

@@ -16,7 +16,7 @@ import calib_ros
 from calib_ros import effects
 from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import Settings, dump_chain, dump_yaml
-from calib_ros.identification import Identification
+from calib_ros.identification import Identification, Noise
 from calib_ros.session import Calibration
 from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
@@ -143,6 +143,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
                 'value': p.value,
                 'offset': p.offset,
                 'std': p.std,
+                'half_width_95': p.half_width(0.95),
                 'unit': unit(p.name),
                 'status': p.status,
             }
@@ -155,6 +156,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'chance_of_gain': result.chance,
         'outliers': [asdict(outlier) for outlier in result.outliers],
         'gauges': result.gauges,
+        'covariance': {'names': list(result.names), 'matrix': result.covariance.tolist()},
         'correlated': [list(pair) for pair in result.correlated()],
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),
@@ -229,8 +231,11 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
     lines += ['', '## What the poses determine', '']
     lines += [f'- {text}' for text in identifiability_in_words(result)]
     lines += ['', '## Parameters', '']
-    lines += ['Offsets and standard deviations in mm and mrad.', '']
-    lines += ['| parameter | value [m, rad] | offset | std | |', '|---|---|---|---|---|']
+    lines += ['Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.', '']
+    lines += [
+        '| parameter | value [m, rad] | offset | std | 95 % | |',
+        '|---|---|---|---|---|---|',
+    ]
     lines += [_parameter_row(parameter) for parameter in result.parameters]
     lines += [
         '',
@@ -272,8 +277,28 @@ def noise_in_words(result: Identification) -> str:
     if noise.orientation is not None:
         text += f' and {noise.orientation:.2f} times that of orientation'
     if noise.consistent:
-        return f'{text}, which a chi-squared test lets pass'
-    return f'{text}; the sigmas given are wrong, standard deviations follow the residuals'
+        text += ', which a chi-squared test lets pass'
+    else:
+        text += '; the sigmas given are wrong, standard deviations follow the residuals'
+    return f'{text}; {neighbours_in_words(noise)}'
+
+
+NEIGHBOURS = {
+    'successive': 'measured in succession',
+    'near': 'near each other in joint space',
+}
+
+
+def neighbours_in_words(noise: Noise) -> str:
+    """Return which neighbours share errors, by how much, and what follows."""
+    if not noise.shared:
+        return 'neighbouring configurations share no errors that a test would find'
+    parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
+    return (
+        f'configurations {" and ".join(parts)} share errors, as of a drifting tracker or of '
+        'effects that the model lacks, and count for fewer: standard deviations are '
+        f'{noise.widened:.1f} times those of independent errors'
+    )
 
 
 def chance_in_words(result: Identification) -> list[str]:
@@ -323,10 +348,12 @@ def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
 
 
 def _parameter_row(p: Parameter) -> str:
+    width = p.half_width(0.95)
     std = '' if p.std is None else f'{1e3 * p.std:.4f}'
+    within = '' if width is None else f'{1e3 * width:.4f}'
     offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
     note = '' if p.status == 'fitted' else p.status
-    return f'| {p.name} | {p.value:.9f} | {offset} | {std} | {note} |'
+    return f'| {p.name} | {p.value:.9f} | {offset} | {std} | {within} | {note} |'
 
 
 def against_truth(result: Identification, truth: Chain) -> str:

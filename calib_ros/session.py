@@ -21,7 +21,7 @@ from calib_ros.config import Settings
 from calib_ros.delays import Delay, Watch
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
-from calib_ros.live import LiveEstimate, barely_moved
+from calib_ros.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Frames, Sample, collect
@@ -172,7 +172,7 @@ class CalibrationSession:
         self._frame_ids: dict[str, list[str]] = {}
         self._layouts: dict[tuple[str, ...], Layout] = {}
         self._foreign_names: list[str] = []
-        self._live = LiveEstimate(self._problem_of)
+        self._live = LiveEstimate(self.problem_of)
 
     def change(self, settings: Settings) -> None:
         """Go on with other settings; the buffers and samples stay.
@@ -407,11 +407,16 @@ class CalibrationSession:
             f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
         )
 
+    @property
+    def estimate(self) -> Estimate | None:
+        """Return what the samples so far tell; None while they are too few."""
+        return self._live.update(self.samples)
+
     def status(self) -> str:
         """Return in words how far the samples have come."""
         fitted = [sample for sample in self.samples if not sample.validation]
         words = [f'{len(fitted)} samples']
-        estimate = self._live.update(self.samples)
+        estimate = self.estimate
         wanted = self.settings.wanted_accuracy
         if estimate is not None:
             more = estimate.more_for(wanted)
@@ -450,9 +455,17 @@ class CalibrationSession:
                     'needed: set frame_id (--frame-id) to the one to use, or give each source a '
                     'device of its own; then clear and measure again'
                 )
-        return self._problem_of(self.samples)
+        return self.problem_of(self.samples)
 
-    def _problem_of(self, samples: Sequence[Sample]) -> Problem:
+    def problem_of(self, samples: Sequence[Sample]) -> Problem:
+        """Return samples as a problem.
+
+        Raises
+        ------
+        InputError
+            When there is none to fit.
+
+        """
         settings = self.settings
         fitted, held_out = collect(samples, (settings.sigma_position, settings.sigma_orientation))
         if not fitted:

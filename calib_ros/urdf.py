@@ -33,6 +33,8 @@ from calib_ros.se3 import FloatArray
 
 DIGITS = 14
 """Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
+POSES = 1000
+"""Random poses at which a corrected URDF, read back, is held against the arm."""
 EXACT = 1e-9
 """Largest difference [m or 1] of poses by a corrected chain and by the URDF written from it."""
 FAR = 0.2
@@ -146,7 +148,7 @@ def corrected_urdf(
         origins[joint.name] = se3.invert(parent) @ pose
     edited = with_origins(text, origins)
     found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
-    q = arm.random_joints(20, np.random.default_rng(0))
+    q = arm.random_joints(POSES, np.random.default_rng(0))
     if np.abs(found.forward(q) - arm.forward(q)).max() > EXACT:
         raise ConfigError(
             f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '

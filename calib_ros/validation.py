@@ -31,7 +31,8 @@ class Parameter:
     """One parameter of the model: m for lengths, rad for angles.
 
     `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
-    do not determine it) or 'fixed'; all but the first keep the nominal value.
+    do not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
+    degrees of freedom from which `std` was estimated; infinite where the noise is known.
     """
 
     name: str
@@ -39,6 +40,13 @@ class Parameter:
     offset: float
     std: float | None
     status: str
+    freedom: float = np.inf
+
+    def half_width(self, level: float = 0.95) -> float | None:
+        """Return half the width of the interval that holds the truth, by Student's t."""
+        if self.std is None:
+            return None
+        return self.std * float(special.stdtrit(self.freedom, 0.5 + 0.5 * level))
 
 
 @dataclass(frozen=True)

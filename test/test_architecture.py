@@ -19,29 +19,33 @@ ORDER = [
     {'chain'},
     {'urdf'},
     {'config', 'differential', 'observations'},
-    {'identifiability', 'leastsquares', 'messages', 'samples', 'track'},
-    {'cdr', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
-    {'robust'},
-    {'collector', 'export', 'frames', 'journal'},
+    {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
+    {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
+    {'following', 'robust', 'waypoints'},
+    {'compensation'},
+    {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
-    {'chance', 'live', 'validation'},
+    {'chance', 'live', 'noise', 'validation'},
     {'identification'},
-    {'selection', 'salvage'},
-    {'session', 'plots'},
+    {'design', 'salvage', 'selection', 'workspace'},
+    {'candidates', 'placement', 'verification'},
+    {'planning', 'plots', 'session', 'testposes'},
     {'intake', 'report'},
     {'replay'},
-    {'deferred', 'outgoing'},
+    {'deferred', 'options', 'outgoing'},
+    {'commands', 'guide'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'outgoing'}
+ROS = {'node', 'deferred', 'guide', 'outgoing'}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,
     'geometry_msgs': ROS,
+    'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config', 'export'},
+    'yaml': {'config', 'export', 'programs'},
 }
 
 

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import csv
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,9 +12,17 @@ from hypothesis import strategies as st
 
 from calib_ros import export
 from calib_ros.chain import Chain, Joint
-from calib_ros.config import load_chain, shipped_robots
+from calib_ros.cli import main
+from calib_ros.config import (
+    calibration_record,
+    dump_chain,
+    load_chain,
+    parse_chain,
+    shipped_robots,
+)
 from calib_ros.export import ExportError, converted, exports, forward_of, kinematics_yaml
 from calib_ros.simulation import Cell, faulty
+from calib_ros.waypoints import joints_csv
 
 KEYS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 ROBOTS = sorted(shipped_robots())
@@ -32,6 +41,18 @@ def scara():
         Joint('j4', d=0.05),
     )
     return Chain('scara', 'standard', rows)
+
+
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_a_table_in_yaml_is_a_chain_file_with_its_origin(convention):
+    nominal, chain = corrected('ur10e')
+    found = exports(chain, nominal, origin={'robot_serial': '2019'})
+    text = next(each for each in found if each.name == f'dh_{convention}.yaml').content
+    again = parse_chain(text)
+    assert again.convention == convention
+    assert calibration_record(text) == {'robot_serial': '2019'}
+    q = chain.random_joints(100, np.random.default_rng(2))
+    np.testing.assert_allclose(again.forward(q), chain.forward(q), rtol=0, atol=1e-9)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([*ROBOTS, 'scara']))
@@ -105,3 +126,35 @@ def test_a_file_that_differs_is_refused(monkeypatch):
     monkeypatch.setattr(export, '_xyz_rpy', lambda matrix: dict.fromkeys(KEYS, 0.0))
     with pytest.raises(ExportError, match=r'kinematics\.yaml, read back, differs'):
         exports(chain, nominal)
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Return a function that exports on the command line and returns the files by name."""
+    monkeypatch.chdir(tmp_path)
+    _, chain = corrected('ur10e', 3)
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(chain, {'samples': 60}))
+
+    def run(*arguments):
+        common = ['export', 'calibration.yaml', '--chain', 'ur10e', '--out', 'out', '--force']
+        assert main([*common, *arguments]) == 0
+        return {path.name: path.read_text() for path in (tmp_path / 'out').iterdir()}
+
+    return run
+
+
+def test_the_command_line_hands_on_where_the_numbers_come_from(files):
+    for name, text in files().items():
+        if name.endswith('.yaml'):
+            assert yaml.safe_load(text)['calibration'] == {'samples': 60}
+
+
+def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
+    rng = np.random.default_rng(4)
+    near = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2]) + rng.uniform(-0.2, 0.2, (300, 6))
+    (tmp_path / 'measured.csv').write_text(joints_csv(near))
+
+    def error(found):
+        return float(re.search('up to (.*) mm off', found['dh_without_beta.csv']).group(1))
+
+    assert error(files('--measured', 'measured.csv')) < 0.5 * error(files())

@@ -40,7 +40,7 @@ def seen(true, count, rng, oriented=True, start=0, **more):
 
 def growing(samples, **settings):
     """Return a live estimate that has seen a list grow, and what it said each time."""
-    live = LiveEstimate(session(**settings)._problem_of)
+    live = LiveEstimate(session(**settings).problem_of)
     said = [live.update(samples[: k + 1]) for k in range(len(samples))]
     return live, said
 
@@ -58,7 +58,7 @@ def test_at_the_end_it_is_the_batch(oriented, seed):
     rng = np.random.default_rng(seed)
     samples = seen(faulty(UR10E, Cell(), rng), 80, rng, oriented)
     live, said = growing(samples)
-    batch = identify(session()._problem_of(samples))
+    batch = identify(session().problem_of(samples))
     assert apart(said[-1].chain, batch.chain, rng) < 0.05 * NOISE[0]
     assert said[-1].noise == pytest.approx(1.0, abs=0.15)
     predicted = np.sqrt(np.mean(batch.predicted_sigma() ** 2))
@@ -90,7 +90,7 @@ def test_it_begins_early_and_only_gets_better(rng):
 def test_one_by_one_or_all_at_once_is_the_same(rng):
     samples = seen(faulty(UR10E, Cell(), rng), 60, rng)
     _, said = growing(samples)
-    once = LiveEstimate(session()._problem_of).update(samples)
+    once = LiveEstimate(session().problem_of).update(samples)
     assert apart(said[-1].chain, once.chain, rng) < 0.02 * NOISE[0]
     assert once.sigma == pytest.approx(said[-1].sigma, rel=0.02)
 
@@ -125,7 +125,7 @@ def test_several_devices_and_targets(rng):
     samples += seen(other, 20, rng, start=100, device='B')
     samples += seen(third, 20, rng, oriented=False, start=200, target='ball')
     live, said = growing(samples)
-    batch = identify(session()._problem_of(samples))
+    batch = identify(session().problem_of(samples))
     assert set(said[-1].chain.frame_names) == {'base', 'tool', 'base_B', 'tool_ball'}
     assert apart(said[-1].chain, batch.chain, rng) < 0.1 * NOISE[0]
     assert live.suspicious == []
@@ -167,7 +167,7 @@ def test_after_a_restart_a_sample_that_was_taken_back_counts_no_longer(rng):
     samples = seen(faulty(UR10E, Cell(), rng), 40, rng)
     live, _ = growing(samples)
     live.restart()
-    expected = LiveEstimate(session()._problem_of).update(samples[:30])
+    expected = LiveEstimate(session().problem_of).update(samples[:30])
     found = live.update(samples[:30])
     assert found.samples == 30
     assert apart(found.chain, expected.chain, rng) < 1e-12

@@ -19,6 +19,8 @@ from calib_ros.urdf import chain_from_urdf
 TABLES = {
     'dh_standard.csv',
     'dh_modified.csv',
+    'dh_standard.yaml',
+    'dh_modified.yaml',
     'kinematics.yaml',
     'dh_without_beta.csv',
     'joint_offsets.csv',

@@ -95,12 +95,13 @@ def test_rviz_shows_what_the_node_publishes():
     content = yaml.safe_load((ROOT / 'config/calibration.rviz').read_text())
     manager = content['Visualization Manager']
     topics = {d['Class']: d['Topic'] for d in manager['Displays'] if 'Topic' in d}
-    node = (ROOT / 'calib_ros/node.py').read_text()
+    node = ''.join((ROOT / f'calib_ros/{name}.py').read_text() for name in ('node', 'guide'))
     for topic in topics.values():
         assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in node
-    # The residuals are published once: a display that comes later must ask for the last ones.
-    residuals = topics['rviz_default_plugins/MarkerArray']
-    assert residuals['Durability Policy'] == 'Transient Local'
+    # These are published once: a display that comes later must ask for the last ones.
+    for kind in ('MarkerArray', 'PointCloud2'):
+        latched = topics[f'rviz_default_plugins/{kind}']
+        assert latched['Durability Policy'] == 'Transient Local'
 
 
 def test_the_document_of_the_node_lists_every_setting():

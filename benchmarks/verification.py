@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How often do the limits of `calib_ros verify` hold the true RMS error?
+
+    CALIB_ROS_DATA=FOLDER python benchmarks/verification.py [--quick] [--json]
+
+Every limit is one-sided at 95 %: the share of draws in which the upper (lower) limit is above
+(below) the truth should be 0.95 or a little more.
+
+Measured robots: 5, 10 and 20 of the held-out poses, drawn at random, against all of them.
+
+Simulated UR10e: an arm with errors is identified from 40 measured poses, corrected, and measured
+at the five test poses of ISO 9283 (noise as in the identification), against the true RMS error
+over 500 positions in the same cube with the same orientation (`cube`), and over the whole joint
+range (`range`), of which five poses in one orientation tell less.
+"""
+
+import argparse
+import json
+import os
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+from real_robots import DATA, problem_of
+
+from calib_ros import inverse
+from calib_ros.config import load_chain
+from calib_ros.design import Design
+from calib_ros.identification import Problem, identify, residuals
+from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.testposes import iso_9283_poses
+from calib_ros.verification import verify
+from calib_ros.workspace import CalibratedArm
+
+SETS = (
+    ('ur10_ipa_leica', 'B'),
+    ('ur5_jacobi_lasertracker', 'grid'),
+    ('wam7_jacobi_lasertracker', 'grid'),
+    ('positioner_2axis_pose', 'all'),
+    ('fr3_camera_eyeinhand', 'all'),
+)
+NOISE = (5e-5, 2e-4)
+
+
+def rms(errors):
+    """Return the RMS length of errors (N, 3)."""
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def shares(found, truth):
+    """Return how often the limits of verifications hold."""
+    upper = np.mean([each.upper >= truth for each, truth in zip(found, truth, strict=True)])
+    lower = np.mean([each.lower <= truth for each, truth in zip(found, truth, strict=True)])
+    return {'upper': float(upper), 'lower': float(lower)}
+
+
+def measured(name, session, draws):
+    """Return how often the limits hold on a measured robot, by the number of poses."""
+    problem = problem_of(name, session, 'chain.yaml')
+    result = identify(problem)
+    arm = CalibratedArm.of(result)
+    held_out = problem.judging[0].select(result.validation.judged)
+    _, first = np.unique(held_out.configurations, return_index=True)
+    held_out = held_out.select(first)
+    truth = rms(residuals(arm.after, held_out).position)
+    rng = np.random.default_rng(0)
+    row = {}
+    for count in (5, 10, 20):
+        found = [
+            verify(arm, [held_out.select(rng.permutation(len(held_out))[:count])], truth)
+            for _ in range(draws)
+        ]
+        row[f'{count} poses'] = shares(found, [truth] * draws)
+    return row
+
+
+def simulated(draws):
+    """Return how often the limits hold at the test poses of ISO 9283."""
+    nominal = load_chain('ur10e')
+    rng = np.random.default_rng(1)
+    found, in_cube, in_range = [], [], []
+    for seed in range(draws):
+        true = faulty(nominal, Cell(), rng)
+        seen = measure(true, nominal.random_joints(40, rng), rng, *NOISE)
+        problem = Problem(nominal, seen, held_out=seen.select(np.arange(1)))
+        result = identify(problem)
+        design = Design.of(problem, result)
+        tests = iso_9283_poses(design, np.random.default_rng(seed))
+        found.append(
+            verify(CalibratedArm.of(result), [measure(true, tests.joints, rng, *NOISE)], 1e-4)
+        )
+        poses = np.repeat(design.targets(tests.joints[:1]), 500, axis=0)
+        turn = result.chain.base.matrix[:3, :3]
+        poses[:, :3, 3] += rng.uniform(-0.4, 0.4, (500, 3)) * tests.edge @ turn.T
+        cube = inverse.solve(result.chain, poses, np.repeat(tests.joints[:1], 500, axis=0))
+        for truths, joints in (
+            (in_cube, cube.joints[cube.converged]),
+            (in_range, nominal.random_joints(500, rng)),
+        ):
+            error = measure(true, joints, rng, *NOISE).positions
+            truths.append(rms(error - result.chain.forward(joints)[:, :3, 3]))
+    return {'cube': shares(found, in_cube), 'range': shares(found, in_range)}
+
+
+def main():
+    """Run everything and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--quick', action='store_true', help='fewer draws')
+    parser.add_argument('--json', action='store_true')
+    options = parser.parse_args()
+    table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 200)}
+    for name, session in SETS:
+        if DATA.is_dir():
+            table[f'{name}/{session}'] = measured(name, session, 100 if options.quick else 2000)
+    if options.json:
+        print(json.dumps(table, indent=2))
+        return
+    if not DATA.is_dir():
+        print(f'no measured robots at {DATA}; set CALIB_ROS_DATA')
+    for label, row in table.items():
+        cells = (f'{k}: {v["upper"]:.3f} upper, {v["lower"]:.3f} lower' for k, v in row.items())
+        print(f'{label:32} ' + '; '.join(cells))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of poses (CSV) that hold nothing measured: candidates, tasks, plans.
+
+Joint values are in q1 ... qn [rad or m], poses in x y z [m] and qx qy qz qw.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib_ros import se3
+from calib_ros.config import QUATERNION_TOLERANCE
+from calib_ros.errors import InputError
+from calib_ros.se3 import FloatArray
+
+POSE = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+
+
+def read_joints(path: Path, joints: int) -> FloatArray:
+    """Read joint values (N, joints) [rad or m] from the columns q1 ... qn of a CSV.
+
+    Raises
+    ------
+    InputError
+        For a missing column, no row, or a value that is no number.
+
+    """
+    return _read(path, joint_columns(joints))[0]
+
+
+def read_poses(path: Path) -> FloatArray:
+    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV.
+
+    Raises
+    ------
+    InputError
+        For a missing column, no row, a value that is no number, or a quaternion that is none.
+
+    """
+    numbers, lines = _read(path, POSE)
+    length = np.linalg.norm(numbers[:, 3:], axis=1)
+    for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE).tolist():
+        raise InputError(
+            f'{path}, line {lines[k]}: quaternion qx qy qz qw has length {length[k]:.6g}, '
+            'expected 1'
+        )
+    return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
+
+
+def joint_columns(joints: int) -> list[str]:
+    """Return the names of the columns of joint values."""
+    return [f'q{k + 1}' for k in range(joints)]
+
+
+def joints_csv(joints: FloatArray) -> str:
+    """Return the CSV text of joint values (N, n), as `read_joints` reads it."""
+    return csv_of(joint_columns(joints.shape[1]), joints)
+
+
+def csv_of(columns: Sequence[str], values: FloatArray) -> str:
+    """Return the CSV text of values (N, C); NaN is left empty."""
+    rows = (
+        ','.join('' if math.isnan(value) else f'{value:.9f}' for value in row)
+        for row in values.tolist()
+    )
+    return '\n'.join([','.join(columns), *rows]) + '\n'
+
+
+def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
+    """Return the values (N, C) of some columns, and the line of each row."""
+    try:
+        with path.open(encoding='utf-8-sig', newline='') as file:
+            reader = csv.DictReader(file, strict=True)
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as err:
+        raise InputError(f'cannot read {path}: {err}') from err
+    header = reader.fieldnames or []
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise InputError(
+            f'{path} has no column {", ".join(missing)}; expected {", ".join(columns)}; found '
+            f'{", ".join(header) or "nothing"}'
+        )
+    if not rows:
+        raise InputError(f'{path} has no rows')
+    numbers = [
+        [_number(row[name], f'{path}, line {line}: {name}') for name in columns]
+        for line, row in rows
+    ]
+    return np.array(numbers), [line for line, _ in rows]
+
+
+def _number(text: str | None, where: str) -> float:
+    try:
+        number = float(text or 'blank')
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        found = 'the row ends before it' if text is None else f'not {text!r}'
+        raise InputError(f'{where} must be a number, {found}')
+    return number
