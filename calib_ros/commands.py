@@ -109,16 +109,20 @@ def _add_workspace(parser: argparse.ArgumentParser) -> None:
     add('--force', action='store_true', help='overwrite files in --out')
 
 
-def _add_verify(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add('measured', type=Path, help='table of new measurements: q1..qn as reported, x y z ...')
-    add_chain(parser)
-    add(
+def _add_calibration(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
         '--calibration',
         type=Path,
         required=True,
         help='folder of identify --out, or calibration.yaml alone',
     )
+
+
+def _add_verify(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('measured', type=Path, help='table of new measurements: q1..qn as reported, x y z ...')
+    add_chain(parser)
+    _add_calibration(parser)
     add('--tolerance', type=float, required=True, metavar='MM', help='wanted RMS position error')
     add(
         '--commanded',
@@ -138,9 +142,7 @@ def _add_compensate(parser: argparse.ArgumentParser) -> None:
         'program', type=Path, help='.csv with q1 ... qn, or .yaml with a JointTrajectory'
     )
     add_chain(parser)
-    parser.add_argument(
-        '--calibration', required=True, help='calibration.yaml of calib_ros identify'
-    )
+    _add_calibration(parser)
     parser.add_argument('--out', type=Path, required=True, help='the corrected program')
     parser.add_argument('--force', action='store_true', help='overwrite --out')
     parser.add_argument(
@@ -366,7 +368,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 def _compensate(options: argparse.Namespace) -> int:
     from calib_ros.compensation import POSITIVE, Compensator, compensate_program, in_words
-    from calib_ros.config import load_chain
+    from calib_ros.config import load_calibration, load_chain
     from calib_ros.files import write_file
     from calib_ros.programs import read_program
 
@@ -376,7 +378,8 @@ def _compensate(options: argparse.Namespace) -> int:
         raise InputError(
             '--out is the program itself: keep it, a program compensated twice is wrong'
         )
-    nominal, calibrated = load_chain(options.chain), load_chain(options.calibration)
+    nominal = load_chain(options.chain)
+    calibrated = load_calibration(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
     compensator = Compensator(nominal, calibrated, tuple(options.tool), **limits)
     source = read_program(options.program, nominal.joint_names)

@@ -21,7 +21,7 @@ from calib_ros.compensation import (
     compensate_program,
     in_words,
 )
-from calib_ros.config import dump_chain, load_chain, shipped_robots
+from calib_ros.config import dump_chain, load_chain, nominal_record, shipped_robots
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.following import POSITION_FIRST, mobility
 from calib_ros.identification import Problem, identify
@@ -641,7 +641,7 @@ def trajectory(q, names=UR.joint_names, **more):
 @pytest.fixture
 def run(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'calibration.yaml').write_text(dump_chain(UR_TRUE))
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(UR_TRUE, {'source': 'simulation'}))
 
     def run(program, *arguments, chain='ur10e', out='out'):
         out = f'{out}{program.suffix}'
@@ -652,6 +652,29 @@ def run(capsys, tmp_path, monkeypatch):
         return status, said, err
 
     return run
+
+
+def test_chains_given_the_wrong_way_round_are_refused(run, tmp_path):
+    """The correction would go the wrong way, and double the error."""
+    path = tmp_path / 'program.csv'
+    path.write_text(TABLE)
+    (tmp_path / 'nominal.yaml').write_text(dump_chain(UR))
+    swapped = ('--calibration', 'nominal.yaml')
+    status, _, err = run(path, *swapped, chain='calibration.yaml')
+    assert status == 1
+    assert 'is a chain, but no calibration' in err
+    assert not (tmp_path / 'out.csv').exists()
+
+
+def test_the_calibration_of_a_cousin_is_refused(run, tmp_path):
+    """A tenth of the poses could be corrected from one arm to the other, by centimetres."""
+    path = tmp_path / 'program.csv'
+    path.write_text(TABLE)
+    record = {'accepted': True, 'nominal': nominal_record(ROBOTS['ur10'])}
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
+    status, _, err = run(path)
+    assert status == 1
+    assert 'identified from another nominal chain' in err
 
 
 def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):

@@ -157,10 +157,19 @@ def test_a_chain_alone_has_no_sigma(cell, tmp_path):
 def test_frames_that_are_fixed_stay(cell, tmp_path):
     _, result = cell
     fixed = result.chain.with_frame('base', Frame(result.chain.base.matrix, fixed=True))
-    (tmp_path / 'chain.yaml').write_text(dump_chain(fixed))
+    (tmp_path / 'chain.yaml').write_text(dump_chain(fixed, {'source': 'a test'}))
     arm = CalibratedArm.read(tmp_path / 'chain.yaml', UR)
     np.testing.assert_allclose(arm.before.base.matrix, result.chain.base.matrix, atol=1e-12)
     assert np.abs(arm.before.tool.matrix - result.chain.tool.matrix).max() > 1e-5
+
+
+def test_a_calibration_knows_its_nominal_chain(cell, tmp_path):
+    _, result = cell
+    write_result(tmp_path, result)
+    CalibratedArm.read(tmp_path, UR)
+    other = UR.with_offsets({'elbow_joint.d': 1e-6})
+    with pytest.raises(ConfigError, match=r'another nominal chain, with elbow_joint\.d 0 and'):
+        CalibratedArm.read(tmp_path, other)
 
 
 def test_results_that_cannot_be_used_are_refused(cell, tmp_path):
