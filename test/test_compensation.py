@@ -566,6 +566,25 @@ def test_velocities_and_accelerations_are_those_of_the_corrected_path(name, gear
     assert np.abs(program.accelerations[1:-1] - bend).max() > 2e-3
 
 
+def test_a_correction_that_swings_between_sparse_samples_is_refused():
+    """Near the wrist's singularity; two samples alone do not show a jump."""
+    q = np.array([[0.3, -1.0, 1.2, -1.0, 0.05, 0.2], [0.9, -1.4, 0.8, -1.6, 1.0, 0.6]])
+    speeds = np.tile([0.0, 0.0, 0.0, 0.0, -0.5, 0.0], (2, 1))
+    true = UR.with_offsets({'wrist_1_joint.alpha': 2e-3, 'shoulder_lift_joint.alpha': 2e-3})
+    compensator = Compensator(UR, true)
+    assert compensate(compensator, q).refusals == ()
+    corrected, result = compensate_program(compensator, Program(UR.joint_names, q, speeds))
+    assert only_refusal(result).sample == 0
+    assert 'moves at' in only_refusal(result).reason
+    assert np.isnan(corrected.velocities[0]).all()
+    assert np.isnan(corrected.positions[0]).all()
+    assert np.isfinite(corrected.velocities[1]).all()
+    lenient = replace(compensator, largest_change=5.0)
+    allowed, result = compensate_program(lenient, Program(UR.joint_names, q, speeds))
+    assert result.refusals == ()
+    assert np.abs(allowed.velocities - speeds)[0].max() > 0.25
+
+
 def test_an_arm_at_rest_keeps_its_rest():
     q = np.repeat(regular(UR, 1), 3, axis=0)
     program = Program(UR.joint_names, q, np.zeros_like(q), np.zeros_like(q))
