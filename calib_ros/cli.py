@@ -265,7 +265,7 @@ def _export(options: argparse.Namespace) -> int:
     chain, origin = parse_calibration(read_text(path), str(path), nominal)
     measured = None
     if options.measured is not None:
-        measured = read_joints(options.measured, len(chain.joints))
+        measured = read_joints(options.measured, chain)
     found = exports(chain, nominal, measured, origin)
     if options.urdf is not None:
         links = (options.base_link, options.tip_link)

@@ -223,14 +223,14 @@ def _plan_measurement(
     if len(options.velocity) not in (1, size):
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
-        design = design.after(read_joints(options.taken, size))
+        design = design.after(read_joints(options.taken, design.chain))
     task = design.chain.random_joints(TASK_POSES, rng)
     if options.task is not None:
-        task = read_joints(options.task, size)
+        task = read_joints(options.task, design.chain)
     if options.candidates is None:
         candidates = draw_candidates(design, options.draw, rng, visibility)
     else:
-        candidates = read_joints(options.candidates, size)
+        candidates = read_joints(options.candidates, design.chain)
         candidates = candidates[visibility.sees(design, candidates)]
         if not len(candidates):
             raise InputError(f'the target can be measured at no pose of {options.candidates}')
@@ -261,6 +261,9 @@ def _plan_tests(
 
 def _check_plan(options: argparse.Namespace) -> None:
     """Refuse options of `plan` that make no sense."""
+    for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
+        if options.iso9283 and getattr(options, name) is not None:
+            raise InputError(f'--{name} is of no use with --iso9283')
     for name, lowest in (('poses', 1), ('draw', 1), ('seed', 0)):
         value = getattr(options, name)
         if value is not None and value < lowest:
@@ -334,6 +337,8 @@ def _task(
             f'{len(options.joint_box)} in all'
         )
     lower, upper = np.reshape(options.joint_box, (2, size))
+    if not (lower <= upper).all():
+        raise InputError('--joint-box: give all lower values first, then all upper ones')
     joints = rng.uniform(lower, upper, (BOX_POSES, size))
     return task_of(in_base(arm.commanded_by(options.model), joints))
 
@@ -351,7 +356,7 @@ def _verify(options: argparse.Namespace) -> int:
     table = read_table(options.measured, len(nominal.joints), sessions)
     commanded = None
     if options.commanded is not None:
-        commanded = read_joints(options.commanded, len(nominal.joints))
+        commanded = read_joints(options.commanded, nominal)
     found = verify(
         arm,
         (*table.fitted, *table.held_out),

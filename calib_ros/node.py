@@ -205,7 +205,7 @@ class CalibrationNode(Node):
             self.session,
             latched,
             self._guarded,
-            read_joints(Path(candidates).expanduser(), len(chain.joints)) if candidates else None,
+            read_joints(Path(candidates).expanduser(), chain) if candidates else None,
         )
         self._identify = DeferredTrigger(
             self, '~/identify', self._answer, self._snapshot, self._run

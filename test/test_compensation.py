@@ -673,6 +673,15 @@ def run(capsys, tmp_path, monkeypatch):
     return run
 
 
+def test_a_program_of_more_joints_than_the_arm_has_is_refused(run, tmp_path):
+    """Its columns may begin with those of another axis."""
+    path = tmp_path / 'program.csv'
+    path.write_text('q1,q2,q3,q4,q5,q6,q7\n1.2,0.1,-1.4,1.1,-1.2,0.7,0.1\n')
+    status, _, err = run(path)
+    assert status == 1
+    assert 'column q7, but the arm has 6 joints only' in err
+
+
 def test_chains_given_the_wrong_way_round_are_refused(run, tmp_path):
     """The correction would go the wrong way, and double the error."""
     path = tmp_path / 'program.csv'

@@ -339,6 +339,9 @@ def test_a_task_out_of_reach_is_refused(cell, task):
     far[0, 0, 3] = 10.0
     with pytest.raises(InputError, match='reaches all 12 poses of the task at none'):
         place(arm, far, cells=3)
+    for upper in ([0.2, 1.0, 1.0], [np.nan, 1.0, 1.0]):
+        with pytest.raises(InputError, match='give the lower corner first'):
+            place(arm, task, region=np.array([[0.3, -1.0, 0.0], upper]))
     with pytest.raises(UnknownNameError, match='aim "least"'):
         place(arm, task, 'least')
 
@@ -407,7 +410,7 @@ def test_workspace_places_a_task(run, folder, tmp_path, task):
     assert (status, err) == (0, '')
     files = {path.name for path in (tmp_path / 'map').iterdir()}
     assert files == {*WORKSPACE_FILES, *PLACEMENT_FILES}
-    joints = read_joints(tmp_path / 'map' / 'placed_task.csv', 6)
+    joints = read_joints(tmp_path / 'map' / 'placed_task.csv', UR)
     with (tmp_path / 'map' / 'placements.csv').open() as file:
         rows = list(csv.DictReader(file))
     reached = [row for row in rows if row['error']]
@@ -434,6 +437,7 @@ def test_workspace_takes_a_box_of_joint_values(run, folder):
     ('arguments', 'text'),
     [
         (('--joint-box', 0, 1), '--joint-box: give 6 lower and 6 upper values, not 2'),
+        (('--joint-box', *[1.0] * 6, *[-1.0] * 6), '--joint-box: give all lower values first'),
         (('--poses', 1), '--poses must be at least 100'),
         (('--task', 'missing.csv'), 'cannot read missing.csv'),
         (('--task', 'x.csv', '--joint-box', 0), 'either --task or --joint-box'),
