@@ -372,10 +372,13 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _compensate(options: argparse.Namespace) -> int:
+    import numpy as np
+
     from calib_ros.compensation import POSITIVE, Compensator, compensate_program, in_words
-    from calib_ros.config import load_calibration, load_chain
+    from calib_ros.config import load_chain
     from calib_ros.files import write_file
     from calib_ros.programs import read_program
+    from calib_ros.workspace import CalibratedArm
 
     if options.out.exists() and not options.force:
         raise InputError(f'{options.out} exists already: choose another name or --force')
@@ -384,9 +387,9 @@ def _compensate(options: argparse.Namespace) -> int:
             '--out is the program itself: keep it, a program compensated twice is wrong'
         )
     nominal = load_chain(options.chain)
-    calibrated = load_calibration(options.calibration, nominal)
+    arm = CalibratedArm.read(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
-    compensator = Compensator(nominal, calibrated, tuple(options.tool), **limits)
+    compensator = Compensator(nominal, arm.after, tuple(options.tool), **limits)
     source = read_program(options.program, nominal.joint_names)
     corrected, result = compensate_program(compensator, source.program)
     if result.refusals:
@@ -396,4 +399,17 @@ def _compensate(options: argparse.Namespace) -> int:
         return NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     print(f'wrote {options.out}: {in_words(compensator, result)}')
+    shift, turn = arm.sigma(result.joints), arm.sigma_turned(result.joints)
+    if arm.covariance is not None:
+        print(
+            f'sigma of the calibration at these poses: {1e3 * shift.max():.3f} mm where the '
+            f'target was, {1e3 * turn.max():.3f} mrad at most'
+        )
+    if np.sum(turn**2) > np.sum(result.orientation_before**2):
+        print(
+            'warning: the calibration does not know the orientation well enough to correct it; '
+            'positions hold near the measured target only. Measure orientations as well, or a '
+            'target further off the last axis',
+            file=sys.stderr,
+        )
     return 0

@@ -110,13 +110,20 @@ class CalibratedArm:
 
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the standard deviation (N,) [m] of predicted positions; NaN if not known."""
+        return self._sigma(joints, slice(0, 3))
+
+    def sigma_turned(self, joints: FloatArray) -> FloatArray:
+        """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
+        return self._sigma(joints, slice(3, 6))
+
+    def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
         if self.covariance is None:
             return np.full(len(joints), np.nan)
         model = ErrorModel(self.after, self.names)
         squares = np.empty(len(joints))
         for first in range(0, len(joints), BLOCK):
             part = slice(first, first + BLOCK)
-            rows = model.jacobian(joints[part])[:, :3]
+            rows = model.jacobian(joints[part])[:, components]
             squares[part] = np.einsum('ncp,pq,ncq->n', rows, self.covariance, rows, optimize=True)
         return np.sqrt(np.maximum(squares, 0.0))
 

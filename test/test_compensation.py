@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from calib_ros.identification import Problem, identify
 from calib_ros.inverse import solve_positive
 from calib_ros.options import NOT_ACCEPTED
 from calib_ros.programs import read_program
+from calib_ros.report import as_document, calibration_yaml
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
 CELL = Cell(length_error=1e-3, angle_error=1e-3)
@@ -680,6 +682,24 @@ def test_a_program_of_more_joints_than_the_arm_has_is_refused(run, tmp_path):
     status, _, err = run(path)
     assert status == 1
     assert 'column q7, but the arm has 6 joints only' in err
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_the_command_line_says_how_well_the_orientation_is_known(run, tmp_path, capsys, oriented):
+    """By positions of a target on the last axis alone it is not, and a long tool would be off."""
+    rng = np.random.default_rng(1)
+    true = UR_TRUE.with_frame('tool', Frame(se3.transform(np.eye(3), np.array([0, 0, 0.01]))))
+    seen = measure(true, UR.random_joints(60, rng), rng, 1e-4, 3e-4, oriented=oriented)
+    found = identify(Problem(UR, seen, sigma_position=1e-4))
+    folder = tmp_path / 'result'
+    folder.mkdir()
+    (folder / 'calibration.yaml').write_text(calibration_yaml(found))
+    (folder / 'result.json').write_text(json.dumps(as_document(found, {})))
+    (tmp_path / 'program.csv').write_text(TABLE)
+    status, said, err = run(tmp_path / 'program.csv', '--calibration', 'result')
+    assert status == 0
+    assert 'sigma of the calibration at these poses: 0.0' in said
+    assert ('does not know the orientation' in err) is not oriented
 
 
 def test_chains_given_the_wrong_way_round_are_refused(run, tmp_path):
