@@ -6,13 +6,21 @@
 
 Four processes: the node; a publisher of joint states and poses of an arm that moves and stops; a
 node with empty callbacks on the same executor, which hears the same messages; and this one, which
-watches. In the middle an identification is asked for.
+watches. An identification is asked for in the warm-up and another one later.
 
-`lost_uncounted` is what was sent and not counted by the node, plus what it counted as received
-and does not account for: received poses = in samples + waiting + not used + dropped.
+The empty callbacks take messages one by one and deserialised, as nodes usually do; ours takes them
+serialised and by the batch, so that it may cost less than they do.
+
+Memory is resident memory after the warm-up. Every sample is kept, in memory as on disk, so what
+kept samples are known to need is told apart from the growth, of which nothing should be left.
+
+`lost_uncounted` is what was sent and neither received by the node nor counted by it as lost on the
+way, plus what it received and does not account for: received poses = in samples + waiting + not
+used + dropped.
 """
 
 import argparse
+import copy
 import csv
 import json
 import os
@@ -20,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from pathlib import Path
 
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -39,10 +48,13 @@ from std_srvs.srv import Trigger
 
 from calib_ros import se3
 from calib_ros.config import load_chain
+from calib_ros.samples import Sample
 from calib_ros.simulation import Cell, faulty, measure
 
 LEG = 1.2
 """Time from one stop to the next [s], half of it in motion."""
+WARM = 240.0
+"""Time [s] until memory is watched; allocators have settled by then."""
 TICK = 1.0 / os.sysconf('SC_CLK_TCK')
 COUNTS = ('dropped', 'not used', 'note')
 PAGE = os.sysconf('SC_PAGE_SIZE') / 1e6
@@ -211,16 +223,20 @@ def run(options, seconds, folder):
         spin_until(lambda: all(name in values() for name in probes))
         spin_until(identify.service_is_ready)
         flood.tell()
-        warm = min(60.0, 0.3 * seconds)
+        warm = min(WARM, 0.5 * seconds)
         start = time.monotonic()
-        spin_until(lambda: time.monotonic() - start > warm, 2.0 * warm)
+        spin_until(lambda: time.monotonic() - start > 0.8 * warm, warm)
+        asked = identify.call_async(Trigger.Request())
+        spin_until(lambda: asked.done() and time.monotonic() - start > warm, 2.0 * warm)
+        count = len(heard)
+        spin_until(lambda: len(heard) > count)
         first = values()
         begin = (time.monotonic(), node.cpu, idle.cpu, received(first))
         memory, asked, answered = [], None, None
         while time.monotonic() - start < seconds:
             executor.spin_once(timeout_sec=0.1)
             if not memory or time.monotonic() - memory[-1][0] > 1.0:
-                memory.append((time.monotonic(), node.memory))
+                memory.append((time.monotonic(), node.memory, idle.memory))
             if asked is None and time.monotonic() - start > 0.6 * seconds:
                 asked, called = identify.call_async(Trigger.Request()), time.monotonic()
             if asked is not None and asked.done() and answered is None:
@@ -245,19 +261,23 @@ def run(options, seconds, folder):
         'joints': sent['joints'] + probed[probes[0]] - int(last['joint states']),
         'poses': sent['poses'] + probed[probes[1]] - int(last['poses']),
     }
+    told = sum(int(value) for key, value in last.items() if key.startswith('lost on'))
     accounted = in_samples + int(last['poses waiting'])
     for key, value in last.items():
         if key.startswith(('dropped poses', 'not used poses')):
             accounted += int(value)
     unaccounted = int(last['poses']) - accounted
-    times, sizes = np.array(memory).T
+    times, sizes, idles = np.array(memory).T
+    grown = slope(times, sizes)
+    kept = round(0.06 * sample_size() * (int(last['samples']) - int(first['samples'])) / span, 1)
     return {
         'seconds': round(span, 1),
         'sent': {key: sent[key] for key in ('joints', 'poses')},
         'publisher late by at most [s]': round(sent['slowest'], 3),
         'lost': lost,
         'unaccounted poses': unaccounted,
-        'lost_uncounted': sum(abs(n) for n in (*lost.values(), unaccounted)),
+        'lost on the way, as the node tells': told,
+        'lost_uncounted': abs(sum(lost.values()) - told) + abs(unaccounted),
         'lost by the empty node': sent['joints'] + sent['poses'] - sum(other.values()),
         'samples': int(last['samples']),
         'account': {
@@ -267,13 +287,32 @@ def run(options, seconds, folder):
             'success': bool(asked and asked.done() and asked.result().success),
             'seconds': None if answered is None else round(answered, 2),
         },
-        'memory [MB]': round(float(sizes[-1]), 1),
-        'memory slope [kB/min]': round(6e4 * float(np.polyfit(times, sizes, 1)[0]), 1),
+        'memory growth [kB/min]': grown,
+        'memory growth of the empty node [kB/min]': slope(times, idles),
+        'memory of kept samples [kB/min]': kept,
+        'memory growth without kept samples [kB/min]': round(grown - kept, 1),
+        'memory by the minute [MB]': [round(float(size), 1) for size in sizes[::60]],
         'cpu of the node [us/message]': round(1e6 * (end[1] - begin[1]) / messages, 1),
         'cpu of empty callbacks [us/message]': round(1e6 * (end[2] - begin[2]) / messages, 1),
         'ratio': round((end[1] - begin[1]) / (end[2] - begin[2]), 3),
         'share of a core': round((end[1] - begin[1]) / span, 3),
     }
+
+
+def slope(times, sizes):
+    """Return how fast memory [MB] grows over times [s], in kB a minute."""
+    return round(6e4 * float(np.polyfit(times, sizes, 1)[0]), 1)
+
+
+def sample_size(count=1000):
+    """Return the bytes that a kept sample of a full pose takes."""
+    one = Sample(1, np.zeros(6), np.zeros(6), np.zeros(3), np.eye(3), spread=1e-5)
+    tracemalloc.start()
+    before = tracemalloc.get_traced_memory()[0]
+    samples = [copy.deepcopy(one) for _ in range(count)]
+    after = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    return (after - before) / len(samples)
 
 
 def received(values):

@@ -5,16 +5,16 @@
 Messages of one topic mostly differ in their stamps and numbers only: the names in them, and so
 the places of the numbers (OMG Common Data Representation), are the same. The layout is read off
 the first message of a batch, the others are held against it byte by byte, and all numbers are
-taken and checked at once. A batch that differs, or that holds anything wrong, is no error: `None`
-says that each message must be decoded by itself.
+taken and checked at once. A batch whose layouts differ is no error: `None` says that each message
+must be decoded by itself.
 """
 
 from __future__ import annotations
 
+import itertools
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.messages import (
     JOINT_STATE,
-    JointReading,
+    JointReadings,
     MessageError,
-    Reading,
+    Readings,
     measured_covariance,
 )
 from calib_ros.se3 import FloatArray
@@ -95,43 +95,56 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
     )
 
 
-def readings(kind: str, blobs: Sequence[bytes]) -> Sequence[JointReading | Reading] | None:
-    """Return what the decoders of `messages` make of each message, None where one would object."""
+def readings(
+    kind: str, blobs: Sequence[bytes]
+) -> tuple[JointReadings | Readings, NDArray[np.bool_]] | None:
+    """Return what the decoders of `messages` make of messages; None where their layouts differ.
+
+    Returns
+    -------
+    found : JointReadings or Readings
+        Those of the messages that the decoders would take.
+    good : (N,) bool
+        Which these are.
+
+    """
     batch = decode(kind, blobs)
-    if batch is None or not (batch.stamps_ns > 0).all():
+    if batch is None:
         return None
-    stamps, numbers = batch.stamps_ns.tolist(), batch.numbers
+    numbers = batch.numbers
     frame_id, *names = batch.strings
+    good = batch.stamps_ns > 0
     if kind == JOINT_STATE:
         if len(names) != numbers.shape[1]:
             return None
-        return [JointReading(s, names, v) for s, v in zip(stamps, numbers.tolist(), strict=True)]
+        return JointReadings(batch.stamps_ns[good], tuple(names), numbers[good]), good
     child = names[0] if names else ''
-    if not child.isprintable() or not np.isfinite(numbers).all():
+    if not child.isprintable():
         return None
-    if kind.endswith('/Range'):
-        distances = numbers[:, 3].tolist()
-        if min(distances) <= 0.0:
-            return None
-        return [
-            Reading(s, frame_id, distance=value)
-            for s, value in zip(stamps, distances, strict=True)
-        ]
-    found = []
-    positions = map(tuple, numbers[:, :3].tolist())
-    quats: Iterable[Any] = [None] * len(blobs)
-    if numbers.shape[1] >= 7:
+    good &= np.isfinite(numbers).all(axis=1)
+    distance = kind.endswith('/Range')
+    if distance:
+        numbers = numbers[:, 3:]
+        good &= numbers[:, 0] > 0.0
+    elif numbers.shape[1] >= 7:
         length = np.linalg.norm(numbers[:, 3:7], axis=1)
-        if not (np.abs(length - 1.0) <= QUATERNION_TOLERANCE).all():
-            return None
-        quats = map(tuple, numbers[:, 3:7].tolist())
-    for s, position, quat, row in zip(stamps, positions, quats, numbers[:, 7:], strict=True):
+        good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
+    if numbers.shape[1] > 7:
+        good &= _usable_covariances(numbers[:, 7:])
+        numbers[~numbers[:, 7:].any(axis=1), 7:] = np.nan
+    return Readings(batch.stamps_ns[good], frame_id, child, distance, numbers[good]), good
+
+
+def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:
+    """Return (N,) which covariances (N, 36) are none or usable; mostly all are the same."""
+    usable = np.ones(len(rows), dtype=bool)
+    changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
+    for begin, end in itertools.pairwise((0, *changes.tolist(), len(rows))):
         try:
-            covariance = measured_covariance(row) if len(row) else None
+            measured_covariance(rows[begin])
         except MessageError:
-            return None
-        found.append(Reading(s, frame_id, position, quat, covariance, None, child))
-    return found
+            usable[begin:end] = False
+    return usable
 
 
 def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:

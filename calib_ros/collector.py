@@ -26,7 +26,7 @@ from calib_ros.dwells import Mean, RestlessError, average
 from calib_ros.messages import Reading
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
-from calib_ros.track import CAUSES, Motion, Rows, Track, unwrapped
+from calib_ros.track import CAUSES, Motion, Rows, Stamps, Track, unwrapped
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
@@ -142,7 +142,7 @@ class Collector:
                 return
             self._start_anew()
         self._backwards = 0
-        if self._track.full(columns):
+        if not self._track.room(columns):
             self._make_room(columns)
         self._track.add(columns, stamp_ns, values)
         if stamp_ns - self._advanced_ns >= ADVANCE_NS:
@@ -150,11 +150,36 @@ class Collector:
             if not self.holding:
                 self._round(self._complete_ns)
 
-    def add(self, key: StreamKey, reading: Reading) -> None:
-        """Take a measurement."""
+    def uneventful(self, columns: tuple[int, ...], stamps: Stamps) -> NDArray[np.bool_]:
+        """Return (M,) which joint samples would only be added, whatever the others do."""
+        quiet = (stamps >= self._track.horizon_ns) & (stamps - self._advanced_ns < ADVANCE_NS)
+        return quiet & (self._track.room(columns) >= len(stamps))
+
+    def extend_joints(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
+        """Take uneventful joint samples: values (M, k) at stamps (M,)."""
+        self._backwards = 0
+        self._track.extend(columns, stamps, values)
+
+    def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray) -> None:
+        """Take measurements with nothing eventful between them: numbers (M, w) at stamps (M,)."""
+        rows = self._stream(key)
+        due = np.flatnonzero(stamps - self.delay_ns > self._settled_ns)
+        taken = due[: rows.capacity - rows.count]
+        if len(due) < len(stamps):
+            self.dropped['poses: later than lateness allows'] += len(stamps) - len(due)
+        if len(taken) < len(due):
+            self.dropped['poses: pose buffer full'] += len(due) - len(taken)
+        rows.extend(stamps[taken], numbers[taken])
+
+    def _stream(self, key: StreamKey) -> Rows:
         rows = self._waiting.get(key)
         if rows is None:
             rows = self._waiting[key] = Rows(_WIDTH, self.settings.pose_buffer)
+        return rows
+
+    def add(self, key: StreamKey, reading: Reading) -> None:
+        """Take a measurement."""
+        rows = self._stream(key)
         if reading.stamp_ns - self.delay_ns <= self._settled_ns:
             self.dropped['poses: later than lateness allows'] += 1
             return
@@ -460,7 +485,7 @@ class Collector:
     def _make_room(self, columns: tuple[int, ...]) -> None:
         """Let go the older half of the samples of some joints; nothing may be held any longer."""
         self._round(self._complete_ns)
-        if self._track.full(columns):
+        if not self._track.room(columns):
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 
     def _start_anew(self) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -40,26 +40,35 @@ BOX_POSES = 30
 Command: TypeAlias = Callable[[str, Callable[[Any], int], str], argparse.ArgumentParser]
 
 
-def add_commands(command: Command) -> None:
-    """Add all commands of this module by a function of name, what to run, and help."""
-    _add_plan(
-        command('plan', _plan, 'choose the poses to measure, and say how accurate they make')
-    )
-    _add_workspace(
-        command(
+def add_commands(command: Command, given: Sequence[str]) -> None:
+    """Add all commands of this module by a function of name, what to run, and help.
+
+    Options only to the one that is `given`: they know modules that take longer than all the rest.
+    """
+    for name, run, add, text in (
+        ('plan', _plan, _add_plan, 'choose the poses to measure, and say how accurate they make'),
+        (
             'workspace',
             _workspace,
+            _add_workspace,
             'map errors over the workspace, and place a task where they are least',
-        )
-    )
-    _add_verify(
-        command('verify', _verify, 'judge a corrected arm on new measurements: PASS or FAIL')
-    )
-    _add_compensate(
-        command(
-            'compensate', _compensate, 'correct the joint values of a program by a calibration'
-        )
-    )
+        ),
+        (
+            'verify',
+            _verify,
+            _add_verify,
+            'judge a corrected arm on new measurements: PASS or FAIL',
+        ),
+        (
+            'compensate',
+            _compensate,
+            _add_compensate,
+            'correct the joint values of a program by a calibration',
+        ),
+    ):
+        added = command(name, run, text)
+        if name in given:
+            add(added)
 
 
 def _add_plan(parser: argparse.ArgumentParser) -> None:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize, signal, stats
+from scipy import linalg, optimize, signal, special
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -128,7 +128,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
         return Shared(**correlations, found=(), middles={})
     extra, _ = system.extra_rows(fit.chain, names)
     forms = _Forms(few, extra)
-    limit = stats.norm.ppf(1.0 - (1.0 - CONFIDENCE) / (len(kinds) * len(forms.parts)))
+    limit = special.ndtri(1.0 - (1.0 - CONFIDENCE) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
     for kind in kinds:
         links = few.links(kind)

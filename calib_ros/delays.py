@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.chain import Chain
@@ -80,6 +81,30 @@ class Watch:
         if abs(stamp_ns - self._last_ns[1]) >= DENSE_NS and not self._poses.full:
             self._last_ns[1] = stamp_ns
             self._poses.append(stamp_ns, (*position, *(quat_xyzw or ())))
+
+    def uneventful(self, stamps: Stamps) -> NDArray[np.bool_]:
+        """Return (M,) at which stamps of joint values it is not yet time to look."""
+        quiet = np.abs(stamps - self._begun_ns) <= WATCH_NS
+        return quiet if self._begun_ns else np.zeros(len(stamps), dtype=bool)
+
+    def extend_joints(self, stamps: Stamps, values: FloatArray) -> None:
+        """Take joint values (M, n) at uneventful stamps (M,)."""
+        self._extend(0, self._joints, stamps, values)
+
+    def extend_poses(self, stamps: Stamps, numbers: FloatArray) -> None:
+        """Take poses (M, 7), with NaN for a rotation that was not measured."""
+        self._extend(1, self._poses, stamps, numbers)
+
+    def _extend(self, which: int, rows: Rows, stamps: Stamps, values: FloatArray) -> None:
+        chosen: list[int] = []
+        last = self._last_ns[which]
+        room = rows.capacity - rows.count
+        for k, stamp_ns in enumerate(stamps.tolist() if room else ()):
+            if abs(stamp_ns - last) >= DENSE_NS and len(chosen) < room:
+                last = stamp_ns
+                chosen.append(k)
+        self._last_ns[which] = last
+        rows.extend(stamps[chosen], values[chosen])
 
     def look(self, chain: Chain) -> Delay | None:
         """Return the delay if it shows, and begin anew."""

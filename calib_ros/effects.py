@@ -134,24 +134,11 @@ def unit(name: str) -> str:
     }.get(group_of(name), 'rad')
 
 
-def expected(name: str) -> float:
-    """Return the size that an effect may have: the standard deviation of its prior.
+EXPECTED = 3e-4
+"""Size that an effect may have, the standard deviation of its prior: about an arc minute.
 
-    Wide against real drives (0.1 mrad is much for an eccentricity); without it a harmonic that is
-    sampled over part of a turn trades against constants without bound.
-    """
-    return EXPECTED[group_of(name)]
-
-
-EXPECTED = {
-    'ratio': 1e-3,
-    'coupling': 1e-3,
-    'eccentricity': 1e-3,
-    'gear': 1e-3,
-    'gravity': 1e-3,
-    'compliance': 1e-3,
-    'backlash': 1e-3,
-}
+Without it a harmonic that is sampled over part of a turn trades against constants without bound,
+and misleads wherever else the arm goes."""
 
 
 def basis(

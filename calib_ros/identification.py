@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calib_ros import effects, identifiability
 from calib_ros.chain import FRAME_KINDS, Chain
@@ -26,16 +26,22 @@ from calib_ros.leastsquares import minimise, triangular_factor
 from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
-from calib_ros.robust import OUTLIER, Robust, thorough_fit
+from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
-from calib_ros.validation import Comparison, Parameter, compare, refusals, residuals, validate
+from calib_ros.validation import (
+    KNOWN,
+    Comparison,
+    Parameter,
+    compare,
+    refusals,
+    residuals,
+    validate,
+)
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
 SOME = 500
 """Pairs that are enough for a first fit."""
-KNOWN = 1e9
-"""Degrees of freedom beyond which the noise is known."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,8 @@ class Identification:
     validated_by : str
         How the pairs of `validation` were held out.
     noise : Noise
+    distances : tuple of (N,)
+        Size of the residuals of each set's samples in units of the usual one (`robust.py`).
     outliers : tuple of Outlier
         Samples of gross error; they carry no or little weight in the fit.
     gauges : dict
@@ -97,6 +105,7 @@ class Identification:
     validation: Comparison | None
     validated_by: str
     noise: Noise
+    distances: tuple[FloatArray, ...]
     outliers: tuple[Outlier, ...]
     gauges: dict[str, list[str]]
     observability: identifiability.Observability
@@ -148,8 +157,8 @@ class Identification:
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
         freedom = self.uncertainty.freedom_of(shares)
         values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
-        square = 3.0 * stats.f.ppf(level, 3, np.minimum(freedom, KNOWN))
-        square = np.where(freedom > KNOWN, stats.chi2.ppf(level, 3), square)
+        square = 3.0 * special.fdtri(3, np.minimum(freedom, KNOWN), level)
+        square = np.where(freedom > KNOWN, special.chdtri(3, 1.0 - level), square)
         length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 
@@ -171,8 +180,11 @@ class Identification:
         return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
 
-def identify(problem: Problem) -> Identification:
+def identify(problem: Problem, simpler: Identification | None = None) -> Identification:
     """Identify the parameters of a chain from matched pairs.
+
+    With the result of a `simpler` model, without effects, no sample that it explains is taken for
+    a gross error: else a rich model could leave out what contradicts it.
 
     Raises
     ------
@@ -199,7 +211,11 @@ def identify(problem: Problem) -> Identification:
     rough = start
     if few.count < system.count // 2:
         rough = minimise(start, names, few, tolerance=1e-2).chain
-    robust = thorough_fit(rough, names, system, problem.loss)
+    if simpler is None:
+        robust = thorough_fit(rough, names, system, problem.loss)
+    else:
+        rough = simpler.chain.with_effects([name for name, _ in model.effects])
+        robust = reweighted(rough, names, system, problem.loss, simpler.distances)
     fit = robust.fit
     before = minimise(start, [n for n in names if model.owns_frame(n)], system)
     factor = fit.normal.factor()
@@ -209,9 +225,13 @@ def identify(problem: Problem) -> Identification:
     weak = _weak(problem, names, uncertainty.covariance)
     if weak:
         return replace(
-            identify(replace(problem, priors=weak | dict(problem.priors))), weak=tuple(weak)
+            identify(replace(problem, priors=weak | dict(problem.priors)), simpler),
+            weak=tuple(weak),
         )
-    validation, validated_by = validate(problem, before.chain, fit.chain, names, robust)
+    explained = (
+        None if simpler is None or simpler.validation is None else simpler.validation.judged
+    )
+    validation, validated_by = validate(problem, before.chain, fit.chain, names, robust, explained)
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
@@ -225,6 +245,7 @@ def identify(problem: Problem) -> Identification:
         validation=validation,
         validated_by=validated_by,
         noise=noise,
+        distances=robust.distances,
         outliers=_outliers(problem, robust),
         gauges=_gauges(problem, fit.chain, names),
         observability=identifiability.observability(factor, system.count),

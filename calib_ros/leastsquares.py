@@ -112,7 +112,8 @@ class Samples:
                 turn[-1] = orientation_error(self.rotations[:, :, part], axes)
             if self.weights is not None:
                 shift *= self.weights[part]
-                turn *= self.weights[part]
+                if self.oriented:
+                    turn *= self.weights[part]
             if self.whitening is not None:
                 yield self._whitened(shift, turn, part), nothing, model
                 continue

@@ -14,9 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError
+from calib_ros.se3 import FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 
@@ -31,6 +33,18 @@ class JointReading(NamedTuple):
     stamp_ns: int
     names: Sequence[str]
     values: Sequence[float]
+
+
+class JointReadings(NamedTuple):
+    """Joint values (N, k) of N JointStates that name the same joints, at stamps (N,)."""
+
+    stamps_ns: NDArray[np.int64]
+    names: tuple[str, ...]
+    values: FloatArray
+
+    def row(self, k: int) -> JointReading:
+        """Return one of them."""
+        return JointReading(int(self.stamps_ns[k]), self.names, self.values[k].tolist())
 
 
 class Reading(NamedTuple):
@@ -54,6 +68,35 @@ class Reading(NamedTuple):
         if self.distance is not None:
             return (self.distance,)
         return (self.position or ()) + (self.quat_xyzw or ()) + (self.covariance or ())
+
+
+class Readings(NamedTuple):
+    """Measurements at stamps (N,) in one frame and of one target.
+
+    `numbers` (N, w) are those of `Reading`, NaN for a covariance that was not measured.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    frame_id: str
+    child: str
+    distance: bool
+    numbers: FloatArray
+
+    def row(self, k: int) -> Reading:
+        """Return one of them."""
+        stamp_ns, numbers = int(self.stamps_ns[k]), tuple(self.numbers[k].tolist())
+        if self.distance:
+            return Reading(stamp_ns, self.frame_id, distance=numbers[0], child=self.child)
+        x, y, z, *rest = numbers
+        known = len(rest) > 4 and not math.isnan(rest[4])
+        return Reading(
+            stamp_ns,
+            self.frame_id,
+            (x, y, z),
+            (rest[0], rest[1], rest[2], rest[3]) if rest else None,
+            tuple(rest[4:]) if known else None,
+            child=self.child,
+        )
 
 
 def joint_state(message: Any) -> JointReading:

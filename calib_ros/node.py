@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node: topics in, services, corrected parameters out. `docs/node.md` describes it.
 
-Messages are taken on the executor's thread. An identification runs on a thread of its own, on a
-snapshot of the samples, and its answer is sent when it has ended.
+Messages wait in the queues of their subscriptions, and a timer takes them by the batch,
+serialised: the executor does not wake for each of them. An identification runs on a thread of its
+own, on a snapshot of the samples, and its answer is sent when it has ended.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +48,10 @@ from rclpy.qos import (
     qos_profile_sensor_data,
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from rclpy.wait_for_message import wait_for_message
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
@@ -69,11 +72,13 @@ from calib_ros.deferred import DeferredTrigger
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.export import exports
 from calib_ros.guide import Guide
+from calib_ros.intake import Stream, feed
+from calib_ros.messages import JOINT_STATE
 from calib_ros.problem import Problem
 from calib_ros.samples import Sample
 from calib_ros.selection import identify_model
 from calib_ros.session import Account, CalibrationSession, check_settings
-from calib_ros.sources import STANDARD, Source, parse_sources
+from calib_ros.sources import STANDARD, parse_sources
 from calib_ros.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.waypoints import read_joints
 
@@ -105,11 +110,20 @@ class Hearing:
     last: float | None = None
     deaf: bool = False
     """True when a publisher offers a QoS that is not asked for."""
+    lost: int = 0
+    """Messages that got lost on the way, as DDS tells by their numbers."""
+    full: int = 0
+    """How often the queue was found full, so that messages may be lost."""
+    lost_before: int = 0
+    losing: bool = False
+    """True when either has grown between the last two looks."""
 
     def look(self, now: float, span: float) -> None:
         """Note how many messages came in the last `span`."""
         fresh, self.before = self.count - self.before, self.count
         self.rate = fresh / span
+        lost, before = self.lost + self.full, self.lost_before
+        self.losing, self.lost_before = lost > before, lost
         if fresh:
             self.last = now
 
@@ -181,8 +195,8 @@ class CalibrationNode(Node):
         self._heard: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
         self._status_text = ''
-        self._joints: tuple[Any, Any] | None = None
-        self._inbox: list[tuple[Callable[[Any], None], Any]] = []
+        self._posed: tuple[int, Sequence[float]] | None = None
+        self._inputs: dict[Subscription, tuple[Stream, Hearing]] = {}
         self._sources = parse_sources(settings.sources) or STANDARD
         if resume:
             self._resume()
@@ -331,77 +345,67 @@ class CalibrationNode(Node):
     # Topics in
 
     def _subscribe(self) -> None:
-        qos = QoSProfile(
-            depth=INPUT_QUEUE,
-            reliability=qos_profile_sensor_data.reliability,
-            durability=qos_profile_sensor_data.durability,
-        )
         overriding = QoSOverridingOptions(
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
-        taking: list[tuple[Any, str, Callable[[Any], None]]] = [
-            (JointState, topic, self._taking_joints(topic))
+        streams = [
+            Stream(topic, JOINT_STATE)
             for topic in self.session.settings.joint_topics or ('joint_states',)
         ]
-        for source in self._sources:
-            name = source.type or 'geometry_msgs/msg/PoseStamped'
-            taking.append((_message_type(name), source.topic, self._taking(source, name)))
-        for kind, topic, callback in taking:
-            heard = self._heard[self.resolve_topic_name(topic)]
-            self.create_subscription(
-                kind,
-                topic,
-                self._putting(callback),
-                qos,
-                qos_overriding_options=overriding,
-                event_callbacks=SubscriptionEventCallbacks(
-                    incompatible_qos=self._guarded(self._noting(heard))
+        streams += [
+            Stream(source.topic, source.type or 'geometry_msgs/msg/PoseStamped', source)
+            for source in self._sources
+        ]
+        for stream in streams:
+            heard = self._heard.setdefault(self.resolve_topic_name(stream.topic), Hearing())
+            subscription = self.create_subscription(
+                _message_type(stream.type),
+                stream.topic,
+                lambda data: None,  # see `subscriptions`
+                QoSProfile(  # one for each: overriding changes it
+                    depth=INPUT_QUEUE,
+                    reliability=qos_profile_sensor_data.reliability,
+                    durability=qos_profile_sensor_data.durability,
                 ),
+                qos_overriding_options=overriding,
+                event_callbacks=self._noting(heard),
+                raw=True,
             )
+            self._inputs[subscription] = stream, heard
 
-    def _putting(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
-        def put(message: Any) -> None:
-            self._inbox.append((take, message))
-
-        return put
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """Return the subscriptions that an executor serves: not the inputs, which a timer does."""
+        inputs = getattr(self, '_inputs', {})  # rclpy asks while it makes the node
+        return (each for each in super().subscriptions if each not in inputs)
 
     def _take_messages(self) -> None:
         """Take what has come in the order in which it came."""
-        come, self._inbox = self._inbox, []
-        for take, message in come:
-            try:
-                take(message)
-            except Exception:
-                self.get_logger().error(f'internal error: {traceback.format_exc()}')
+        come = []
+        for subscription, (stream, heard) in self._inputs.items():
+            found = _waiting(subscription)
+            heard.count += len(found)
+            heard.full += len(found) >= subscription.qos_profile.depth
+            come += [(stamp, stream, data) for stamp, data in found]
+        come.sort(key=itemgetter(0))
+        batch = [(stream, data) for _, stream, data in come]
+        try:
+            problems = feed(self.session, batch, _deserialised)
+        except Exception:
+            problems = [f'internal error: {traceback.format_exc()}']
+        for problem in problems:
+            self.get_logger().error(problem)
 
-    def _hearing(self, topic: str) -> Hearing:
-        return self._heard.setdefault(self.resolve_topic_name(topic), Hearing())
-
-    def _taking_joints(self, topic: str) -> Callable[[Any], None]:
-        heard = self._hearing(topic)
-
-        def take(message: Any) -> None:
-            heard.count += 1
-            values = self.session.take_joints(message)
-            if values is not None:
-                self._joints = (message.header.stamp, values)
-
-        return take
-
-    def _taking(self, source: Source, name: str) -> Callable[[Any], None]:
-        heard = self._hearing(source.topic)
-
-        def take(message: Any) -> None:
-            heard.count += 1
-            self.session.take(source, name, message)
-
-        return take
-
-    def _noting(self, heard: Hearing) -> Callable[[Any], None]:
-        def note(event: Any) -> None:
+    def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:
+        def note_deaf(event: Any) -> None:
             heard.deaf = True
 
-        return note
+        def note_lost(event: Any) -> None:
+            heard.lost += event.total_count_change
+
+        return SubscriptionEventCallbacks(
+            incompatible_qos=self._guarded(note_deaf), message_lost=self._guarded(note_lost)
+        )
 
     # The journal
 
@@ -544,12 +548,13 @@ class CalibrationNode(Node):
 
     def _publish_corrected_pose(self) -> None:
         calibration = self.session.calibration
-        if calibration is None or self._joints is None:
+        latest = self.session.latest
+        if calibration is None or latest is None or latest is self._posed:
             return
-        stamp, values = self._joints
-        self._joints = None
+        self._posed = latest
+        stamp_ns, values = latest
         self._corrected_pose.publish(
-            outgoing.pose(calibration.chain, values, stamp, calibration.world_frame)
+            outgoing.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
         )
 
     def _on_second(self) -> None:
@@ -589,6 +594,9 @@ class CalibrationNode(Node):
             for topic, heard in self._heard.items()
             if heard.deaf and not heard.count
         ]
+        losing = [topic for topic, heard in self._heard.items() if heard.losing]
+        if losing:
+            wrong.append(f'messages get lost on {", ".join(losing)}')
         fresh = {
             cause: count
             for cause, count in account.dropped.items()
@@ -623,6 +631,8 @@ class CalibrationNode(Node):
             'delay [s]': 'not known' if delay is None else f'{delay.seconds:.4f}',
             **{f'rate of {topic} [Hz]': f'{each.rate:.1f}' for topic, each in heard.items()},
             **{f'age of {topic} [s]': f'{now - each.last:.1f}' for topic, each in heard.items()},
+            **{f'lost on {topic}': each.lost for topic, each in heard.items()},
+            **{f'queue of {topic} full': each.full for topic, each in heard.items()},
             **{f'not used {cause}': count for cause, count in account.unused.items()},
             **{f'dropped {cause}': count for cause, count in account.dropped.items()},
             **{f'note {cause}': count for cause, count in account.notes.items()},
@@ -661,6 +671,22 @@ class CalibrationNode(Node):
 
 def _names(values: Sequence[str] | None) -> tuple[str, ...]:
     return tuple(name for name in values or () if name)
+
+
+def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
+    """Return the messages that wait, with the times at which they were received [ns]."""
+    found = []
+    with subscription.handle:
+        for _ in range(INPUT_QUEUE):
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                break
+            found.append((taken[1]['received_timestamp'], taken[0]))
+    return found
+
+
+def _deserialised(data: bytes, name: str) -> Any:
+    return deserialize_message(data, _message_type(name))
 
 
 def _message_type(name: str) -> Any:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calib_ros import identifiability
 from calib_ros.chain import Chain
@@ -64,7 +64,8 @@ def noise_of(
     freedom = counts - taken
     known = freedom > 1e-9
     variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
-    low, high = stats.chi2.interval(SIGMA_TEST, np.where(known, freedom, 1.0))
+    beyond = 0.5 * (1.0 - SIGMA_TEST)
+    low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
     neighbours = shared_errors(fit, names, system)
     noise = Noise(

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from calib_ros import se3
 from calib_ros.errors import InputError
@@ -124,7 +123,12 @@ class Observations:
         """Return the pairs chosen by a mask or by indices."""
         names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
         present = [name for name in _OPTIONAL if getattr(self, name) is not None]
-        return replace(self, **{name: getattr(self, name)[mask] for name in (*names, *present)})
+        chosen = replace(self, **{name: getattr(self, name)[mask] for name in (*names, *present)})
+        if 'configurations' in vars(self):  # takes longer to find than all the rest
+            _, vars(chosen)['configurations'] = np.unique(
+                self.configurations[mask], return_inverse=True
+            )
+        return chosen
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
         """Return the poses the other way round: a camera on the flange sees a fixed target.
@@ -205,9 +209,32 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     """
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    standing = joints[np.concatenate([[True], _moved(joints)])] % TURN  # one row a stop
-    tree = cKDTree(standing % TURN, boxsize=TURN)
-    near = tree.query_pairs(STILL, p=np.inf, output_type='ndarray')
+    standing = joints[np.concatenate([[True], _moved(joints)])]  # one row a stop
+    near = _near(standing)
     links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(standing),) * 2)
     _, label = connected_components(links, directed=False)
     return np.asarray(label[stops(joints)], dtype=np.intp)
+
+
+def _near(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn.
+
+    Sums of cosines move by n times as much at most, and know no turns: in the order of one, rows
+    are compared with those after them as long as these two may be near.
+    """
+    phases = np.arange(joints.shape[1])
+    along, across = np.cos(joints + phases).sum(axis=1), np.sin(joints + phases).sum(axis=1)
+    order = np.argsort(along)
+    along, across = along[order], across[order]
+    reach = joints.shape[1] * STILL
+    found = []
+    first, step = np.arange(len(joints)), 0
+    while len(first):
+        step += 1
+        first = first[: np.searchsorted(first, len(joints) - step)]
+        first = first[along[first + step] - along[first] <= reach]
+        close = first[np.abs(across[first + step] - across[first]) <= reach]
+        pairs = np.column_stack([order[close], order[close + step]])
+        change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
+        found.append(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
+    return np.concatenate(found)

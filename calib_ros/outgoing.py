@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped
 from sensor_msgs.msg import JointState, PointCloud2, PointField
@@ -39,11 +40,12 @@ def dh_parameters(chain: Chain) -> Float64MultiArray:
     return array
 
 
-def pose(chain: Chain, joints: Sequence[float], stamp: Any, frame_id: str) -> PoseStamped:
-    """Return the pose of the target at joint values (n)."""
+def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) -> PoseStamped:
+    """Return the pose of the target at joint values (n) of a stamp."""
     matrix = chain.forward(np.array([joints]))[0]
     message = PoseStamped()
-    message.header.stamp = stamp
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
     message.header.frame_id = frame_id
     point, turn = message.pose.position, message.pose.orientation
     point.x, point.y, point.z = matrix[:3, 3].tolist()

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.cdr import readings
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
-from calib_ros.messages import DECODERS, JOINT_STATE, JointReading, Reading
+from calib_ros.intake import Stream, feed
+from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
@@ -27,7 +27,7 @@ from calib_ros.session import CalibrationSession
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
-BATCH = 5000
+BATCH = 2000
 """Messages that are decoded at once."""
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
@@ -72,6 +72,18 @@ class Topics:
             raise _no_topic('pose topic', tuple(DECODERS), available)
         chosen = {source.topic: source for source in sources}
         return cls({topic: available[topic] for topic in (*joints, *chosen)}, chosen)
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """Return what comes on each topic."""
+        return {
+            topic: Stream(topic, k, self.sources.get(topic)) for topic, k in self.types.items()
+        }
+
+    def of(self, messages: Iterable[tuple[str, bytes]]) -> Iterator[tuple[Stream, bytes]]:
+        """Return those of some messages that are on these topics."""
+        streams = self.streams
+        return ((streams[topic], data) for topic, data in messages if topic in streams)
 
 
 def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
@@ -121,7 +133,7 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         if found is None:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
         topics = Topics.choose(found.topics, session.settings)
-        count, problem = _feed(session, topics, iter(found.messages))
+        count, problem = _feed(session, topics.of(found.messages))
         total = recorded(path if path.is_dir() else path.parent)
         lost = 'how many are lost is not known'
         if total is not None:
@@ -135,12 +147,13 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         topics = Topics.choose(available, session.settings)
         connections = [c for c in reader.connections if c.topic in topics.types]
         expected = sum(c.msgcount for c in connections)
-        raw = ((c.topic, data) for c, _, data in reader.messages(connections))
-        count, problem = _feed(session, topics, raw)
+        streams = topics.streams
+        messages = ((streams[c.topic], data) for c, _, data in reader.messages(connections))
+        count, problem = _feed(session, messages)
     if problem is not None and count == 0:
         found = salvage(path)
         if found is not None:
-            count, _ = _feed(session, topics, iter(found.messages))
+            count, _ = _feed(session, topics.of(found.messages))
     if problem is None:
         return session.warnings
     return (
@@ -150,52 +163,23 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
 
 
 def _feed(
-    session: CalibrationSession, topics: Topics, raw: Iterator[tuple[str, bytes]]
+    session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
 ) -> tuple[int, str | None]:
     """Feed serialised messages; return how many, and what is wrong with the others if any."""
     count, problem, ended = 0, None, False
     while not ended:
-        batch: list[tuple[str, bytes]] = []
+        batch: list[tuple[Stream, bytes]] = []
         try:
-            for topic, data in itertools.islice(raw, BATCH):
-                batch.append((topic, data))
+            for each in itertools.islice(messages, BATCH):
+                batch.append(each)
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        decoded = {
-            topic: iter(found)
-            for topic in {topic for topic, _ in batch} & set(topics.types)
-            if (found := readings(topics.types[topic], [d for t, d in batch if t == topic]))
-        }
-        for topic, data in batch:
-            kind = topics.types.get(topic)
-            if kind is None:
-                continue
-            if topic in decoded:
-                _take(session, topics, topic, next(decoded[topic]))
-                count += 1
-                continue
-            try:
-                message = _TYPESTORE.deserialize_cdr(data, kind)
-            except Exception as err:
-                problem = f'a message on {topic} cannot be decoded: {err!r}'
-                continue
-            if kind == JOINT_STATE:
-                session.take_joints(message)
-            else:
-                session.take(topics.sources[topic], kind, message)
-            count += 1
+        problems = feed(session, batch, _TYPESTORE.deserialize_cdr)
+        count += len(batch) - len(problems)
+        problem = (problem, *problems)[-1]
     session.finish()
     return count, problem
-
-
-def _take(
-    session: CalibrationSession, topics: Topics, topic: str, reading: JointReading | Reading
-) -> None:
-    if isinstance(reading, JointReading):
-        session.take_joint_reading(reading)
-    else:
-        session.take_reading(topics.sources[topic], reading)
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calib_ros.chain import Chain
 from calib_ros.errors import UnknownNameError
@@ -116,12 +116,27 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
     return replace(robust, iterations=iterations + robust.iterations)
 
 
-def reweighted(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+def reweighted(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    loss: str,
+    simpler: Sequence[FloatArray] | None = None,
+) -> Robust:
     """Fit with the weights of a loss from a start that is good enough to tell gross errors.
 
-    The weights of the sets are left as they were used last.
+    With the distances (N,) of all samples by a `simpler` model, samples that it explains are no
+    gross errors: a richer model has to explain them as well. The weights of the sets are left as
+    they were used last.
     """
-    distances = distances_of(chain, names, system)
+
+    def judged(chain: Chain) -> tuple[FloatArray, ...]:
+        found = distances_of(chain, names, system)
+        if simpler is None:
+            return found
+        return tuple(np.minimum(d, s) for d, s in zip(found, simpler, strict=True))
+
+    distances = judged(chain)
     iterations = 0
     settled = False
     weights = [np.ones(0)] * len(system.sets)
@@ -136,7 +151,7 @@ def reweighted(chain: Chain, names: Sequence[str], system: System, loss: str) ->
         _weigh(system, weights)
         fit = minimise(chain, names, system, tolerance=1e-3)
         chain, iterations = fit.chain, iterations + fit.iterations
-        distances = distances_of(chain, names, system)
+        distances = judged(chain)
     fit = minimise(chain, names, system)
     return Robust(fit, distances, settled, iterations + fit.iterations, loss)
 
@@ -173,4 +188,4 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
 
 def _median_length(dimensions: int) -> float:
     """Return the median length of a vector of standard normal components."""
-    return float(np.sqrt(stats.chi2.ppf(0.5, dimensions)))
+    return float(np.sqrt(special.chdtri(dimensions, 0.5)))

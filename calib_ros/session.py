@@ -12,6 +12,7 @@ from operator import itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros import messages
 from calib_ros.chain import Chain
@@ -24,11 +25,14 @@ from calib_ros.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Frames, Sample, collect
+from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.sources import Source
+from calib_ros.track import Stamps
 from calib_ros.validation import ErrorFigures, compare
 
 Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
+Positions: TypeAlias = NDArray[np.intp]
 Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 LOOK_AGAIN_NS = 2_000_000_000
@@ -155,6 +159,8 @@ class CalibrationSession:
         self.samples: list[Sample] = []
         self.received: Counter[str] = Counter()
         """Messages that came so far, by stream."""
+        self.latest: tuple[int, Sequence[float]] | None = None
+        """Stamp [ns] and values of the last joint state that named all joints."""
         self._watch = None if continuous else Watch(len(self.chain.joints))
         self.delay: Delay | None = None
         """How late the measurements are stamped, as far as the motion shows."""
@@ -184,38 +190,107 @@ class CalibrationSession:
 
     # Messages
 
-    def take_joints(self, message: Any) -> Sequence[float] | None:
-        """Take a JointState; return its values in the order of the chain if it has all."""
+    def take_joints(self, message: Any) -> None:
+        """Take a JointState."""
         try:
             reading = messages.joint_state(message)
         except messages.MessageError as err:
             self.received['joints'] += 1
             self._dropped[f'joints: {err}'] += 1
-            return None
-        return self.take_joint_reading(reading)
+            return
+        self.take_joint_reading(reading)
 
-    def take_joint_reading(self, reading: messages.JointReading) -> Sequence[float] | None:
-        """Take decoded joint values; return them in the order of the chain if all are there."""
+    def take_joint_reading(self, reading: messages.JointReading) -> None:
+        """Take decoded joint values."""
         self.received['joints'] += 1
         try:
             columns, pick = self._layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
-            return None
+            return
         values = pick(reading.values)
         if not math.isfinite(sum(values)):
             self._dropped['joints: NaN or infinite joint value'] += 1
-            return None
+            return
+        complete = len(columns) == len(self.chain.joints)
+        if complete:
+            self.latest = (reading.stamp_ns, values)
         if not self.recording:
             self._unused['joints: not recording'] += 1
         else:
             self._watch_order('joints', reading.stamp_ns)
             self._look_for_delay(reading.stamp_ns)
-            if self._watch is not None and len(columns) == len(self.chain.joints):
+            if complete and self._watch is not None:
                 self._watch_clocks(reading.stamp_ns, values)
             self._collector.add_joints(columns, reading.stamp_ns, values)
             self._take()
-        return values if len(columns) == len(self.chain.joints) else None
+
+    def uneventful(self, readings: messages.JointReadings) -> NDArray[np.bool_]:
+        """Return (N,) which joint readings would only be kept, until others make more of them."""
+        nothing = np.zeros(len(readings.stamps_ns), dtype=bool)
+        if not self.recording:
+            return nothing
+        try:
+            columns, values = self._values(readings)
+        except messages.MessageError:
+            return nothing
+        stamps = readings.stamps_ns
+        quiet = self._collector.uneventful(columns, stamps) & np.isfinite(values).all(axis=1)
+        if self._collector.holding:
+            since = stamps - self._looked_ns
+            quiet &= (since >= 0) & (since < LOOK_AGAIN_NS)
+        if self._watch is not None and len(columns) == len(self.chain.joints):
+            quiet &= self._watch.uneventful(stamps)
+        return quiet
+
+    def keep(
+        self,
+        joints: Sequence[tuple[Positions, messages.JointReadings]],
+        measured: Sequence[tuple[Positions, Source, messages.Readings]],
+    ) -> None:
+        """Take uneventful joint readings, and the measurements between them, all at once.
+
+        Their positions tell in which order they came.
+        """
+        parts = []
+        for where, readings in joints:
+            stamps = readings.stamps_ns
+            columns, values = self._values(readings)
+            self.received['joints'] += len(stamps)
+            self._collector.extend_joints(columns, stamps, values)
+            parts.append((where, stamps, values))
+        self._watch_orders('joints', [part[:2] for part in parts])
+        whole = [part for part in parts if part[2].shape[1] == len(self.chain.joints)]
+        if whole:
+            stamps, values = _in_order(whole)
+            self.latest = (int(stamps[-1]), values[-1].tolist())
+            if self._watch is not None:
+                self._watch.extend_joints(stamps, values)
+        used = [(where, s, each) for where, s, each in measured if self._keep_readings(s, each)]
+        self._watch_orders('poses', [(where, each.stamps_ns) for where, _, each in used])
+        seen = [
+            (where, each.stamps_ns, _padded(each.numbers[:, :7], 7))
+            for where, source, each in used
+            if not each.distance and not source.eye_in_hand
+        ]
+        if seen and self._watch is not None:
+            self._watch.extend_poses(*_in_order(seen))
+
+    def _keep_readings(self, source: Source, readings: messages.Readings) -> bool:
+        """Keep measurements if they can be used."""
+        count = len(readings.stamps_ns)
+        self.received['poses'] += count
+        if not self.recording:
+            self._unused['poses: not recording'] += count
+            return False
+        try:
+            self._check_frame(source.device, readings.frame_id)
+        except messages.MessageError as err:
+            self._dropped[f'poses: {err}'] += count
+            return False
+        key = _stream(source, readings.child, readings.distance)
+        self._collector.extend(key, readings.stamps_ns, readings.numbers)
+        return True
 
     def take(self, source: Source, msgtype: str, message: Any) -> None:
         """Take a measurement of the message type named."""
@@ -239,13 +314,7 @@ class CalibrationSession:
             self._dropped[f'poses: {err}'] += 1
             return
         self._watch_order('poses', reading.stamp_ns)
-        key = StreamKey(
-            source.device,
-            source.target or reading.child,
-            source.validation,
-            reading.distance is not None,
-            source.eye_in_hand,
-        )
+        key = _stream(source, reading.child, reading.distance is not None)
         if self._watch is not None and reading.position is not None and not key.eye_in_hand:
             self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
@@ -511,6 +580,12 @@ class CalibrationSession:
             raise messages.MessageError('none of the joints in the message')
         return layout
 
+    def _values(self, readings: messages.JointReadings) -> tuple[tuple[int, ...], FloatArray]:
+        """Return which joints of the chain messages name, and their values (N, k)."""
+        columns, pick = self._layout(readings.names)
+        index = np.array(pick(range(len(readings.names))), dtype=np.intp)
+        return columns, readings.values[:, index]
+
     def _check_frame(self, device: str, frame_id: str) -> None:
         if self.settings.frame_id and frame_id != self.settings.frame_id:
             raise messages.MessageError(
@@ -525,6 +600,18 @@ class CalibrationSession:
         if stamp_ns < self._newest[stream]:
             self._notes[f'{stream} with a stamp older than the one before'] += 1
         self._newest[stream] = max(stamp_ns, self._newest[stream])
+
+    def _watch_orders(self, stream: str, parts: Sequence[tuple[Positions, Stamps]]) -> None:
+        """Note stamps that go backwards among messages that came at some positions."""
+        if not parts:
+            return
+        stamps = np.concatenate([each for _, each in parts])
+        stamps = stamps[np.argsort(np.concatenate([where for where, _ in parts]))]
+        newest = np.maximum.accumulate(np.append(self._newest[stream], stamps))
+        back = int((stamps < newest[:-1]).sum())
+        if back:
+            self._notes[f'{stream} with a stamp older than the one before'] += back
+        self._newest[stream] = int(newest[-1])
 
     def _watch_clocks(self, stamp_ns: int, values: Sequence[float]) -> None:
         """Look between stops whether the clocks agree, until it shows."""
@@ -547,6 +634,30 @@ class CalibrationSession:
         self._looked_ns = now_ns or 0
         self.delay = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None
+
+
+def _stream(source: Source, child: str, distance: bool) -> StreamKey:
+    return StreamKey(
+        source.device,
+        source.target or child,
+        source.validation,
+        distance,
+        source.eye_in_hand,
+    )
+
+
+def _in_order(
+    parts: Sequence[tuple[Positions, Stamps, FloatArray]],
+) -> tuple[Stamps, FloatArray]:
+    """Return stamps and rows of numbers of several streams in the order in which they came."""
+    order = np.argsort(np.concatenate([where for where, _, _ in parts]))
+    stamps = np.concatenate([each for _, each, _ in parts])
+    return stamps[order], np.concatenate([rows for _, _, rows in parts])[order]
+
+
+def _padded(rows: FloatArray, width: int) -> FloatArray:
+    missing = width - rows.shape[1]
+    return np.pad(rows, ((0, 0), (0, missing)), constant_values=np.nan)
 
 
 def _picker(index: Sequence[int]) -> Picker:

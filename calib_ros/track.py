@@ -68,6 +68,19 @@ class Rows:
         self._values[self.count, len(row) :] = np.nan
         self.count += 1
 
+    def extend(self, stamps: Stamps, rows: FloatArray) -> None:
+        """Add rows (M, at most width), NaN where they are shorter; there is room for them."""
+        end = self.count + len(stamps)
+        if end > len(self._stamps):
+            size = min(max(2 * self.count, end), self.capacity)
+            self._stamps = np.resize(self._stamps, size)
+            self._values = np.resize(self._values, (size, self._values.shape[1]))
+        width = rows.shape[1]
+        self._stamps[self.count : end] = stamps
+        self._values[self.count : end, :width] = rows
+        self._values[self.count : end, width:] = np.nan
+        self.count = end
+
     def keep(self, index: NDArray[np.generic]) -> None:
         """Keep only the rows of a mask or an index, in its order."""
         stamps = self.stamps[index]
@@ -141,10 +154,10 @@ class Track:
                 heard[index] = np.maximum(heard[index], rows.stamps.max())
         return heard
 
-    def full(self, columns: tuple[int, ...]) -> bool:
-        """Tell whether there is no room for another sample of some joints."""
+    def room(self, columns: tuple[int, ...]) -> int:
+        """Return for how many more samples of some joints there is room."""
         rows = self._parts.get(columns)
-        return rows is not None and rows.full
+        return self._capacity if rows is None else self._capacity - rows.count
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -154,10 +167,17 @@ class Track:
 
     def add(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
         """Take the values of some joints, given by their numbers in the chain."""
+        self._rows(columns).append(stamp_ns, values)
+
+    def extend(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
+        """Take values (M, k) of some joints at stamps (M,)."""
+        self._rows(columns).extend(stamps, values)
+
+    def _rows(self, columns: tuple[int, ...]) -> Rows:
         rows = self._parts.get(columns)
         if rows is None:
             rows = self._parts[columns] = Rows(len(columns), self._capacity)
-        rows.append(stamp_ns, values)
+        return rows
 
     def sort(self) -> int:
         """Put all samples in order; return how many had the stamp of another one."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
@@ -20,6 +20,8 @@ from calib_ros.se3 import FloatArray
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
+KNOWN = 1e9
+"""Degrees of freedom that are as good as infinite."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 MOST_OUTLIERS = 0.35
@@ -46,7 +48,7 @@ class Parameter:
         """Return half the width of the interval that holds the truth, by Student's t."""
         if self.std is None:
             return None
-        return self.std * float(stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
 
 
 @dataclass(frozen=True)
@@ -142,9 +144,17 @@ def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Compar
 
 
 def validate(
-    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust
+    problem: Problem,
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+    explained: NDArray[np.bool_] | None = None,
 ) -> tuple[Comparison | None, str]:
     """Judge both chains on pairs that were not fitted.
+
+    Held-out pairs are outliers unless they are near what the fit predicts, or were `explained`
+    (N,) by a simpler model.
 
     Configurations are dealt out to the folds one by one, so that none is on both sides.
     Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
@@ -153,7 +163,10 @@ def validate(
         comparison = compare(before, after, problem.judging)
         if problem.loss != 'none':
             distances = distances_of(after, names, problem.system(problem.judging))
-            comparison = replace(comparison, judged=np.concatenate(distances) <= OUTLIER)
+            judged = np.concatenate(distances) <= OUTLIER
+            if explained is not None:
+                judged |= explained
+            comparison = replace(comparison, judged=judged)
         return comparison, f'{len(comparison.judged)} held-out samples'
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
@@ -400,5 +413,5 @@ def log_gain(
     means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
     totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
     deviation = np.diff(means / totals, axis=0).std(ddof=1)
-    limit = stats.t.ppf(confidence, count - 1) * deviation / np.sqrt(count)
+    limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
     return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)

@@ -30,7 +30,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calib_ros import se3
 from calib_ros.chain import Chain
@@ -192,7 +192,7 @@ def rms_limits(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the one-sided limits (N,) of an RMS found with (N,) degrees of freedom."""
     lower, upper = (
-        rms / np.sqrt(stats.chi2.ppf(level, freedom) / freedom)
+        rms / np.sqrt(special.chdtri(freedom, 1.0 - level) / freedom)
         for level in (confidence, 1.0 - confidence)
     )
     return lower, upper

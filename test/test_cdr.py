@@ -149,7 +149,10 @@ def blob_of(kind, numbers, child='hand', seconds=5):
 def test_batches_are_read_as_single_messages_are(kind):
     blobs = [blob_of(kind, VALID, seconds=s) for s in (5, 6, 7)]
     expected = read(kind, blobs)
-    for found, single in zip(readings(kind, blobs), expected, strict=True):
+    batch, good = readings(kind, blobs)
+    assert good.all()
+    for k, single in enumerate(expected):
+        found = batch.row(k)
         assert found[:4] == single[:4]
         assert found.covariance == single.covariance
         assert found.distance == pytest.approx(single.distance)
@@ -158,7 +161,10 @@ def test_batches_are_read_as_single_messages_are(kind):
 
 def test_batches_of_joint_states_are_read_as_single_messages_are():
     blobs = [joint_blob(['a', 'b'], [value, 2.0]) for value in (0.0, 1.0)]
-    for found, single in zip(readings(JOINT_STATE, blobs), read(JOINT_STATE, blobs), strict=True):
+    batch, good = readings(JOINT_STATE, blobs)
+    assert good.all()
+    for k, single in enumerate(read(JOINT_STATE, blobs)):
+        found = batch.row(k)
         assert found.stamp_ns == single.stamp_ns
         assert list(found.names) == list(single.names)
         assert list(found.values) == list(single.values)
@@ -175,8 +181,13 @@ def test_batches_of_joint_states_are_read_as_single_messages_are():
     ],
 )
 def test_what_a_decoder_refuses_is_left_to_it(kind, numbers, child, seconds):
-    assert readings(kind, [blob_of(kind, VALID)]) is not None
-    bad = blob_of(kind, numbers, child, seconds)
-    assert readings(kind, [bad]) is None
+    blob, bad = blob_of(kind, VALID), blob_of(kind, numbers, child, seconds)
+    found = readings(kind, [blob, bad, blob])
+    if found is None:
+        assert readings(kind, [blob]) is not None
+    else:
+        batch, good = found
+        assert good.tolist() == [True, False, True]
+        assert batch.row(1) == read(kind, [blob])[0]
     with pytest.raises(messages.MessageError):
         read(kind, [bad])

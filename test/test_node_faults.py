@@ -440,3 +440,66 @@ def test_an_overridden_qos(monkeypatch, tmp_path, recording):
         assert cell.node.session.received['joints'] == len(recording.joints)
         assert cell.call('identify').success
         cell.spin_until(lambda: 'best effort' not in heard[-1].status[0].message)
+
+
+def test_an_overridden_qos_leaves_other_topics_alone(tmp_path):
+    override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+
+        def offered(topic):
+            return [each.qos_profile.reliability for each in infos(topic)]
+
+        def infos(topic):
+            return cell.peer.get_subscriptions_info_by_topic(topic)
+
+        cell.spin_until(lambda: infos('/joint_states') and infos('/measured_pose'))
+        assert offered('/joint_states') == [ReliabilityPolicy.RELIABLE]
+        assert offered('/measured_pose') == [ReliabilityPolicy.BEST_EFFORT]
+
+
+def test_a_queue_that_was_full_is_told(monkeypatch, tmp_path, recording):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    override = {'qos_overrides./joint_states.subscription.depth': 5}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(JointState, 'joint_states')
+        for message in joint_messages(recording)[:20]:
+            publisher.publish(message)
+        cell.spin_until(
+            lambda: any('messages get lost on /joint_states' in r.status[0].message for r in heard)
+        )
+        assert cell.node.session.received['joints'] < 20
+        assert int(values_of(heard[-1])['queue of /joint_states full']) > 0
+        cell.spin_until(lambda: 'get lost' not in heard[-1].status[0].message)
+
+
+def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, recording):
+    with Cell() as cell, Child(domain=cell.domain, chain='ur10e', data_dir=tmp_path) as child:
+        reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(JointState, 'joint_states', ReliabilityPolicy.BEST_EFFORT)
+
+        def told():
+            values = values_of(reports[-1]) if reports else {}
+            names = 'joint states', 'lost on /joint_states'
+            return [int(values.get(name, 0)) for name in names]
+
+        sent = 0
+        message = joint_messages(recording)[0]
+
+        def heard():
+            nonlocal sent
+            publisher.publish(message)
+            sent += 1
+            return told()[0] > 0
+
+        cell.spin_until(heard)
+        count = len(reports)
+        cell.spin_until(lambda: len(reports) >= count + 2)
+        first = sent - sum(told())
+        child.process.send_signal(signal.SIGSTOP)
+        for _ in range(3000):
+            publisher.publish(message)
+        child.process.send_signal(signal.SIGCONT)
+        publisher.publish(message)
+        cell.spin_until(lambda: told()[1] > 0)
+        cell.spin_until(lambda: sent + 3001 - sum(told()) == first)

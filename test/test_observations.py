@@ -100,3 +100,18 @@ def test_select_takes_optional_arrays_along(rng):
     part = seen.select(np.array([3, 1]))
     for name in ('velocity', 'acceleration', 'delay'):
         np.testing.assert_array_equal(getattr(part, name), getattr(seen, name)[[3, 1]])
+
+
+def test_a_part_keeps_the_configurations_of_the_whole(rng):
+    """Known or found anew, they are the same, whatever order the part is in."""
+    joints = rng.uniform(-3.0, 3.0, (30, 6))[rng.integers(0, 30, 90)]
+    whole = Observations.from_arrays(joints, np.zeros((90, 3)))
+    for part in (np.arange(90) % 3 == 0, rng.permutation(90)[:40], np.zeros(90, bool)):
+        anew = Observations.from_arrays(joints[part], np.zeros((len(joints[part]), 3)))
+        assert whole.configurations.max() > 10
+        known = whole.select(part).configurations
+        same = known[:, np.newaxis] == known
+        np.testing.assert_array_equal(
+            same, anew.configurations[:, np.newaxis] == anew.configurations
+        )
+        assert set(known) == set(range(len(set(known))))

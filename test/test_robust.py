@@ -322,3 +322,23 @@ def test_an_unknown_loss_is_named():
     with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
         Problem(UR10E, seen, loss='hubert')
     assert caught.value.alternatives == LOSSES
+
+
+def test_what_a_simpler_model_explains_is_no_gross_error_for_a_richer_one():
+    """Displaced samples keep their weight where the simpler model explains them."""
+    rng = np.random.default_rng(21)
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, 5e-5, 2e-4)
+    positions = seen.positions.copy()
+    positions[:6] += 5e-3
+    problem = Problem(UR10E, replace(seen, positions=positions))
+    result = identify(problem)
+    assert [outlier.sample for outlier in result.outliers] == list(range(6))
+    explained = replace(result, distances=(np.zeros(60),))
+    plain = identify(replace(problem, loss='none'))
+    kept = identify(problem, explained)
+    assert kept.outliers == ()
+    assert kept.fitted.figures[1].rms_mm == pytest.approx(plain.fitted.figures[1].rms_mm, rel=1e-6)
+    again = identify(problem, result)
+    assert [outlier.sample for outlier in again.outliers] == list(range(6))
+    assert again.fitted.figures[1].rms_mm == pytest.approx(result.fitted.figures[1].rms_mm)

@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Serialised messages into the session, by the batch: of live topics and of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.cdr import readings
+from calib_ros.messages import JointReading, JointReadings, Readings
+from calib_ros.session import CalibrationSession
+from calib_ros.sources import Source
+
+WINDOW = 1024
+"""Messages that are looked at at once."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What comes on one topic: its message type, and what it measures; None for joint states."""
+
+    topic: str
+    type: str
+    source: Source | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Decoded messages of one stream, and their places (N,) in the batch."""
+
+    stream: Stream
+    places: NDArray[np.intp]
+    readings: JointReadings | Readings
+
+    def between(self, begin: int, end: int) -> Group:
+        """Return what has its place from `begin` on and before `end`."""
+        part = slice(*np.searchsorted(self.places, (begin, end)).tolist())
+        if isinstance(self.readings, JointReadings):
+            stamps, names, values = self.readings
+            cut: JointReadings | Readings = JointReadings(stamps[part], names, values[part])
+        else:
+            cut = self.readings._replace(
+                stamps_ns=self.readings.stamps_ns[part], numbers=self.readings.numbers[part]
+            )
+        return Group(self.stream, self.places[part], cut)
+
+
+def feed(
+    session: CalibrationSession,
+    batch: Sequence[tuple[Stream, bytes]],
+    deserialise: Callable[[bytes, str], Any],
+) -> list[str]:
+    """Let a session take messages in their order; return why some could not be decoded.
+
+    Messages of one stream that are laid out alike are decoded at once, and kept at once up to the
+    next joint state after which there is more to do. That one is taken by itself, and so are
+    messages that differ from the others. The outcome is that of taking each by itself.
+
+    Parameters
+    ----------
+    session : CalibrationSession
+        Takes the messages.
+    batch : sequence of (Stream, bytes)
+        Messages in the order in which they came.
+    deserialise : callable
+        Makes a message of bytes and a message type.
+
+    """
+    groups = _decoded(batch)
+    alone = np.ones(len(batch), dtype=bool)
+    for group in groups:
+        alone[group.places] = False
+    problems = []
+    begin = 0
+    while begin < len(batch):
+        stop = min(begin + WINDOW, len(batch))
+        window = [group.between(begin, stop) for group in groups]
+        eventful = alone[begin:stop].copy()
+        for group in window:
+            if isinstance(group.readings, JointReadings):
+                eventful[group.places - begin] = ~session.uneventful(group.readings)
+        end = begin + int(eventful.argmax()) if eventful.any() else stop
+        _keep(session, [group.between(begin, end) for group in window])
+        if end < stop:
+            try:
+                _take(session, batch[end], _reading(window, end), deserialise)
+            except DecodingError as err:
+                problems.append(str(err))
+        begin = end + 1 if end < stop else stop
+    return problems
+
+
+class DecodingError(Exception):
+    """A message that cannot be decoded."""
+
+
+def _decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
+    """Return the messages that are laid out like others of their stream and length."""
+    alike: dict[tuple[str, int], list[int]] = {}
+    for place, (stream, data) in enumerate(batch):
+        alike.setdefault((stream.topic, len(data)), []).append(place)
+    groups = []
+    for places in alike.values():
+        stream = batch[places[0]][0]
+        found = readings(stream.type, [batch[place][1] for place in places])
+        if found is not None:
+            groups.append(Group(stream, np.array(places)[found[1]], found[0]))
+    return groups
+
+
+def _keep(session: CalibrationSession, groups: Sequence[Group]) -> None:
+    joints, measured = [], []
+    for group in groups:
+        if not len(group.places):
+            continue
+        if isinstance(group.readings, JointReadings):
+            joints.append((group.places, group.readings))
+        elif group.stream.source is not None:
+            measured.append((group.places, group.stream.source, group.readings))
+    session.keep(joints, measured)
+
+
+def _reading(groups: Sequence[Group], place: int) -> JointReading | None:
+    """Return the joint reading at a place, if it is decoded."""
+    for group in groups:
+        row = int(np.searchsorted(group.places, place))
+        if row < len(group.places) and group.places[row] == place:
+            found = group.readings.row(row)
+            return found if isinstance(found, JointReading) else None
+    return None
+
+
+def _take(
+    session: CalibrationSession,
+    given: tuple[Stream, bytes],
+    reading: JointReading | None,
+    deserialise: Callable[[bytes, str], Any],
+) -> None:
+    """Let a session take one message, decoded or not."""
+    stream, data = given
+    if reading is not None:
+        session.take_joint_reading(reading)
+        return
+    try:
+        message = deserialise(data, stream.type)
+    except Exception as err:  # damaged bytes fail in many ways
+        raise DecodingError(f'a message on {stream.topic} cannot be decoded: {err!r}') from err
+    if stream.source is None:
+        session.take_joints(message)
+    else:
+        session.take(stream.source, stream.type, message)

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages taken by the batch, as if each were taken by itself."""
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros.config import Settings, load_chain
+from calib_ros.intake import Stream, feed
+from calib_ros.messages import JOINT_STATE
+from calib_ros.se3 import to_quat
+from calib_ros.session import CalibrationSession
+from calib_ros.simulation import Cell, drive, faulty, measure
+from calib_ros.sources import Source
+
+ARM = load_chain('ur10e')
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'
+JOINTS = Stream('joints', JOINT_STATE)
+GRIPPER = Stream('gripper', JOINT_STATE)
+TRACKER = Stream('tracker', POSE, Source('tracker', POSE))
+CAMERA = Stream('camera', POINT, Source('camera', POINT, device='camera'))
+START = 1_700_000_000_000_000_000
+RARE = 0.002
+
+
+def header(stamp_ns, frame_id=''):
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
+    return TYPES['std_msgs/msg/Header'](time, frame_id)
+
+
+def joints(stream, stamp_ns, names, values):
+    none = np.zeros(0)
+    message = TYPES[JOINT_STATE](header(stamp_ns), list(names), np.array(values), none, none)
+    return stream, bytes(STORE.serialize_cdr(message, JOINT_STATE))
+
+
+def pose(stamp_ns, position, quat, frame_id='world'):
+    point = TYPES['geometry_msgs/msg/Point'](*position)
+    turn = TYPES['geometry_msgs/msg/Quaternion'](*quat)
+    message = TYPES[POSE](header(stamp_ns, frame_id), TYPES['geometry_msgs/msg/Pose'](point, turn))
+    return TRACKER, bytes(STORE.serialize_cdr(message, POSE))
+
+
+def point(stamp_ns, position):
+    message = TYPES[POINT](header(stamp_ns, 'lens'), TYPES['geometry_msgs/msg/Point'](*position))
+    return CAMERA, bytes(STORE.serialize_cdr(message, POINT))
+
+
+def shift(rng, stops=14):
+    """Return messages of a shift with what may go wrong, in the order in which they come."""
+    cell = Cell(joint_rate=100.0, move=0.7, dwell=0.6)
+    true = faulty(ARM, Cell(), rng)
+    stamps, values, _ = drive(ARM.random_joints(stops, rng), cell, START)
+    seen = measure(true, values, rng, 5e-5, 2e-4)
+    quats = to_quat(seen.rotations)
+    found = []
+
+    def come(stamp_ns, message):
+        late = rng.exponential(0.05) + (rng.random() < 0.02) * rng.uniform(0.0, 3.0)
+        found.append((stamp_ns * 1e-9 + late, message))
+
+    for k, stamp in enumerate(stamps.tolist()):
+        row = values[k].copy()
+        row[2] = np.nan if rng.random() < RARE else row[2]
+        given = 0 if rng.random() < RARE else stamp
+        order = rng.permutation(6) if rng.random() < RARE else np.arange(6)
+        come(stamp, joints(JOINTS, given, [ARM.joint_names[i] for i in order], row[order]))
+        if k % 3 == 0:
+            come(stamp, joints(GRIPPER, stamp, ['finger'], [0.1]))
+        frame_id = 'elsewhere' if rng.random() < RARE else 'world'
+        place = seen.positions[k] * (np.nan if rng.random() < RARE else 1.0)
+        come(stamp, pose(stamp + 300_000, place, quats[k], frame_id))
+        if k % 2 == 0:
+            come(stamp, point(stamp, seen.positions[k]))
+    found.sort(key=lambda item: item[0])
+    return [message for _, message in found]
+
+
+def outcome(session):
+    """Return all that a session has made of its messages, as plain values."""
+    account = session.account()
+    samples = [
+        (s.stamp_ns, s.device, s.count, s.joints.tolist(), s.approach.tolist(), s.spread)
+        for s in session.samples
+    ]
+    stamp_ns, values = session.latest or (0, ())
+    return account, samples, stamp_ns, list(values), session.delay, session.status()
+
+
+@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+def test_a_batch_is_taken_as_its_messages_are(seed, mode):
+    rng = np.random.default_rng(seed)
+    first, second = shift(rng), shift(rng)
+    # The clock jumps back when the recording begins again.
+    messages = first + (second if seed % 2 else [])
+    limits = {'joint_buffer': 150, 'pose_buffer': 40} if seed % 3 == 0 else {}
+    settings = Settings(mode=mode, frame_id='' if seed % 3 == 1 else 'world', **limits)
+    one, many = CalibrationSession(ARM, settings), CalibrationSession(ARM, settings)
+    begin = 0
+    while begin < len(messages):
+        end = begin + int(rng.choice([1, 10, 100, 400, 3000]))
+        one.recording = many.recording = bool(rng.random() < 0.8)
+        assert feed(many, messages[begin:end], STORE.deserialize_cdr) == []
+        for stream, data in messages[begin:end]:
+            message = STORE.deserialize_cdr(data, stream.type)
+            if stream.source is None:
+                one.take_joints(message)
+            else:
+                one.take(stream.source, stream.type, message)
+        assert outcome(one) == outcome(many)
+        begin = end
+    one.finish()
+    many.finish()
+    assert outcome(one) == outcome(many)
+    assert one.samples
+
+
+def test_a_damaged_message_is_told_and_the_others_are_taken():
+    stamps = [START + k * 10_000_000 for k in range(20)]
+    messages = [joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)) for stamp in stamps]
+    messages[7] = (JOINTS, messages[7][1][:40])
+    session = CalibrationSession(ARM)
+    (problem,) = feed(session, messages, STORE.deserialize_cdr)
+    assert problem.startswith('a message on joints cannot be decoded')
+    assert session.received['joints'] == 19
