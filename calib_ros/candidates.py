@@ -52,6 +52,10 @@ class Visibility:
             )
         if not np.linalg.norm(self.axis) > 0.0:
             raise ConfigError('the axis of the target must not be 0 0 0')
+        if not 0.0 < self.cone <= np.pi:
+            raise ConfigError(
+                f'the cone must be between 0 and 180 degrees, not {np.degrees(self.cone):g}'
+            )
 
     def sees(self, design: Design, joints: FloatArray) -> NDArray[np.bool_]:
         """Return (N,) whether the target can be measured at joint values (N, n)."""

@@ -257,18 +257,18 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from calib_ros.config import calibration_record, load_chain, read_text
+    from calib_ros.config import load_chain, parse_calibration, read_text
     from calib_ros.export import Export, exports
     from calib_ros.files import write_file
     from calib_ros.urdf import corrected_urdf
     from calib_ros.waypoints import read_joints
 
-    chain = load_chain(options.calibration)
+    nominal, path = load_chain(options.chain), options.calibration
+    chain, origin = parse_calibration(read_text(path), str(path), nominal)
     measured = None
     if options.measured is not None:
-        measured = read_joints(options.measured, len(chain.joints))
-    origin = calibration_record(read_text(options.calibration))
-    found = exports(chain, load_chain(options.chain), measured, origin)
+        measured = read_joints(options.measured, chain)
+    found = exports(chain, nominal, measured, origin)
     if options.urdf is not None:
         links = (options.base_link, options.tip_link)
         text = corrected_urdf(read_text(options.urdf), chain, *links)
@@ -370,7 +370,7 @@ def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
     options.bag.parent.mkdir(parents=True, exist_ok=True)
     write_bag(options.bag, recording, options.storage)
     path: Path = options.bag.parent / f'{options.bag.name}_truth.yaml'
-    write_file(path, dump_chain(true), overwrite=True)
+    write_file(path, dump_chain(true, {'source': 'simulation'}), overwrite=True)
     return path
 
 

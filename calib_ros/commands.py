@@ -118,16 +118,20 @@ def _add_workspace(parser: argparse.ArgumentParser) -> None:
     add('--force', action='store_true', help='overwrite files in --out')
 
 
-def _add_verify(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add('measured', type=Path, help='table of new measurements: q1..qn as reported, x y z ...')
-    add_chain(parser)
-    add(
+def _add_calibration(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
         '--calibration',
         type=Path,
         required=True,
         help='folder of identify --out, or calibration.yaml alone',
     )
+
+
+def _add_verify(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('measured', type=Path, help='table of new measurements: q1..qn as reported, x y z ...')
+    add_chain(parser)
+    _add_calibration(parser)
     add('--tolerance', type=float, required=True, metavar='MM', help='wanted RMS position error')
     add(
         '--commanded',
@@ -147,9 +151,7 @@ def _add_compensate(parser: argparse.ArgumentParser) -> None:
         'program', type=Path, help='.csv with q1 ... qn, or .yaml with a JointTrajectory'
     )
     add_chain(parser)
-    parser.add_argument(
-        '--calibration', required=True, help='calibration.yaml of calib_ros identify'
-    )
+    _add_calibration(parser)
     parser.add_argument('--out', type=Path, required=True, help='the corrected program')
     parser.add_argument('--force', action='store_true', help='overwrite --out')
     parser.add_argument(
@@ -230,14 +232,14 @@ def _plan_measurement(
     if len(options.velocity) not in (1, size):
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
-        design = design.after(read_joints(options.taken, size))
+        design = design.after(read_joints(options.taken, design.chain))
     task = design.chain.random_joints(TASK_POSES, rng)
     if options.task is not None:
-        task = read_joints(options.task, size)
+        task = read_joints(options.task, design.chain)
     if options.candidates is None:
         candidates = draw_candidates(design, options.draw, rng, visibility)
     else:
-        candidates = read_joints(options.candidates, size)
+        candidates = read_joints(options.candidates, design.chain)
         candidates = candidates[visibility.sees(design, candidates)]
         if not len(candidates):
             raise InputError(f'the target can be measured at no pose of {options.candidates}')
@@ -268,6 +270,9 @@ def _plan_tests(
 
 def _check_plan(options: argparse.Namespace) -> None:
     """Refuse options of `plan` that make no sense."""
+    for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
+        if options.iso9283 and getattr(options, name) is not None:
+            raise InputError(f'--{name} is of no use with --iso9283')
     for name, lowest in (('poses', 1), ('draw', 1), ('seed', 0)):
         value = getattr(options, name)
         if value is not None and value < lowest:
@@ -341,6 +346,8 @@ def _task(
             f'{len(options.joint_box)} in all'
         )
     lower, upper = np.reshape(options.joint_box, (2, size))
+    if not (lower <= upper).all():
+        raise InputError('--joint-box: give all lower values first, then all upper ones')
     joints = rng.uniform(lower, upper, (BOX_POSES, size))
     return task_of(in_base(arm.commanded_by(options.model), joints))
 
@@ -358,7 +365,7 @@ def _verify(options: argparse.Namespace) -> int:
     table = read_table(options.measured, len(nominal.joints), sessions)
     commanded = None
     if options.commanded is not None:
-        commanded = read_joints(options.commanded, len(nominal.joints))
+        commanded = read_joints(options.commanded, nominal)
     found = verify(
         arm,
         (*table.fitted, *table.held_out),
@@ -374,10 +381,13 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _compensate(options: argparse.Namespace) -> int:
+    import numpy as np
+
     from calib_ros.compensation import POSITIVE, Compensator, compensate_program, in_words
     from calib_ros.config import load_chain
     from calib_ros.files import write_file
     from calib_ros.programs import read_program
+    from calib_ros.workspace import CalibratedArm
 
     if options.out.exists() and not options.force:
         raise InputError(f'{options.out} exists already: choose another name or --force')
@@ -385,9 +395,10 @@ def _compensate(options: argparse.Namespace) -> int:
         raise InputError(
             '--out is the program itself: keep it, a program compensated twice is wrong'
         )
-    nominal, calibrated = load_chain(options.chain), load_chain(options.calibration)
+    nominal = load_chain(options.chain)
+    arm = CalibratedArm.read(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
-    compensator = Compensator(nominal, calibrated, tuple(options.tool), **limits)
+    compensator = Compensator(nominal, arm.after, tuple(options.tool), **limits)
     source = read_program(options.program, nominal.joint_names)
     corrected, result = compensate_program(compensator, source.program)
     if result.refusals:
@@ -397,4 +408,17 @@ def _compensate(options: argparse.Namespace) -> int:
         return NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     print(f'wrote {options.out}: {in_words(compensator, result)}')
+    shift, turn = arm.sigma(result.joints), arm.sigma_turned(result.joints)
+    if arm.covariance is not None:
+        print(
+            f'sigma of the calibration at these poses: {1e3 * shift.max():.3f} mm where the '
+            f'target was, {1e3 * turn.max():.3f} mrad at most'
+        )
+    if np.sum(turn**2) > np.sum(result.orientation_before**2):
+        print(
+            'warning: the calibration does not know the orientation well enough to correct it; '
+            'positions hold near the measured target only. Measure orientations as well, or a '
+            'target further off the last axis',
+            file=sys.stderr,
+        )
     return 0

@@ -248,24 +248,23 @@ def compensate_program(compensator: Compensator, program: Program) -> tuple[Prog
     positions = program.positions[:, columns]
     approach = approaches(positions) if program.approach is None else program.approach
     result = compensate(compensator, positions, approach)
-    if program.velocities is not None:
-        refused = {refusal.sample for refusal in result.refusals}
-        held = [k for k in np.flatnonzero(result.limited.any(axis=1)) if k not in refused]
-        reason = 'a joint is held at its limit, where its velocity is not defined'
-        result = _refused(result, [Refusal(int(sample), reason) for sample in held])
-    corrected = replace(program, positions=_put(program.positions, columns, result.joints))
     if program.velocities is None:
-        return corrected, result
+        return replace(program, positions=_put(program.positions, columns, result.joints)), result
     given = program.accelerations
     curve = np.zeros_like(program.velocities) if given is None else given
+    speeds = program.velocities[:, columns]
     velocities, accelerations = _derivatives(
-        compensator, result, program.velocities[:, columns], curve[:, columns], approach
+        compensator, result, speeds, curve[:, columns], approach
     )
+    result = _refused(result, _held(result))
+    result = _refused(result, _swings(compensator, result, speeds, velocities - speeds))
+    refused = np.where(np.isnan(result.joints), np.nan, 0.0)
     return (
         replace(
-            corrected,
-            velocities=_put(program.velocities, columns, velocities),
-            accelerations=None if given is None else _put(given, columns, accelerations),
+            program,
+            positions=_put(program.positions, columns, result.joints),
+            velocities=_put(program.velocities, columns, velocities + refused),
+            accelerations=None if given is None else _put(given, columns, accelerations + refused),
         ),
         result,
     )
@@ -291,7 +290,9 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             worst = max(columns, key=lambda k: float(size[k]))
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
-    text += f'; largest error {1e3 * result.position_before[kept].max():.3f} mm, '
+    text += (
+        f'; by the calibration, largest error {1e3 * result.position_before[kept].max():.3f} mm, '
+    )
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
     text += f' -> {1e3 * result.position[kept].max():.6f} mm, '
     text += f'{1e3 * result.orientation[kept].max():.6f} mrad'
@@ -358,6 +359,34 @@ def _jumps(compensator: Compensator, result: Compensation) -> list[Refusal]:
     return found
 
 
+def _held(result: Compensation) -> list[Refusal]:
+    """Return the samples with a joint at its limit that are not refused yet."""
+    held = np.flatnonzero(result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1))
+    reason = 'a joint is held at its limit, where its velocity is not defined'
+    return [Refusal(sample, reason) for sample in held.tolist()]
+
+
+def _swings(
+    compensator: Compensator, result: Compensation, speeds: FloatArray, changes: FloatArray
+) -> list[Refusal]:
+    """Return the samples whose correction changes (N, n) too fast for their speeds (N, n).
+
+    The limit is that of jumps, which samples far from each other do not show.
+    """
+    sizes = np.where(np.isnan(result.joints), 0.0, np.abs(changes))
+    shares = sizes / compensator.largest
+    allowed = compensator.largest_change * np.abs(speeds / compensator.largest).max(axis=1)
+    found = []
+    for k in np.flatnonzero(shares.max(axis=1) > allowed + CHANGE_FLOOR).tolist():
+        i = int(shares[k].argmax())
+        reason = (
+            f'the correction of {compensator.nominal.joint_names[i]} moves at {sizes[k, i]:.4g} '
+            f'while the joints move at {np.abs(speeds[k]).max():.4g} a second at most'
+        )
+        found.append(Refusal(k, reason))
+    return found
+
+
 def _refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     """Return the result with further samples refused, their joint values set to NaN."""
     joints = result.joints.copy()
@@ -373,7 +402,7 @@ def _derivatives(
     accelerations: FloatArray,
     approach: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return velocities and accelerations (N, n) along the corrected path, NaN where refused.
+    """Return velocities and accelerations (N, n) along the corrected path.
 
     Central differences of the correction along q + v t + a t^2 / 2, with a time step in which the
     command moves by a small part of the largest correction.
@@ -390,10 +419,9 @@ def _derivatives(
         return compensator.follower.solve(joints, approach, bounded=False).change
 
     ahead, here, behind = correction(step), correction(0.0 * step), correction(-step)
-    refused = np.where(np.isnan(result.joints), np.nan, 0.0)
     return (
-        velocities + (ahead - behind) / (2.0 * step) + refused,
-        accelerations + (ahead - 2.0 * here + behind) / step**2 + refused,
+        velocities + (ahead - behind) / (2.0 * step),
+        accelerations + (ahead - 2.0 * here + behind) / step**2,
     )
 
 

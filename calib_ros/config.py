@@ -34,6 +34,8 @@ MODES = ('dwell', 'continuous', 'triggered')
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
+SAME = 1e-9
+"""Numbers [m, rad] of two nominal chains that differ by less are the same."""
 
 
 STARTUP = (
@@ -270,6 +272,78 @@ def calibration_record(text: str) -> dict[str, Any]:
 
     record = yaml.safe_load(text).get('calibration')
     return record if isinstance(record, dict) else {}
+
+
+def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> Chain:
+    """Read the calibration of a nominal chain: its file, or the folder of an identification.
+
+    Raises
+    ------
+    ConfigError
+        When it is none, or that of another nominal chain (`parse_calibration`).
+
+    """
+    file = Path(path)
+    if file.is_dir():
+        file /= 'calibration.yaml'
+    return parse_calibration(read_text(file), str(file), nominal)[0]
+
+
+def parse_calibration(text: str, where: str, nominal: Chain) -> tuple[Chain, dict[str, Any]]:
+    """Turn the text of a calibration into the corrected chain and the record of its origin.
+
+    A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
+    all that calib_ros writes, and must not speak against this nominal chain.
+
+    Raises
+    ------
+    ConfigError
+        When the text is no chain file, a chain without a record, or a calibration that was not
+        accepted, or that was identified from another nominal chain.
+
+    """
+    chain = parse_chain(text, where)
+    ours, theirs = (
+        [f'{joint.name} ({joint.type})' for joint in each.joints] for each in (nominal, chain)
+    )
+    if ours != theirs:
+        raise ConfigError(
+            f'{where} has the joints {", ".join(theirs)}, the nominal chain has '
+            f'{", ".join(ours)}: is it the right nominal chain?'
+        )
+    record = calibration_record(text)
+    if not record:
+        raise ConfigError(
+            f'{where} is a chain, but no calibration: it does not say where its numbers come '
+            'from (key "calibration"); give the calibration.yaml of calib_ros identify'
+        )
+    if record.get('accepted') is False:
+        raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
+    _check_nominal(record.get('nominal'), nominal, where)
+    return chain, record
+
+
+def nominal_record(nominal: Chain) -> dict[str, Any]:
+    """Return the numbers of the chain that a calibration belongs to, row by row."""
+    rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
+    return {'convention': nominal.convention, 'joints': rows}
+
+
+def _check_nominal(recorded: object, nominal: Chain, where: str) -> None:
+    """Refuse a nominal chain with other numbers than the one that a calibration comes from."""
+    known = _dictionary(recorded, f'{where}: calibration.nominal')
+    if known.get('convention') != nominal.convention:  # nothing recorded, or not comparable
+        return
+    rows = _dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
+    for joint in nominal.joints:
+        row = _numbers(rows.get(joint.name), len(DH_KINDS), f'{where}: nominal {joint.name}')
+        for kind, value in zip(DH_KINDS, row.tolist(), strict=True):
+            if abs(value - getattr(joint, kind)) > SAME:
+                raise ConfigError(
+                    f'{where} was identified from another nominal chain, with {joint.name}.{kind} '
+                    f'{value:.9g} and not {getattr(joint, kind):.9g}: give that one, or identify '
+                    'again'
+                )
 
 
 def chain_document(chain: Chain) -> dict[str, Any]:

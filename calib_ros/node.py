@@ -65,7 +65,7 @@ from calib_ros.config import (
     Settings,
     calibration_record,
     load_chain,
-    parse_chain,
+    parse_calibration,
     read_text,
 )
 from calib_ros.deferred import DeferredTrigger
@@ -219,7 +219,7 @@ class CalibrationNode(Node):
             self.session,
             latched,
             self._guarded,
-            read_joints(Path(candidates).expanduser(), len(chain.joints)) if candidates else None,
+            read_joints(Path(candidates).expanduser(), chain) if candidates else None,
         )
         self._identify = DeferredTrigger(
             self, '~/identify', self._answer, self._snapshot, self._run
@@ -529,7 +529,7 @@ class CalibrationNode(Node):
                 f'{self._archive.folder}: set calibration_filename'
             )
         text = read_text(path)
-        chain, record = parse_chain(text, str(path)), calibration_record(text)
+        chain, record = parse_calibration(text, str(path), self.session.chain)
         self.session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
         self._last = f'loaded {path}'
         self._publish_calibration(chain, text)

@@ -99,11 +99,16 @@ def place(
     Raises
     ------
     InputError
-        When the arm reaches all poses of the task nowhere.
+        When the region is empty, or the arm reaches all poses of the task nowhere in it.
 
     """
     if aim not in AIMS:
         raise UnknownNameError('aim', aim, AIMS)
+    if region is not None and not (region[0] <= region[1]).all():
+        raise InputError(
+            f'the region from {region[0].tolist()} to {region[1].tolist()} is empty: give the '
+            'lower corner first'
+        )
     search = _Search(arm, task, aim, model)
     corners = search.reach if region is None else region
     axes = [np.linspace(low, high, cells) for low, high in corners.T]

@@ -397,7 +397,8 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
     if plan.lacking:
         lines.append(
             f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '
-            'further and in more combinations, or fix these parameters'
+            'further and in more combinations, or fix these parameters. The figures leave out '
+            'what these bring, and hold only where the joints move as in the candidates'
         )
     lines.append('from the noise of the measurement alone; what the model lacks comes on top')
     return '\n'.join(lines)

@@ -75,6 +75,10 @@ def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
                 f'{where} must have one column {name}, not {header.count(name)}; expected '
                 f'{", ".join(names)}, found {", ".join(header)}'
             )
+    if f'q{len(joints) + 1}' in header:
+        raise InputError(
+            f'{where} has a column q{len(joints) + 1}, but the arm has {len(joints)} joints only'
+        )
     for line, row in rows:
         if len(row) != len(header):
             raise InputError(f'{where}, line {line}: {len(row)} values for {len(header)} columns')

@@ -15,7 +15,7 @@ import numpy as np
 import calib_ros
 from calib_ros import effects
 from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
-from calib_ros.config import Settings, dump_chain, dump_yaml
+from calib_ros.config import Settings, dump_chain, dump_yaml, nominal_record
 from calib_ros.identification import Identification, Noise
 from calib_ros.session import Calibration
 from calib_ros.validation import Comparison, ErrorFigures, Parameter
@@ -73,6 +73,7 @@ def provenance(result: Identification) -> dict[str, Any]:
         'rms_mm_before': round(before.rms_mm, 6),
         'rms_mm_after': round(after.rms_mm, 6),
         'not_identifiable': list(result.unidentifiable),
+        'nominal': nominal_record(result.before),
     }
 
 

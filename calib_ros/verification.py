@@ -75,6 +75,8 @@ class Verification:
         even MOST would not.
     common : float
         Share of the RMS error that is left without one common shift and turn of all positions.
+    by_program : bool
+        Whether the poses wanted are those of the program before its correction.
 
     """
 
@@ -88,6 +90,7 @@ class Verification:
     verdict: Verdict
     needed: int | None
     common: float
+    by_program: bool
 
     @property
     def configurations(self) -> int:
@@ -129,9 +132,9 @@ def verify(
         know, or measurements far from all that was commanded.
 
     """
-    if not tolerance > 0.0 or not 0.5 < confidence < 1.0:
+    if not 0.0 < tolerance < np.inf or not 0.5 < confidence < 1.0:
         raise ConfigError(
-            'tolerance must be positive and confidence between 0.5 and 1, not '
+            'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
             f'{tolerance} and {confidence}'
         )
     for each in sets:
@@ -180,6 +183,7 @@ def verify(
         verdict,
         needed,
         common,
+        commanded is not None,
     )
 
 
@@ -262,6 +266,11 @@ def in_words(found: Verification) -> str:
         f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm; wanted is '
         f'{1e3 * found.tolerance:g} mm'
     )
+    if not found.by_program:
+        lines.append(
+            'this is about the calibration: whether its correction arrives at the arm shows only '
+            'with the program as it was before (--commanded)'
+        )
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {MOST}'
         lines.append(f'{enough} configurations with the same RMS error would decide')

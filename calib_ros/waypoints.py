@@ -15,23 +15,42 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros import se3
+from calib_ros.chain import Chain
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError
+from calib_ros.inverse import limits
 from calib_ros.se3 import FloatArray
 
+BEYOND = 1e-3
+"""How far [rad or m] an arm may stand beyond a limit."""
 POSE = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
 
 
-def read_joints(path: Path, joints: int) -> FloatArray:
-    """Read joint values (N, joints) [rad or m] from the columns q1 ... qn of a CSV.
+def read_joints(path: Path, chain: Chain) -> FloatArray:
+    """Read joint values (N, n) [rad or m] of a chain from the columns q1 ... qn of a CSV.
 
     Raises
     ------
     InputError
-        For a missing column, no row, or a value that is no number.
+        For a missing column, one joint too many, no row, a value that is no number, and one that
+        is beyond the limits of its joint.
 
     """
-    return _read(path, joint_columns(joints))[0]
+    columns = joint_columns(len(chain.joints))
+    values, lines, header = _read(path, columns)
+    surplus = f'q{len(columns) + 1}'
+    if surplus in header:
+        raise InputError(
+            f'{path} has a column {surplus}, but "{chain.name}" has {len(columns)} joints only'
+        )
+    lower, upper = limits(chain)
+    beyond = (values < lower - BEYOND) | (values > upper + BEYOND)
+    for k, i in np.argwhere(beyond).tolist():
+        raise InputError(
+            f'{path}, line {lines[k]}: {columns[i]} {values[k, i]:.6g} is beyond the limits of '
+            f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
+        )
+    return values
 
 
 def read_poses(path: Path) -> FloatArray:
@@ -43,7 +62,7 @@ def read_poses(path: Path) -> FloatArray:
         For a missing column, no row, a value that is no number, or a quaternion that is none.
 
     """
-    numbers, lines = _read(path, POSE)
+    numbers, lines, _ = _read(path, POSE)
     length = np.linalg.norm(numbers[:, 3:], axis=1)
     for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE).tolist():
         raise InputError(
@@ -72,8 +91,8 @@ def csv_of(columns: Sequence[str], values: FloatArray) -> str:
     return '\n'.join([','.join(columns), *rows]) + '\n'
 
 
-def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
-    """Return the values (N, C) of some columns, and the line of each row."""
+def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int], Sequence[str]]:
+    """Return the values (N, C) of some columns, the line of each row, and the header."""
     try:
         with path.open(encoding='utf-8-sig', newline='') as file:
             reader = csv.DictReader(file, strict=True)
@@ -93,7 +112,7 @@ def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int]]:
         [_number(row[name], f'{path}, line {line}: {name}') for name in columns]
         for line, row in rows
     ]
-    return np.array(numbers), [line for line, _ in rows]
+    return np.array(numbers), [line for line, _ in rows], header
 
 
 def _number(text: str | None, where: str) -> float:

@@ -23,7 +23,7 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.chain import FRAME_KINDS, Chain
-from calib_ros.config import load_chain
+from calib_ros.config import load_calibration
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identifiability import structurally_independent
@@ -80,17 +80,12 @@ class CalibratedArm:
         Raises
         ------
         ConfigError
-            When there is no calibrated chain, or it is not of that nominal one.
+            When there is no calibration, or not one of that nominal chain.
         InputError
             When the result beside it cannot be used.
 
         """
-        after = load_chain(path / 'calibration.yaml' if path.is_dir() else path)
-        if after.joint_names != nominal.joint_names:
-            raise ConfigError(
-                f'{path} has the joints {", ".join(after.joint_names)}, the nominal chain has '
-                f'{", ".join(nominal.joint_names)}: is it the right nominal chain?'
-            )
+        after = load_calibration(path, nominal)
         arm = cls(_in_frames_of(nominal, after), after)
         if not path.is_dir():
             return arm
@@ -115,13 +110,20 @@ class CalibratedArm:
 
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the standard deviation (N,) [m] of predicted positions; NaN if not known."""
+        return self._sigma(joints, slice(0, 3))
+
+    def sigma_turned(self, joints: FloatArray) -> FloatArray:
+        """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
+        return self._sigma(joints, slice(3, 6))
+
+    def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
         if self.covariance is None:
             return np.full(len(joints), np.nan)
         model = ErrorModel(self.after, self.names)
         squares = np.empty(len(joints))
         for first in range(0, len(joints), BLOCK):
             part = slice(first, first + BLOCK)
-            rows = model.jacobian(joints[part])[:, :3]
+            rows = model.jacobian(joints[part])[:, components]
             squares[part] = np.einsum('ncp,pq,ncq->n', rows, self.covariance, rows, optimize=True)
         return np.sqrt(np.maximum(squares, 0.0))
 

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -21,13 +22,14 @@ from calib_ros.compensation import (
     compensate_program,
     in_words,
 )
-from calib_ros.config import dump_chain, load_chain, shipped_robots
+from calib_ros.config import dump_chain, load_chain, nominal_record, shipped_robots
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.following import POSITION_FIRST, mobility
 from calib_ros.identification import Problem, identify
 from calib_ros.inverse import solve_positive
 from calib_ros.options import NOT_ACCEPTED
 from calib_ros.programs import read_program
+from calib_ros.report import as_document, calibration_yaml
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
 CELL = Cell(length_error=1e-3, angle_error=1e-3)
@@ -566,6 +568,25 @@ def test_velocities_and_accelerations_are_those_of_the_corrected_path(name, gear
     assert np.abs(program.accelerations[1:-1] - bend).max() > 2e-3
 
 
+def test_a_correction_that_swings_between_sparse_samples_is_refused():
+    """Near the wrist's singularity; two samples alone do not show a jump."""
+    q = np.array([[0.3, -1.0, 1.2, -1.0, 0.05, 0.2], [0.9, -1.4, 0.8, -1.6, 1.0, 0.6]])
+    speeds = np.tile([0.0, 0.0, 0.0, 0.0, -0.5, 0.0], (2, 1))
+    true = UR.with_offsets({'wrist_1_joint.alpha': 2e-3, 'shoulder_lift_joint.alpha': 2e-3})
+    compensator = Compensator(UR, true)
+    assert compensate(compensator, q).refusals == ()
+    corrected, result = compensate_program(compensator, Program(UR.joint_names, q, speeds))
+    assert only_refusal(result).sample == 0
+    assert 'moves at' in only_refusal(result).reason
+    assert np.isnan(corrected.velocities[0]).all()
+    assert np.isnan(corrected.positions[0]).all()
+    assert np.isfinite(corrected.velocities[1]).all()
+    lenient = replace(compensator, largest_change=5.0)
+    allowed, result = compensate_program(lenient, Program(UR.joint_names, q, speeds))
+    assert result.refusals == ()
+    assert np.abs(allowed.velocities - speeds)[0].max() > 0.25
+
+
 def test_an_arm_at_rest_keeps_its_rest():
     q = np.repeat(regular(UR, 1), 3, axis=0)
     program = Program(UR.joint_names, q, np.zeros_like(q), np.zeros_like(q))
@@ -641,7 +662,7 @@ def trajectory(q, names=UR.joint_names, **more):
 @pytest.fixture
 def run(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / 'calibration.yaml').write_text(dump_chain(UR_TRUE))
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(UR_TRUE, {'source': 'simulation'}))
 
     def run(program, *arguments, chain='ur10e', out='out'):
         out = f'{out}{program.suffix}'
@@ -652,6 +673,56 @@ def run(capsys, tmp_path, monkeypatch):
         return status, said, err
 
     return run
+
+
+def test_a_program_of_more_joints_than_the_arm_has_is_refused(run, tmp_path):
+    """Its columns may begin with those of another axis."""
+    path = tmp_path / 'program.csv'
+    path.write_text('q1,q2,q3,q4,q5,q6,q7\n1.2,0.1,-1.4,1.1,-1.2,0.7,0.1\n')
+    status, _, err = run(path)
+    assert status == 1
+    assert 'column q7, but the arm has 6 joints only' in err
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_the_command_line_says_how_well_the_orientation_is_known(run, tmp_path, capsys, oriented):
+    """By positions of a target on the last axis alone it is not, and a long tool would be off."""
+    rng = np.random.default_rng(1)
+    true = UR_TRUE.with_frame('tool', Frame(se3.transform(np.eye(3), np.array([0, 0, 0.01]))))
+    seen = measure(true, UR.random_joints(60, rng), rng, 1e-4, 3e-4, oriented=oriented)
+    found = identify(Problem(UR, seen, sigma_position=1e-4))
+    folder = tmp_path / 'result'
+    folder.mkdir()
+    (folder / 'calibration.yaml').write_text(calibration_yaml(found))
+    (folder / 'result.json').write_text(json.dumps(as_document(found, {})))
+    (tmp_path / 'program.csv').write_text(TABLE)
+    status, said, err = run(tmp_path / 'program.csv', '--calibration', 'result')
+    assert status == 0
+    assert 'sigma of the calibration at these poses: 0.0' in said
+    assert ('does not know the orientation' in err) is not oriented
+
+
+def test_chains_given_the_wrong_way_round_are_refused(run, tmp_path):
+    """The correction would go the wrong way, and double the error."""
+    path = tmp_path / 'program.csv'
+    path.write_text(TABLE)
+    (tmp_path / 'nominal.yaml').write_text(dump_chain(UR))
+    swapped = ('--calibration', 'nominal.yaml')
+    status, _, err = run(path, *swapped, chain='calibration.yaml')
+    assert status == 1
+    assert 'is a chain, but no calibration' in err
+    assert not (tmp_path / 'out.csv').exists()
+
+
+def test_the_calibration_of_a_cousin_is_refused(run, tmp_path):
+    """A tenth of the poses could be corrected from one arm to the other, by centimetres."""
+    path = tmp_path / 'program.csv'
+    path.write_text(TABLE)
+    record = {'accepted': True, 'nominal': nominal_record(ROBOTS['ur10'])}
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
+    status, _, err = run(path)
+    assert status == 1
+    assert 'identified from another nominal chain' in err
 
 
 def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):

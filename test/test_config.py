@@ -14,7 +14,10 @@ from calib_ros.config import (
     Settings,
     chain_document,
     dump_chain,
+    load_calibration,
     load_chain,
+    nominal_record,
+    parse_calibration,
     parse_chain,
     shipped_robots,
 )
@@ -465,3 +468,45 @@ def test_settings_at_the_edge_are_taken():
 def test_a_key_that_comes_twice_is_refused():
     with pytest.raises(ConfigError, match='key "alpha" comes twice'):
         parse_chain(BASE.replace('alpha:', 'alpha: 0.0, alpha:', 1))
+
+
+def calibrated_text(nominal, record):
+    """Return the text of a calibration of a nominal chain, with a record of its origin."""
+    return dump_chain(nominal.with_offsets({f'{nominal.joint_names[1]}.a': 1e-3}), record)
+
+
+def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
+    nominal = load_chain('ur10e')
+    record = {'accepted': True, 'nominal': nominal_record(nominal)}
+    (tmp_path / 'calibration.yaml').write_text(calibrated_text(nominal, record))
+    for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
+        found = load_calibration(path, nominal)
+        assert found.joints[1].a == pytest.approx(nominal.joints[1].a + 1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('nominal', 'record', 'message'),
+    [
+        ('ur10e', None, 'is a chain, but no calibration'),
+        ('ur10e', {}, 'is a chain, but no calibration'),
+        ('ur10e', {'accepted': False}, 'was not accepted'),
+        ('puma560', {'samples': 3}, 'is it the right nominal chain'),
+        ('ur10', {'nominal': nominal_record(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
+        ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
+        ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
+    ],
+)
+def test_what_is_no_calibration_of_a_nominal_chain_is_refused(nominal, record, message):
+    text = calibrated_text(load_chain('ur10e'), record)
+    with pytest.raises(ConfigError, match=message):
+        parse_calibration(text, 'calibration.yaml', load_chain(nominal))
+
+
+def test_a_calibration_in_another_convention_is_taken_as_it_is():
+    """Its numbers cannot be compared with those of the nominal chain."""
+    nominal = load_chain('ur10e')
+    record = {'nominal': nominal_record(load_chain('franka_fr3'))}
+    assert record['nominal']['convention'] == 'modified'
+    chain, found = parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    assert found == record
+    assert chain.joint_names == nominal.joint_names

@@ -599,7 +599,7 @@ def run(capsys, tmp_path, monkeypatch):
 def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     status, out, err = run('--chain', 'ur10e', '--poses', 25, '--out', 'plan.csv')
     assert (status, err) == (0, '')
-    q = read_joints(tmp_path / 'plan.csv', 6)
+    q = read_joints(tmp_path / 'plan.csv', load_chain('ur10e'))
     assert q.shape == (25, 6)
     assert travel(q, range(25), np.ones(6)) < 150.0
     assert np.abs(q).max() <= 2.0 * np.pi
@@ -625,7 +625,7 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
     common = ('--chain', 'chain.yaml', '--candidates', 'q.csv', '--poses', 12, '--force')
     common += ('--task', 'task.csv', '--measured', 'position', '--out', 'plan.csv')
     _, alone, _ = run(*common)
-    found = read_joints(tmp_path / 'plan.csv', 6)
+    found = read_joints(tmp_path / 'plan.csv', chain)
     nearest = np.abs(found[:, None] - q).max(axis=2).min(axis=1)
     assert nearest.max() < 1e-8
     expected = choose(design_of(chain, oriented=False), q, 12)
@@ -643,7 +643,7 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
 
 def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
     _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 500)
-    count = len(read_joints(tmp_path / 'plan.csv', 6))
+    count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
     assert f'0.1 mm: {count} poses' in out
     assert 18 <= count <= 26
     _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 500)
@@ -666,6 +666,9 @@ def test_plan_with_too_few_poses_says_so(run):
         (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
         (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
         (('--box', 9, 9, 9, 10, 10, 10), 'random poses only'),
+        (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
+        (('--iso9283', '--poses', 20), '--poses is of no use with --iso9283'),
+        (('--iso9283', '--candidates', 'q.csv'), '--candidates is of no use'),
         (('--box', 0, 0, 0, 1, 1, 1, '--world'), 'where the base is'),
     ],
 )
@@ -683,11 +686,24 @@ def test_plan_from_candidates_that_nothing_sees(run, tmp_path):
     assert 'measured at no pose of q.csv' in err
 
 
+@pytest.mark.parametrize('option', ['--task', '--taken'])
+def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
+    (tmp_path / 'q.csv').write_text('q1,q2,q3,q4,q5,q6\n0,0,180,0,0,0\n')
+    status, _, err = run('--chain', 'ur10e', option, 'q.csv')
+    assert status == 1
+    assert 'q3 180 is beyond the limits of elbow_joint' in err
+
+
 @pytest.mark.parametrize(
     ('content', 'text'),
     [
         ('q1,q2\n0,0\n', 'has no column q3, q4, q5, q6'),
         ('q1,q2,q3,q4,q5,q6\n', 'has no rows'),
+        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but "ur10e" has 6 joints only'),
+        (
+            'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
+            'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',
+        ),
         ('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,x\n', "line 2: q6 must be a number, not 'x'"),
     ],
 )

@@ -249,7 +249,7 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
     correct = ['compensate', 'tests.csv', '--chain', 'ur10e', '--out', 'corrected.csv']
     assert main([*correct, '--calibration', 'result/calibration.yaml']) == 0
     capsys.readouterr()
-    write_table(folder / 'measured.csv', measured(true, read_joints(folder / 'corrected.csv', 6)))
+    write_table(folder / 'measured.csv', measured(true, read_joints(folder / 'corrected.csv', UR)))
     judge = ['verify', 'measured.csv', '--commanded', 'tests.csv', '--chain', 'ur10e']
     judge.append('--calibration')
     for calibration in ('result', 'result/calibration.yaml'):
@@ -257,8 +257,22 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
             assert main([*judge, calibration, '--tolerance', tolerance]) == status
             out = capsys.readouterr().out
             assert f'\n{word}: the RMS error over poses like these is below 0.' in out
+            assert 'about the calibration' not in out
             assert '15 measurements in 5 configurations' in out
             assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
+
+
+def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, capsys):
+    """Its joint values tell of the calibration alone."""
+    q = UR.random_joints(8, np.random.default_rng(3))
+    (folder / 'program.csv').write_text(joints_csv(q))
+    write_table(folder / 'measured.csv', measured(cell[0], q))
+    common = ['verify', 'measured.csv', '--chain', 'ur10e', '--calibration', 'result']
+    common += ['--tolerance', '1']
+    assert main(common) == 0
+    assert 'about the calibration: whether its correction arrives' in capsys.readouterr().out
+    assert main([*common, '--commanded', 'program.csv']) == NOT_ACCEPTED
+    assert 'about the calibration' not in capsys.readouterr().out
 
 
 def test_verify_refuses_what_makes_no_sense(cell, folder, capsys):
@@ -267,6 +281,7 @@ def test_verify_refuses_what_makes_no_sense(cell, folder, capsys):
     for arguments, text in (
         ([*common, '--tolerance', '1'], 'at least 5 are needed'),
         ([*common, '--tolerance', '0'], 'tolerance must be positive'),
+        ([*common, '--tolerance', 'inf'], 'tolerance must be positive'),
         ([*common[:-1], 'missing', '--tolerance', '1'], 'missing'),
         (['verify', 'none.csv', *common[2:], '--tolerance', '1'], 'cannot read none.csv'),
     ):
@@ -277,7 +292,7 @@ def test_verify_refuses_what_makes_no_sense(cell, folder, capsys):
 def test_plan_writes_test_poses_that_are_seen(folder, capsys):
     common = ['plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv']
     assert main([*common, '--box', '0.2', '-0.5', '0.2', '1', '0.5', '1']) == 0
-    joints = read_joints(folder / 'tests.csv', 6)
+    joints = read_joints(folder / 'tests.csv', UR)
     design = design_of(UR)
     positions = design.targets(joints)[:, :3, 3]
     assert ((positions > [0.2, -0.5, 0.2]) & (positions < [1.0, 0.5, 1.0])).all()

@@ -157,10 +157,19 @@ def test_a_chain_alone_has_no_sigma(cell, tmp_path):
 def test_frames_that_are_fixed_stay(cell, tmp_path):
     _, result = cell
     fixed = result.chain.with_frame('base', Frame(result.chain.base.matrix, fixed=True))
-    (tmp_path / 'chain.yaml').write_text(dump_chain(fixed))
+    (tmp_path / 'chain.yaml').write_text(dump_chain(fixed, {'source': 'a test'}))
     arm = CalibratedArm.read(tmp_path / 'chain.yaml', UR)
     np.testing.assert_allclose(arm.before.base.matrix, result.chain.base.matrix, atol=1e-12)
     assert np.abs(arm.before.tool.matrix - result.chain.tool.matrix).max() > 1e-5
+
+
+def test_a_calibration_knows_its_nominal_chain(cell, tmp_path):
+    _, result = cell
+    write_result(tmp_path, result)
+    CalibratedArm.read(tmp_path, UR)
+    other = UR.with_offsets({'elbow_joint.d': 1e-6})
+    with pytest.raises(ConfigError, match=r'another nominal chain, with elbow_joint\.d 0 and'):
+        CalibratedArm.read(tmp_path, other)
 
 
 def test_results_that_cannot_be_used_are_refused(cell, tmp_path):
@@ -330,6 +339,9 @@ def test_a_task_out_of_reach_is_refused(cell, task):
     far[0, 0, 3] = 10.0
     with pytest.raises(InputError, match='reaches all 12 poses of the task at none'):
         place(arm, far, cells=3)
+    for upper in ([0.2, 1.0, 1.0], [np.nan, 1.0, 1.0]):
+        with pytest.raises(InputError, match='give the lower corner first'):
+            place(arm, task, region=np.array([[0.3, -1.0, 0.0], upper]))
     with pytest.raises(UnknownNameError, match='aim "least"'):
         place(arm, task, 'least')
 
@@ -398,7 +410,7 @@ def test_workspace_places_a_task(run, folder, tmp_path, task):
     assert (status, err) == (0, '')
     files = {path.name for path in (tmp_path / 'map').iterdir()}
     assert files == {*WORKSPACE_FILES, *PLACEMENT_FILES}
-    joints = read_joints(tmp_path / 'map' / 'placed_task.csv', 6)
+    joints = read_joints(tmp_path / 'map' / 'placed_task.csv', UR)
     with (tmp_path / 'map' / 'placements.csv').open() as file:
         rows = list(csv.DictReader(file))
     reached = [row for row in rows if row['error']]
@@ -425,6 +437,7 @@ def test_workspace_takes_a_box_of_joint_values(run, folder):
     ('arguments', 'text'),
     [
         (('--joint-box', 0, 1), '--joint-box: give 6 lower and 6 upper values, not 2'),
+        (('--joint-box', *[1.0] * 6, *[-1.0] * 6), '--joint-box: give all lower values first'),
         (('--poses', 1), '--poses must be at least 100'),
         (('--task', 'missing.csv'), 'cannot read missing.csv'),
         (('--task', 'x.csv', '--joint-box', 0), 'either --task or --joint-box'),
