@@ -381,7 +381,6 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _compensate(options: argparse.Namespace) -> int:
-    import numpy as np
 
     from calib_ros.compensation import POSITIVE, Compensator, compensate_program, in_words
     from calib_ros.config import load_chain
@@ -408,17 +407,9 @@ def _compensate(options: argparse.Namespace) -> int:
         return NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     print(f'wrote {options.out}: {in_words(compensator, result)}')
-    shift, turn = arm.sigma(result.joints), arm.sigma_turned(result.joints)
-    if arm.covariance is not None:
-        print(
-            f'sigma of the calibration at these poses: {1e3 * shift.max():.3f} mm where the '
-            f'target was, {1e3 * turn.max():.3f} mrad at most'
-        )
-    if np.sum(turn**2) > np.sum(result.orientation_before**2):
-        print(
-            'warning: the calibration does not know the orientation well enough to correct it; '
-            'positions hold near the measured target only. Measure orientations as well, or a '
-            'target further off the last axis',
-            file=sys.stderr,
-        )
+    words, warning = arm.knowledge(result.joints, result.orientation_before)
+    if words:
+        print(words)
+    if warning:
+        print(f'warning: {warning}', file=sys.stderr)
     return 0

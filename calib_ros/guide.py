@@ -208,6 +208,13 @@ class Guide:
             if len(result.refusals) > MOST_REASONS:
                 reasons.append(f'and {len(result.refusals) - MOST_REASONS} more')
             raise InputError('; '.join([words, *reasons]))
+        if calibration.result is not None:
+            arm = CalibratedArm.of(calibration.result)
+            known, warning = arm.knowledge(result.joints, result.orientation_before)
+            words = f'{words}; {known}'
+            if warning:
+                words = f'{words}; {warning}'
+                self._node.get_logger().warning(f'trajectory: {warning}')
         answer = copy.deepcopy(message)
         for key in RATES:
             values = getattr(corrected, key)

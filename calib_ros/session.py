@@ -91,6 +91,7 @@ class Calibration:
 
     `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
     the error that it was judged to have, and `known` holds the samples that were there by then.
+    `result` is the identification that it comes from, if it was here.
     """
 
     chain: Chain
@@ -98,6 +99,7 @@ class Calibration:
     world_frame: str
     rms_mm: float | None
     known: frozenset[Sample]
+    result: Identification | None = None
 
 
 def check_settings(chain: Chain, settings: Settings) -> None:
@@ -499,6 +501,7 @@ class CalibrationSession:
             self.calibration = Calibration(
                 *(result.chain, result.before, result.world_frame, after.rms_mm),
                 known=frozenset(samples),
+                result=result,
             )
 
     def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:

@@ -116,6 +116,27 @@ class CalibratedArm:
         """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
         return self._sigma(joints, slice(3, 6))
 
+    def knowledge(self, joints: FloatArray, turned: FloatArray) -> tuple[str, str]:
+        """Return how well a program at (N, n) is known, and a warning where that is not enough.
+
+        `turned` (N,) [rad] are the errors of orientation to correct. Both are empty where the
+        covariance is not known, or nothing is to be warned about.
+        """
+        if self.covariance is None:
+            return '', ''
+        shift, turn = self.sigma(joints), self.sigma_turned(joints)
+        words = (
+            f'sigma of the calibration at these poses: {1e3 * shift.max(initial=0.0):.3f} mm '
+            f'where the target was, {1e3 * turn.max(initial=0.0):.3f} mrad at most'
+        )
+        if np.sum(turn**2) <= np.sum(turned**2):
+            return words, ''
+        return words, (
+            'the calibration does not know the orientation well enough to correct it; positions '
+            'hold near the measured target only. Measure orientations as well, or a target '
+            'further off the last axis'
+        )
+
     def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
         if self.covariance is None:
             return np.full(len(joints), np.nan)

@@ -457,3 +457,19 @@ def test_figures_are_drawn(cell, task):
         assert workspace_png(survey(each, 500, np.random.default_rng(0))).startswith(b'\x89PNG')
     found = place(arm, task, cells=4)
     assert placements_png(found).startswith(b'\x89PNG')
+
+
+def test_a_program_that_the_calibration_does_not_know_is_told(rng):
+    """Positions of a target on the last axis tell next to nothing of the flange's orientation."""
+    true = replace(
+        simulation.faulty(UR, simulation.Cell(), rng),
+        tool=Frame(transform(np.eye(3), np.array([0.0, 0.0, 0.1]))),
+    )
+    for oriented, known in ((True, True), (False, False)):
+        seen = simulation.measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4, oriented)
+        arm = CalibratedArm.of(identify(Problem(UR, seen)))
+        words, warning = arm.knowledge(UR.random_joints(5, rng), np.full(5, 1e-3))
+        assert words.startswith('sigma of the calibration at these poses: 0.')
+        assert ('does not know the orientation' in warning) is not known
+    alone = replace(arm, names=(), covariance=None)
+    assert alone.knowledge(UR.random_joints(5, rng), np.full(5, 1e-3)) == ('', '')
