@@ -134,11 +134,14 @@ def unit(name: str) -> str:
     }.get(group_of(name), 'rad')
 
 
-EXPECTED = 3e-4
-"""Size that an effect may have, the standard deviation of its prior: about an arc minute.
+def expected(name: str) -> float:
+    """Return the size that an effect may have: the standard deviation of its prior.
 
-Without it a harmonic that is sampled over part of a turn trades against constants without bound,
-and misleads wherever else the arm goes."""
+    A third of an arc minute of a drive's own errors, an arc minute of what bends (for a torque arm
+    of a metre) or has play. Without it a harmonic that is sampled over part of a turn trades
+    against constants without bound, and misleads wherever else the arm goes.
+    """
+    return 3e-4 if group_of(name) in ('gravity', 'compliance', 'backlash') else 1e-4
 
 
 def basis(

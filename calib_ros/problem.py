@@ -188,7 +188,7 @@ class Problem:
                 if fnmatch.fnmatchcase(name, pattern) and not model.owns_frame(name):
                     sigmas.setdefault(name, sigma)
         for name, _ in model.effects:
-            sigmas.setdefault(name, effects.EXPECTED)
+            sigmas.setdefault(name, effects.expected(name))
         return sigmas
 
     @property

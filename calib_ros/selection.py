@@ -237,7 +237,7 @@ class _Linear:
     def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""
         extra, offset = self._system.extra_rows(self._chain, self._names)
-        wide = np.eye(len(chosen)) / effects.EXPECTED
+        wide = np.diag([1.0 / effects.expected(name) for name in chosen])
         return linalg.block_diag(extra, wide), np.append(offset, np.zeros(len(chosen)))
 
     def _priors(self, names: Sequence[str]) -> FloatArray:
@@ -248,7 +248,7 @@ class _Linear:
             if name in known:
                 found[k] = 1.0 / known[name]
             elif name not in self._names:
-                found[k] = 1.0 / effects.EXPECTED
+                found[k] = 1.0 / effects.expected(name)
         return found
 
 
