@@ -150,10 +150,15 @@ class Collector:
             if not self.holding:
                 self._round(self._complete_ns)
 
-    def uneventful(self, columns: tuple[int, ...], stamps: Stamps) -> NDArray[np.bool_]:
-        """Return (M,) which joint samples would only be added, whatever the others do."""
+    def uneventful(
+        self, columns: tuple[int, ...], stamps: Stamps, among: int
+    ) -> NDArray[np.bool_]:
+        """Return (M,) which joint samples would only be added, whatever the others do.
+
+        The others may be of the same joints: there must be room for as many as come `among` them.
+        """
         quiet = (stamps >= self._track.horizon_ns) & (stamps - self._advanced_ns < ADVANCE_NS)
-        return quiet & (self._track.room(columns) >= len(stamps))
+        return quiet & (self._track.room(columns) >= among)
 
     def extend_joints(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
         """Take uneventful joint samples: values (M, k) at stamps (M,)."""

@@ -389,11 +389,7 @@ class CalibrationNode(Node):
             come += [(stamp, stream, data) for stamp, data in found]
         come.sort(key=itemgetter(0))
         batch = [(stream, data) for _, stream, data in come]
-        try:
-            problems = feed(self.session, batch, _deserialised)
-        except Exception:
-            problems = [f'internal error: {traceback.format_exc()}']
-        for problem in problems:
+        for problem in feed(self.session, batch, _deserialised):
             self.get_logger().error(problem)
 
     def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:

@@ -225,8 +225,11 @@ class CalibrationSession:
             self._collector.add_joints(columns, reading.stamp_ns, values)
             self._take()
 
-    def uneventful(self, readings: messages.JointReadings) -> NDArray[np.bool_]:
-        """Return (N,) which joint readings would only be kept, until others make more of them."""
+    def uneventful(self, readings: messages.JointReadings, among: int) -> NDArray[np.bool_]:
+        """Return (N,) which joint readings would only be kept, until others make more of them.
+
+        `among` counts the messages that may be kept with them, of all streams.
+        """
         nothing = np.zeros(len(readings.stamps_ns), dtype=bool)
         if not self.recording:
             return nothing
@@ -235,7 +238,8 @@ class CalibrationSession:
         except messages.MessageError:
             return nothing
         stamps = readings.stamps_ns
-        quiet = self._collector.uneventful(columns, stamps) & np.isfinite(values).all(axis=1)
+        quiet = self._collector.uneventful(columns, stamps, among)
+        quiet &= np.isfinite(values).all(axis=1)
         if self._collector.holding:
             since = stamps - self._looked_ns
             quiet &= (since >= 0) & (since < LOOK_AGAIN_NS)
