@@ -226,7 +226,8 @@ class Collector:
 
     def capture(self) -> tuple[int, str]:
         """Take one sample of each stream now; return how many, and why not more in words."""
-        before = len(self._fresh)
+        if self.settings.mode == 'continuous':
+            return 0, 'every measurement is taken in mode continuous'
         self._sort()
         stands = self._track.standing(self.settings.still, WINDOW)
         newest = self._track.newest_ns
@@ -240,10 +241,13 @@ class Collector:
                 f'the arm has not stood for {self.settings.shortest_stop:g} s yet '
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
-        dropped = self.dropped.copy()
-        self._average(int(stands[-1, 0]), newest)
-        self._sampled_ns = self._settled_ns = newest
+        begin = int(stands[-1, 0])
+        self._round(begin)  # a stop before is not waited for any longer
+        before, dropped = len(self._fresh), self.dropped.copy()
+        self._average(begin, newest)
         count = len(self._fresh) - before
+        if count:
+            self._sampled_ns = self._settled_ns = newest
         causes = ', '.join(dict.fromkeys(self.dropped - dropped))
         return count, '' if count else causes or 'no measurement within this stop'
 
