@@ -431,7 +431,7 @@ def test_a_full_track_is_halved(capacity):
     made = track(capacity=capacity)
     taken = gone = 0
     for k in range(500):
-        if made.full(BOTH):
+        if not made.room(BOTH):
             made.sort()
             gone += made.halve()
         assert not made.full(BOTH) or capacity == 1
