@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import messages
-from calib_ros.chain import Chain
+from calib_ros.chain import ANGLES, DH_KINDS, Chain
 from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
 from calib_ros.delays import Delay, Watch
@@ -37,6 +37,8 @@ Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
+SILENT_NS = 5_000_000_000
+"""Time after which joints of which nothing is heard, while others are, count as silent."""
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
 
@@ -369,7 +371,11 @@ class CalibrationSession:
     @property
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
-        missing = [self.joint_names[k] for k in self._collector.track.missing]
+        track = self._collector.track
+        silent = [self.joint_names[k] for k in track.silent(SILENT_NS)]
+        if silent:
+            return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
+        missing = [self.joint_names[k] for k in track.missing]
         if missing and self._foreign_names:
             return (
                 f'waiting for joint states of {", ".join(missing)}; those that come name '
@@ -511,13 +517,20 @@ class CalibrationSession:
         Raises
         ------
         InputError
-            When it is that of another robot.
+            When it is that of another robot, also of one whose joints have the same names.
 
         """
         if chain.joint_names != self.chain.joint_names:
             raise InputError(
                 f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
+            )
+        limits = (self.settings.largest_length, self.settings.largest_angle)
+        differing = _differing(chain, self.chain, *limits)
+        if differing:
+            raise InputError(
+                f'the calibration is not one of this robot: {", ".join(differing)} differ from '
+                f'chain "{self.chain.name}" by more than largest_length and largest_angle allow'
             )
         self.calibration = Calibration(chain, None, world_frame, rms_mm, frozenset(self.samples))
 
@@ -638,6 +651,21 @@ class CalibrationSession:
         self._looked_ns = now_ns or 0
         self.delay = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None
+
+
+def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
+    """Return what of the joints differs by more than errors [m, rad] of one robot can."""
+    if chain.convention != nominal.convention:
+        return [f'the conventions ({chain.convention}, {nominal.convention})']
+    names = []
+    for joint, other in zip(chain.joints, nominal.joints, strict=True):
+        if (joint.type, joint.sign) != (other.type, other.sign):
+            names.append(f'type or sign of {joint.name}')
+        for kind in DH_KINDS:
+            limit = angle if kind in ANGLES else length
+            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
+                names.append(f'{joint.name}.{kind}')
+    return names
 
 
 def _stream(source: Source, child: str, distance: bool) -> StreamKey:

@@ -243,6 +243,13 @@ def test_the_calibration_of_another_robot_is_refused():
     made = session(samples())
     with pytest.raises(InputError, match='the calibration has the joints panda_joint1'):
         made.load(load_chain('franka_panda'))
+    for name in ('ur10e', 'ur5e'):  # a UR10e has joints of the same names
+        other = load_chain(name)
+        other = other.with_offsets({'elbow_joint.theta': 0.2}) if name == 'ur5e' else other
+        with pytest.raises(InputError, match='is not one of this robot: .*elbow_joint'):
+            made.load(other)
+    with pytest.raises(InputError, match='conventions'):
+        made.load(replace(UR5E, convention='modified'))
     assert made.calibration is None
 
 
@@ -328,6 +335,21 @@ def test_the_status_names_joints_that_hardly_moved():
     joints = [np.array([*each.joints[:5], 0.01 * k]) for k, each in enumerate(given)]
     made = session([replace(each, joints=q) for each, q in zip(given, joints, strict=True)])
     assert 'hardly moved so far: wrist_3_joint' in made.status()
+
+
+def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
+    """Of two drivers that each name some joints one has died."""
+    made = session()
+    for k in range(2000):
+        stamp = 1_700_000_000_000_000_000 + k * 5_000_000
+        made.take_joints(joint_state(stamp, UR5E.joint_names[:4], [0.0] * 4))
+        if k < 500:
+            made.take_joints(joint_state(stamp, UR5E.joint_names[4:], [0.0] * 2))
+        if k == 600:
+            assert 'the arm stands' in made.status()
+    assert made.status().endswith(
+        'nothing can be sampled: no joint states of wrist_2_joint, wrist_3_joint come any more'
+    )
 
 
 def test_the_status_is_never_an_error():
