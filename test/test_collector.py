@@ -324,9 +324,7 @@ def test_in_continuous_mode_a_capture_takes_nothing_away():
         collector(mode='continuous'), joint_events(motion, 9.5), pose_events(motion, 9.5)
     )
     made = collector(mode='continuous')
-    assert_same(
-        play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), asking), expected
-    )
+    assert_same(play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), asking), expected)
     assert answers == [(0, 'every measurement is taken in mode continuous')]
 
 

@@ -246,7 +246,7 @@ def test_the_calibration_of_another_robot_is_refused():
     for name in ('ur10e', 'ur5e'):  # a UR10e has joints of the same names
         other = load_chain(name)
         other = other.with_offsets({'elbow_joint.theta': 0.2}) if name == 'ur5e' else other
-        with pytest.raises(InputError, match='is not one of this robot: .*elbow_joint'):
+        with pytest.raises(InputError, match=r'is not one of this robot: .*elbow_joint'):
             made.load(other)
     with pytest.raises(InputError, match='conventions'):
         made.load(replace(UR5E, convention='modified'))
