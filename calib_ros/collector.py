@@ -41,13 +41,17 @@ _FOREVER = np.iinfo(np.int64).max
 
 
 class StreamKey(NamedTuple):
-    """What one stream of measurements is of: device, target, and whether it only judges."""
+    """What one stream of measurements is of: device, target, and whether it only judges.
+
+    What is measured in another frame is another stream.
+    """
 
     device: str
     target: str
     validation: bool
     distance: bool
     eye_in_hand: bool
+    frame_id: str = ''
 
 
 class Collector:
@@ -464,6 +468,7 @@ class Collector:
                 acceleration=acceleration,
                 device=key.device,
                 target=key.target,
+                frame_id=key.frame_id,
                 validation=key.validation,
                 eye_in_hand=key.eye_in_hand,
                 delay=1e-9 * self.delay_ns,
@@ -512,4 +517,5 @@ def _key(sample: Sample) -> StreamKey:
         sample.validation,
         sample.distance is not None,
         sample.eye_in_hand,
+        sample.frame_id,
     )

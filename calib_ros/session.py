@@ -294,7 +294,7 @@ class CalibrationSession:
         except messages.MessageError as err:
             self._dropped[f'poses: {err}'] += count
             return False
-        key = _stream(source, readings.child, readings.distance)
+        key = _stream(source, readings.frame_id, readings.child, readings.distance)
         self._collector.extend(key, readings.stamps_ns, readings.numbers)
         return True
 
@@ -320,7 +320,7 @@ class CalibrationSession:
             self._dropped[f'poses: {err}'] += 1
             return
         self._watch_order('poses', reading.stamp_ns)
-        key = _stream(source, reading.child, reading.distance is not None)
+        key = _stream(source, reading.frame_id, reading.child, reading.distance is not None)
         if self._watch is not None and reading.position is not None and not key.eye_in_hand:
             self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
@@ -364,6 +364,8 @@ class CalibrationSession:
                     f'samples to go on with have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
+            if sample.frame_id:
+                self._note_frame(sample.device, sample.frame_id)
         self._collector.remember(samples)
         self.samples = [*samples, *self.samples]
         self._live.restart()
@@ -608,8 +610,15 @@ class CalibrationSession:
             raise messages.MessageError(
                 f'in frame "{frame_id}", not in frame_id "{self.settings.frame_id}"'
             )
+        if not frame_id.isprintable():  # it shall be a cell of a table
+            raise messages.MessageError('in a frame whose name cannot be printed')
+        self._note_frame(device, frame_id)
+
+    def _note_frame(self, device: str, frame_id: str) -> None:
         known = self._frame_ids.setdefault(device, [])
-        if frame_id not in known and len(known) < MOST_NAMES:
+        if frame_id not in known:
+            if len(known) == MOST_NAMES:
+                raise messages.MessageError(f'in one of more than {MOST_NAMES} frames')
             known.append(frame_id)
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
@@ -668,13 +677,14 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
     return names
 
 
-def _stream(source: Source, child: str, distance: bool) -> StreamKey:
+def _stream(source: Source, frame_id: str, child: str, distance: bool) -> StreamKey:
     return StreamKey(
         source.device,
         source.target or child,
         source.validation,
         distance,
         source.eye_in_hand,
+        frame_id,
     )
 
 

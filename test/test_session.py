@@ -117,6 +117,26 @@ def test_restored_samples_come_first_and_are_as_good_as_new():
         assert one == other
 
 
+def test_restored_samples_know_their_frame():
+    made = session(samples(frame_id='world'))
+    assert made.problem().world_frame == 'world'
+    drive(made, UR5E.random_joints(2, np.random.default_rng(1)), [tracker()])  # in 'tracker'
+    with pytest.raises(InputError, match=r'different frames \(tracker, world\)'):
+        made.problem()
+
+
+def test_frames_without_end_are_not_remembered():
+    made = session()
+    drive(made, UR5E.random_joints(1, np.random.default_rng(1)), [])
+    for k in range(60):
+        message = pose(k + 1, np.zeros(3), np.eye(3))
+        message.header.frame_id = f'frame {k}' if k else 'line\nbreak'
+        made.take(TRACKER, POSE, message)
+    dropped = made.account().dropped
+    assert dropped['poses: in a frame whose name cannot be printed'] == 1
+    assert dropped['poses: in one of more than 50 frames'] == 9
+
+
 def test_samples_of_another_robot_are_not_restored():
     made = session(samples())
     with pytest.raises(InputError, match='have 7 joint values, chain "ur5e" has 6 joints'):
