@@ -385,19 +385,24 @@ class CalibrationNode(Node):
         ]
         for stream in streams:
             heard = self._heard.setdefault(self.resolve_topic_name(stream.topic), Hearing())
-            subscription = self.create_subscription(
-                _message_type(stream.type),
-                stream.topic,
-                lambda data: None,  # see `subscriptions`
-                QoSProfile(  # one for each: overriding changes it
-                    depth=INPUT_QUEUE,
-                    reliability=qos_profile_sensor_data.reliability,
-                    durability=qos_profile_sensor_data.durability,
-                ),
-                qos_overriding_options=overriding,
-                event_callbacks=self._noting(heard),
-                raw=True,
-            )
+            try:
+                subscription = self.create_subscription(
+                    _message_type(stream.type),
+                    stream.topic,
+                    lambda data: None,  # see `subscriptions`
+                    QoSProfile(  # one for each: overriding changes it
+                        depth=INPUT_QUEUE,
+                        reliability=qos_profile_sensor_data.reliability,
+                        durability=qos_profile_sensor_data.durability,
+                    ),
+                    qos_overriding_options=overriding,
+                    event_callbacks=self._noting(heard),
+                    raw=True,
+                )
+            except RuntimeError as err:  # what rclpy raises for a policy that there is not
+                raise ConfigError(f'topic "{stream.topic}": {err}') from err
+            if subscription.qos_profile.depth < 1:
+                raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
             self._inputs[subscription] = stream, heard
 
     @property
@@ -622,6 +627,7 @@ class CalibrationNode(Node):
             for topic, heard in self._heard.items()
             if heard.deaf and not heard.count
         ]
+        wrong += self._of_other_types()
         losing = [topic for topic, heard in self._heard.items() if heard.losing]
         if losing:
             wrong.append(f'messages get lost on {", ".join(losing)}')
@@ -638,6 +644,16 @@ class CalibrationNode(Node):
             wrong.insert(0, f'samples are in memory only: {self._archive.error}')
             level = DiagnosticStatus.ERROR
         return level, ''.join(f'{text}; ' for text in wrong)
+
+    def _of_other_types(self) -> list[str]:
+        """Return in words what is published as another type on topics that are not heard."""
+        found = {}
+        for subscription, (stream, heard) in self._inputs.items():
+            topic = subscription.topic_name
+            infos = [] if heard.count else self.get_publishers_info_by_topic(topic)
+            for kind in {info.topic_type for info in infos} - {stream.type}:
+                found[topic, kind] = f'{topic} is published as {kind}, not as {stream.type}'
+        return [found[key] for key in sorted(found)]
 
     def _figures(self, account: Account) -> dict[str, Any]:
         now, delay = time.monotonic(), self.session.delay
