@@ -32,7 +32,7 @@ class Archive:
     joints : int
         Number of joints.
     configuration : callable
-        Returns the configuration to write beside every file.
+        Returns the configuration to write beside a journal.
 
     """
 
@@ -118,8 +118,10 @@ class Archive:
         """Return the calibration that was saved last."""
         return next(reversed(self._files(CALIBRATION)), None)
 
-    def save(self, text: str, path: Path | None = None) -> Path:
+    def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
         """Write a calibration, into a new file unless a path is given; return its path.
+
+        The configuration by which it was made, where that is known, is written beside it.
 
         Raises
         ------
@@ -132,7 +134,8 @@ class Archive:
         path = path or self._new_path(CALIBRATION)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, text)
-        write_file(path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
+        if configuration:
+            write_file(path.with_suffix(SETTINGS), configuration, overwrite=True)
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:

@@ -41,13 +41,17 @@ _FOREVER = np.iinfo(np.int64).max
 
 
 class StreamKey(NamedTuple):
-    """What one stream of measurements is of: device, target, and whether it only judges."""
+    """What one stream of measurements is of: device, target, and whether it only judges.
+
+    What is measured in another frame is another stream.
+    """
 
     device: str
     target: str
     validation: bool
     distance: bool
     eye_in_hand: bool
+    frame_id: str = ''
 
 
 class Collector:
@@ -150,10 +154,15 @@ class Collector:
             if not self.holding:
                 self._round(self._complete_ns)
 
-    def uneventful(self, columns: tuple[int, ...], stamps: Stamps) -> NDArray[np.bool_]:
-        """Return (M,) which joint samples would only be added, whatever the others do."""
+    def uneventful(
+        self, columns: tuple[int, ...], stamps: Stamps, among: int
+    ) -> NDArray[np.bool_]:
+        """Return (M,) which joint samples would only be added, whatever the others do.
+
+        The others may be of the same joints: there must be room for as many as come `among` them.
+        """
         quiet = (stamps >= self._track.horizon_ns) & (stamps - self._advanced_ns < ADVANCE_NS)
-        return quiet & (self._track.room(columns) >= len(stamps))
+        return quiet & (self._track.room(columns) >= among)
 
     def extend_joints(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
         """Take uneventful joint samples: values (M, k) at stamps (M,)."""
@@ -221,7 +230,8 @@ class Collector:
 
     def capture(self) -> tuple[int, str]:
         """Take one sample of each stream now; return how many, and why not more in words."""
-        before = len(self._fresh)
+        if self.settings.mode == 'continuous':
+            return 0, 'every measurement is taken in mode continuous'
         self._sort()
         stands = self._track.standing(self.settings.still, WINDOW)
         newest = self._track.newest_ns
@@ -235,10 +245,13 @@ class Collector:
                 f'the arm has not stood for {self.settings.shortest_stop:g} s yet '
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
-        dropped = self.dropped.copy()
-        self._average(int(stands[-1, 0]), newest)
-        self._sampled_ns = self._settled_ns = newest
+        begin = int(stands[-1, 0])
+        self._round(begin)  # a stop before is not waited for any longer
+        before, dropped = len(self._fresh), self.dropped.copy()
+        self._average(begin, newest)
         count = len(self._fresh) - before
+        if count:
+            self._sampled_ns = self._settled_ns = newest
         causes = ', '.join(dict.fromkeys(self.dropped - dropped))
         return count, '' if count else causes or 'no measurement within this stop'
 
@@ -455,6 +468,7 @@ class Collector:
                 acceleration=acceleration,
                 device=key.device,
                 target=key.target,
+                frame_id=key.frame_id,
                 validation=key.validation,
                 eye_in_hand=key.eye_in_hand,
                 delay=1e-9 * self.delay_ns,
@@ -503,4 +517,5 @@ def _key(sample: Sample) -> StreamKey:
         sample.validation,
         sample.distance is not None,
         sample.eye_in_hand,
+        sample.frame_id,
     )

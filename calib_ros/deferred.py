@@ -60,7 +60,7 @@ class DeferredTrigger:
     def _on_call(self, request: Any, response: Any) -> Any:
         if self._running.is_set():
             response.success = False
-            response.message = 'refused: an identification is running, wait for its answer'
+            response.message = 'refused: the call before is still running, wait for its answer'
             return response
 
         def prepare() -> Answer:

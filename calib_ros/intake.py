@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -55,11 +56,12 @@ def feed(
     batch: Sequence[tuple[Stream, bytes]],
     deserialise: Callable[[bytes, str], Any],
 ) -> list[str]:
-    """Let a session take messages in their order; return why some could not be decoded.
+    """Let a session take messages in their order; return what went wrong with some, in words.
 
     Messages of one stream that are laid out alike are decoded at once, and kept at once up to the
     next joint state after which there is more to do. That one is taken by itself, and so are
-    messages that differ from the others. The outcome is that of taking each by itself.
+    messages that differ from the others. The outcome is that of taking each by itself. An error
+    costs the messages that are taken with the one that makes it, and none after them.
 
     Parameters
     ----------
@@ -83,15 +85,18 @@ def feed(
         eventful = alone[begin:stop].copy()
         for group in window:
             if isinstance(group.readings, JointReadings):
-                eventful[group.places - begin] = ~session.uneventful(group.readings)
+                quiet = session.uneventful(group.readings, among=stop - begin)
+                eventful[group.places - begin] = ~quiet
         end = begin + int(eventful.argmax()) if eventful.any() else stop
-        _keep(session, [group.between(begin, end) for group in window])
-        if end < stop:
-            try:
+        try:
+            _keep(session, [group.between(begin, end) for group in window])
+            if end < stop:
                 _take(session, batch[end], _reading(window, end), deserialise)
-            except DecodingError as err:
-                problems.append(str(err))
-        begin = end + 1 if end < stop else stop
+        except DecodingError as err:
+            problems.append(str(err))
+        except Exception:
+            problems.append(f'internal error: {traceback.format_exc()}')
+        begin = min(end + 1, stop)
     return problems
 
 

@@ -10,6 +10,7 @@ back gets a second row, marked `removed`; nothing is ever deleted.
 from __future__ import annotations
 
 import csv
+import fcntl
 import io
 import os
 from collections.abc import Sequence
@@ -21,7 +22,7 @@ from calib_ros.tables import cells, columns
 
 
 class Journal:
-    """An open journal, which only grows.
+    """An open journal, which only grows and which no other process can open meanwhile.
 
     Parameters
     ----------
@@ -33,7 +34,7 @@ class Journal:
     Raises
     ------
     InputError
-        When the file is that of another robot.
+        When the file is that of another robot, or another process writes it.
     OSError
         When it cannot be written.
 
@@ -44,6 +45,7 @@ class Journal:
         self.path = path
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         try:
+            self._lock()
             self._begin(columns(joints))
         except BaseException:
             self.close()
@@ -71,6 +73,18 @@ class Journal:
     def close(self) -> None:
         """Close the file."""
         os.close(self._file)
+
+    def _lock(self) -> None:
+        """Keep others out until the file is closed or the process has ended."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f'{self.path} is being written by another process: give each robot a serial or '
+                'a data_dir of its own'
+            ) from None
+        except OSError:  # a file system without locks: a journal without one is better than none
+            return
 
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""

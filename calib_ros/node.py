@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 # Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -133,6 +133,23 @@ class Hearing:
         return self.last is not None and time.monotonic() - self.last > SILENCE
 
 
+class Snapshot(NamedTuple):
+    """What an identification works on, and what it was called with."""
+
+    problem: Problem
+    model: str
+    samples: tuple[Sample, ...]
+    origin: dict[str, Any]
+    configuration: str
+
+
+class Published(NamedTuple):
+    """A calibration as the text of a file, and by which configuration it was made, if known."""
+
+    text: str
+    configuration: str
+
+
 class CalibrationNode(Node):
     """Calibrates one robot from its joint states and measurements."""
 
@@ -180,17 +197,18 @@ class CalibrationNode(Node):
             )
         home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
         chain, self._urdf = self._load_robot(chain_name, links)
-        self._links = links
+        self._chain_name, self._links = chain_name, links
         self._archive = Archive(
             Path(folder).expanduser() if folder else home / 'calib_ros',
             f'{chain.name}_{self._serial}' if self._serial else chain.name,
             len(chain.joints),
-            lambda: report.configuration_yaml(chain_name, self.session.settings),
+            self._configuration,
         )
         self.session = CalibrationSession(chain, settings, self._on_sample)
         self._last = 'nothing identified yet'
         self._observability = ''
-        self._calibration_text = ''
+        self._published = Published('', '')
+        self._publishing = threading.Lock()
         self._dropped_before: dict[str, int] = {}
         self._heard: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
@@ -255,6 +273,8 @@ class CalibrationNode(Node):
         self._take_messages()
         self.session.finish()
         self._archive.close()
+        if self._archive.error:
+            self.get_logger().error(f'samples are lost: {self._archive.error}')
         self.destroy_node()
         return all(ended)
 
@@ -280,6 +300,13 @@ class CalibrationNode(Node):
         return replace(chain_from_urdf(text, **links), base=None, tool=None), text
 
     # Parameters
+
+    def _configuration(self) -> str:
+        """Return what this node is set to as a parameter file."""
+        more = {name: link for name, link in self._links.items() if link}
+        if self._serial:
+            more['serial'] = self._serial
+        return report.configuration_yaml(self._chain_name, self.session.settings, **more)
 
     def _declare(
         self, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
@@ -358,19 +385,24 @@ class CalibrationNode(Node):
         ]
         for stream in streams:
             heard = self._heard.setdefault(self.resolve_topic_name(stream.topic), Hearing())
-            subscription = self.create_subscription(
-                _message_type(stream.type),
-                stream.topic,
-                lambda data: None,  # see `subscriptions`
-                QoSProfile(  # one for each: overriding changes it
-                    depth=INPUT_QUEUE,
-                    reliability=qos_profile_sensor_data.reliability,
-                    durability=qos_profile_sensor_data.durability,
-                ),
-                qos_overriding_options=overriding,
-                event_callbacks=self._noting(heard),
-                raw=True,
-            )
+            try:
+                subscription = self.create_subscription(
+                    _message_type(stream.type),
+                    stream.topic,
+                    lambda data: None,  # see `subscriptions`
+                    QoSProfile(  # one for each: overriding changes it
+                        depth=INPUT_QUEUE,
+                        reliability=qos_profile_sensor_data.reliability,
+                        durability=qos_profile_sensor_data.durability,
+                    ),
+                    qos_overriding_options=overriding,
+                    event_callbacks=self._noting(heard),
+                    raw=True,
+                )
+            except RuntimeError as err:  # what rclpy raises for a policy that there is not
+                raise ConfigError(f'topic "{stream.topic}": {err}') from err
+            if subscription.qos_profile.depth < 1:
+                raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
             self._inputs[subscription] = stream, heard
 
     @property
@@ -389,11 +421,7 @@ class CalibrationNode(Node):
             come += [(stamp, stream, data) for stamp, data in found]
         come.sort(key=itemgetter(0))
         batch = [(stream, data) for _, stream, data in come]
-        try:
-            problems = feed(self.session, batch, _deserialised)
-        except Exception:
-            problems = [f'internal error: {traceback.format_exc()}']
-        for problem in problems:
+        for problem in feed(self.session, batch, _deserialised):
             self.get_logger().error(problem)
 
     def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:
@@ -426,8 +454,8 @@ class CalibrationNode(Node):
 
     # Services
 
-    def _snapshot(self) -> tuple[Problem, tuple[Sample, ...], dict[str, Any]]:
-        """Return the problem, its samples and where they come from, as they are now."""
+    def _snapshot(self) -> Snapshot:
+        """Return the problem and all that goes with it, as they are now."""
         self._take_messages()
         problem = self.session.problem()
         samples = tuple(self.session.samples)
@@ -439,27 +467,27 @@ class CalibrationNode(Node):
             'samples': len(samples),
             'journal': str(self._archive.journal or ''),
         }
-        return problem, samples, origin
+        model = self.session.settings.model
+        return Snapshot(problem, model, samples, origin, self._configuration())
 
-    def _run(
-        self, snapshot: tuple[Problem, tuple[Sample, ...], dict[str, Any]]
-    ) -> tuple[bool, str]:
+    def _run(self, given: Snapshot) -> tuple[bool, str]:
         """Identify, on a thread of its own; publish only what is accepted."""
-        problem, samples, origin = snapshot
-        result = identify_model(problem, self.session.settings.model)
+        result = identify_model(given.problem, given.model)
         self._last = report.summary(result)
         self._observability = report.observability_in_words(result)
         self._residuals.publish(
             outgoing.residual_markers(
                 result,
-                problem.sets,
+                given.problem.sets,
                 self.get_parameter('marker_scale').value,
                 self.get_clock().now().to_msg(),
             )
         )
         if result.accepted:
-            self.session.adopt(result, samples)
-            self._publish_calibration(result.chain, report.calibration_yaml(result, origin))
+            text = report.calibration_yaml(result, given.origin)
+            with self._publishing:
+                self.session.adopt(result, given.samples)
+                self._publish_calibration(result.chain, Published(text, given.configuration))
             self._guide.show(result)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
@@ -494,27 +522,25 @@ class CalibrationNode(Node):
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
     def _on_save(self, request: Any) -> tuple[bool, str]:
-        if not self._calibration_text:
+        if not self._published.text:
             return False, 'there is no accepted calibration to save: call ~/identify first'
         target = self.get_parameter('target_filename').value
-        path = self._archive.save(
-            self._calibration_text, Path(target).expanduser() if target else None
-        )
+        path = self._archive.save(*self._published, Path(target).expanduser() if target else None)
         return True, f'saved to {path}'
 
-    def _to_export(self) -> tuple[Chain, Any]:
-        """Return the calibrated chain, and the joint values (N, n) at which it was measured."""
+    def _to_export(self) -> tuple[Chain, str, Any]:
+        """Return the calibrated chain, its text, and the joint values (N, n) of the samples."""
         self._take_messages()
         if self.session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
         joints = [sample.joints for sample in self.session.samples]
-        return self.session.calibration.chain, joints or None
+        with self._publishing:
+            return self.session.calibration.chain, self._published.text, joints or None
 
-    def _write_exports(self, given: tuple[Chain, Any]) -> tuple[bool, str]:
+    def _write_exports(self, given: tuple[Chain, str, Any]) -> tuple[bool, str]:
         """Write a calibration in all forms, on a thread of its own."""
-        chain, joints = given
-        origin = calibration_record(self._calibration_text)
-        found = exports(chain, self.session.chain, joints, origin)
+        chain, text, joints = given
+        found = exports(chain, self.session.chain, joints, calibration_record(text))
         files = {each.name: each.content for each in found}
         if self._urdf:
             files['corrected.urdf'] = corrected_urdf(self._urdf, chain, **self._links)
@@ -530,17 +556,24 @@ class CalibrationNode(Node):
             )
         text = read_text(path)
         chain, record = parse_calibration(text, str(path), self.session.chain)
-        self.session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
+        serial = record.get('robot_serial')
+        if serial and self._serial and serial != self._serial:
+            raise InputError(
+                f'{path} is the calibration of the robot with serial "{serial}", this is '
+                f'"{self._serial}"'
+            )
+        with self._publishing:
+            self.session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
+            self._publish_calibration(chain, Published(text, ''))
         self._last = f'loaded {path}'
-        self._publish_calibration(chain, text)
         return True, self._last
 
     # Topics out
 
-    def _publish_calibration(self, chain: Chain, text: str) -> None:
-        self._calibration_text = text
+    def _publish_calibration(self, chain: Chain, published: Published) -> None:
+        self._published = published
         self._dh_parameters.publish(outgoing.dh_parameters(chain))
-        self._calibration.publish(String(data=text))
+        self._calibration.publish(String(data=published.text))
 
     def _on_tick(self) -> None:
         self._take_messages()
@@ -570,7 +603,7 @@ class CalibrationNode(Node):
         for heard in self._heard.values():
             heard.look(now, span)
         account = self.session.account()
-        name = f'{self.get_name()}: calibration'
+        name = f'{self.get_fully_qualified_name().lstrip("/")}: calibration'
         level, words = self._judged(account)
         message = DiagnosticArray(
             status=[
@@ -594,6 +627,7 @@ class CalibrationNode(Node):
             for topic, heard in self._heard.items()
             if heard.deaf and not heard.count
         ]
+        wrong += self._of_other_types()
         losing = [topic for topic, heard in self._heard.items() if heard.losing]
         if losing:
             wrong.append(f'messages get lost on {", ".join(losing)}')
@@ -610,6 +644,16 @@ class CalibrationNode(Node):
             wrong.insert(0, f'samples are in memory only: {self._archive.error}')
             level = DiagnosticStatus.ERROR
         return level, ''.join(f'{text}; ' for text in wrong)
+
+    def _of_other_types(self) -> list[str]:
+        """Return in words what is published as another type on topics that are not heard."""
+        found = {}
+        for subscription, (stream, heard) in self._inputs.items():
+            topic = subscription.topic_name
+            infos = [] if heard.count else self.get_publishers_info_by_topic(topic)
+            for kind in {info.topic_type for info in infos} - {stream.type}:
+                found[topic, kind] = f'{topic} is published as {kind}, not as {stream.type}'
+        return [found[key] for key in sorted(found)]
 
     def _figures(self, account: Account) -> dict[str, Any]:
         now, delay = time.monotonic(), self.session.delay
@@ -651,8 +695,11 @@ class CalibrationNode(Node):
 
     def _answering(self, callback: Callable[[Any], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
-            self._take_messages()
-            response.success, response.message = self._answer(lambda: callback(request))
+            def work() -> tuple[bool, str]:
+                self._take_messages()
+                return callback(request)
+
+            response.success, response.message = self._answer(work)
             return response
 
         return answer

@@ -86,9 +86,12 @@ def calibration_yaml(result: Identification, origin: Mapping[str, Any] | None = 
     return head + dump_chain(result.chain, provenance(result) | dict(origin or {}))
 
 
-def configuration_yaml(chain: str, settings: Settings) -> str:
-    """Return the configuration as a parameter file, with which a node does the same again."""
-    parameters: dict[str, Any] = {'chain': chain}
+def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
+    """Return the configuration as a parameter file, with which a node does the same again.
+
+    `more` are parameters of the node besides the settings.
+    """
+    parameters: dict[str, Any] = {'chain': chain, **more}
     for name, value in asdict(settings).items():
         parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
     return dump_yaml({'/**': {'ros__parameters': parameters}})

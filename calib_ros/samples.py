@@ -38,6 +38,8 @@ class Sample:
         Of the joints, where the arm was moving.
     session, device, target : str
         Each session and device has a base frame of its own, each session and target a tool frame.
+    frame_id : str
+        Frame of the measurement, as its message named it.
     socket : bool
         A ball at the target sat in a socket, whose place is not known.
     eye_in_hand : bool
@@ -65,6 +67,7 @@ class Sample:
     session: str = ''
     device: str = ''
     target: str = ''
+    frame_id: str = ''
     socket: bool = False
     eye_in_hand: bool = False
     validation: bool = False

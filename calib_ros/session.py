@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import messages
-from calib_ros.chain import Chain
+from calib_ros.chain import ANGLES, DH_KINDS, Chain
 from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
 from calib_ros.delays import Delay, Watch
@@ -37,6 +37,8 @@ Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
+SILENT_NS = 5_000_000_000
+"""Time after which joints of which nothing is heard, while others are, count as silent."""
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
 
@@ -227,8 +229,11 @@ class CalibrationSession:
             self._collector.add_joints(columns, reading.stamp_ns, values)
             self._take()
 
-    def uneventful(self, readings: messages.JointReadings) -> NDArray[np.bool_]:
-        """Return (N,) which joint readings would only be kept, until others make more of them."""
+    def uneventful(self, readings: messages.JointReadings, among: int) -> NDArray[np.bool_]:
+        """Return (N,) which joint readings would only be kept, until others make more of them.
+
+        `among` counts the messages that may be kept with them, of all streams.
+        """
         nothing = np.zeros(len(readings.stamps_ns), dtype=bool)
         if not self.recording:
             return nothing
@@ -237,7 +242,8 @@ class CalibrationSession:
         except messages.MessageError:
             return nothing
         stamps = readings.stamps_ns
-        quiet = self._collector.uneventful(columns, stamps) & np.isfinite(values).all(axis=1)
+        quiet = self._collector.uneventful(columns, stamps, among)
+        quiet &= np.isfinite(values).all(axis=1)
         if self._collector.holding:
             since = stamps - self._looked_ns
             quiet &= (since >= 0) & (since < LOOK_AGAIN_NS)
@@ -290,7 +296,7 @@ class CalibrationSession:
         except messages.MessageError as err:
             self._dropped[f'poses: {err}'] += count
             return False
-        key = _stream(source, readings.child, readings.distance)
+        key = _stream(source, readings.frame_id, readings.child, readings.distance)
         self._collector.extend(key, readings.stamps_ns, readings.numbers)
         return True
 
@@ -316,7 +322,7 @@ class CalibrationSession:
             self._dropped[f'poses: {err}'] += 1
             return
         self._watch_order('poses', reading.stamp_ns)
-        key = _stream(source, reading.child, reading.distance is not None)
+        key = _stream(source, reading.frame_id, reading.child, reading.distance is not None)
         if self._watch is not None and reading.position is not None and not key.eye_in_hand:
             self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
@@ -360,6 +366,8 @@ class CalibrationSession:
                     f'samples to go on with have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
+            if sample.frame_id:
+                self._note_frame(sample.device, sample.frame_id)
         self._collector.remember(samples)
         self.samples = [*samples, *self.samples]
         self._live.restart()
@@ -367,7 +375,11 @@ class CalibrationSession:
     @property
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
-        missing = [self.joint_names[k] for k in self._collector.track.missing]
+        track = self._collector.track
+        silent = [self.joint_names[k] for k in track.silent(SILENT_NS)]
+        if silent:
+            return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
+        missing = [self.joint_names[k] for k in track.missing]
         if missing and self._foreign_names:
             return (
                 f'waiting for joint states of {", ".join(missing)}; those that come name '
@@ -510,13 +522,20 @@ class CalibrationSession:
         Raises
         ------
         InputError
-            When it is that of another robot.
+            When it is that of another robot, also of one whose joints have the same names.
 
         """
         if chain.joint_names != self.chain.joint_names:
             raise InputError(
                 f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
+            )
+        limits = (self.settings.largest_length, self.settings.largest_angle)
+        differing = _differing(chain, self.chain, *limits)
+        if differing:
+            raise InputError(
+                f'the calibration is not one of this robot: {", ".join(differing)} differ from '
+                f'chain "{self.chain.name}" by more than largest_length and largest_angle allow'
             )
         self.calibration = Calibration(chain, None, world_frame, rms_mm, frozenset(self.samples))
 
@@ -594,8 +613,15 @@ class CalibrationSession:
             raise messages.MessageError(
                 f'in frame "{frame_id}", not in frame_id "{self.settings.frame_id}"'
             )
+        if not frame_id.isprintable():  # it shall be a cell of a table
+            raise messages.MessageError('in a frame whose name cannot be printed')
+        self._note_frame(device, frame_id)
+
+    def _note_frame(self, device: str, frame_id: str) -> None:
         known = self._frame_ids.setdefault(device, [])
-        if frame_id not in known and len(known) < MOST_NAMES:
+        if frame_id not in known:
+            if len(known) == MOST_NAMES:
+                raise messages.MessageError(f'in one of more than {MOST_NAMES} frames')
             known.append(frame_id)
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
@@ -639,13 +665,29 @@ class CalibrationSession:
         collector.holding = self.delay is None and now_ns is not None
 
 
-def _stream(source: Source, child: str, distance: bool) -> StreamKey:
+def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
+    """Return what of the joints differs by more than errors [m, rad] of one robot can."""
+    if chain.convention != nominal.convention:
+        return [f'the conventions ({chain.convention}, {nominal.convention})']
+    names = []
+    for joint, other in zip(chain.joints, nominal.joints, strict=True):
+        if (joint.type, joint.sign) != (other.type, other.sign):
+            names.append(f'type or sign of {joint.name}')
+        for kind in DH_KINDS:
+            limit = angle if kind in ANGLES else length
+            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
+                names.append(f'{joint.name}.{kind}')
+    return names
+
+
+def _stream(source: Source, frame_id: str, child: str, distance: bool) -> StreamKey:
     return StreamKey(
         source.device,
         source.target or child,
         source.validation,
         distance,
         source.eye_in_hand,
+        frame_id,
     )
 
 

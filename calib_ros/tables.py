@@ -104,6 +104,7 @@ def columns(joints: int) -> list[str]:
         *names,
         'device',
         'target',
+        'frame_id',
         'eye_in_hand',
         'delay',
         'count',
@@ -128,7 +129,7 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row.append('' if sample.distance is None else repr(sample.distance))
     covariance = sample.covariance
     row += numbers(None if covariance is None else covariance[tuple(np.transpose(UPPER))], 21)
-    row += [sample.device, sample.target, '1' if sample.eye_in_hand else '']
+    row += [sample.device, sample.target, sample.frame_id, '1' if sample.eye_in_hand else '']
     row += [repr(sample.delay), str(sample.count), repr(sample.spread), sample.session]
     return [*row, split or ('test' if sample.validation else 'train')]
 
@@ -201,6 +202,7 @@ class _Reader:
             session=row.get('session') or '',
             device=row.get('device') or '',
             target=row.get('target') or '',
+            frame_id=row.get('frame_id') or '',
             eye_in_hand=self._flag(line, row, 'eye_in_hand'),
             validation=split == 'test',
             delay=self._number(line, row, 'delay') if row.get('delay') else 0.0,

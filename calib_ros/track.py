@@ -165,6 +165,11 @@ class Track:
         named = {column for part in self._parts for column in part}
         return tuple(k for k in range(len(self._revolute)) if k not in named)
 
+    def silent(self, time_ns: int) -> tuple[int, ...]:
+        """Return the joints that were last heard so much earlier than others were."""
+        heard = self._heard()
+        return tuple(np.flatnonzero((heard > 0) & (heard < heard.max() - time_ns)).tolist())
+
     def add(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
         """Take the values of some joints, given by their numbers in the chain."""
         self._rows(columns).append(stamp_ns, values)

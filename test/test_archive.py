@@ -2,7 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
 import resource
+import shutil
 from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -20,8 +23,13 @@ def open_archive(folder, robot='arm', joints=2):
     return Archive(folder, robot, joints, lambda: 'settings: none\n')
 
 
-def stamps(archive):
-    samples, _ = archive.resume()
+def stamps(folder, robot='arm'):
+    """Return the stamps that a resumed session has, while another may still write."""
+    with TemporaryDirectory() as copy:
+        shutil.copytree(folder, copy, dirs_exist_ok=True)
+        archive = open_archive(Path(copy), robot)
+        samples, _ = archive.resume()
+        archive.close()
     return [each.stamp_ns for each in samples]
 
 
@@ -46,12 +54,15 @@ def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
         second.add(each)
     second.remove(samples[2])
     second.remove(samples[3])
+    with pytest.raises(InputError, match='written by another process'):
+        open_archive(tmp_path).resume()
+    second.close()
     third = open_archive(tmp_path)
     found, warnings = third.resume()
     assert [(each.stamp_ns, each.validation) for each in found] == [(2, False), (3, False)]
     assert warnings == ()
     third.add(sample(5))
-    assert stamps(open_archive(tmp_path)) == [2, 3, 5]
+    assert stamps(tmp_path) == [2, 3, 5]
     assert len(list(tmp_path.glob('*.csv'))) == len(list(tmp_path.glob('*.settings.yaml'))) == 2
 
 
@@ -65,7 +76,7 @@ def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
     archive, only = open_archive(tmp_path), sample(1)
     archive.add(only)
     archive.remove(only)
-    assert stamps(open_archive(tmp_path)) == []
+    assert stamps(tmp_path) == []
 
 
 def test_cleared_samples_do_not_come_back(tmp_path):
@@ -73,21 +84,23 @@ def test_cleared_samples_do_not_come_back(tmp_path):
     archive.add(sample(1))
     old = archive.begin_anew()
     assert 'train' in old.read_text()
-    assert stamps(open_archive(tmp_path)) == []
+    assert stamps(tmp_path) == []
 
 
 def test_a_folder_of_several_robots(tmp_path):
     for number, robot in enumerate(('arm', 'arm_on_linear_axis', 'arm_A7', 'an/arm')):
         archive = open_archive(tmp_path, robot)
         archive.add(sample(1 + number))
-        archive.save(f'calibration: {robot}\n')
-    assert stamps(open_archive(tmp_path)) == [1]
+        archive.save(f'calibration: {robot}\n', '')
+    assert stamps(tmp_path) == [1]
     assert open_archive(tmp_path).newest_calibration().read_text() == 'calibration: arm\n'
-    assert stamps(open_archive(tmp_path, 'an/arm')) == [4]
+    assert stamps(tmp_path, 'an/arm') == [4]
 
 
 def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
-    open_archive(tmp_path, joints=2).add(sample(1))
+    archive = open_archive(tmp_path, joints=2)
+    archive.add(sample(1))
+    archive.close()
     with pytest.raises(InputError, match='q3'):
         open_archive(tmp_path, joints=3).resume()
     (path,) = tmp_path.glob('*.csv')
@@ -103,12 +116,13 @@ def test_a_row_that_was_cut_off_is_left_out(tmp_path, cut):
     archive.add(sample(2))
     with archive.journal.open('r+b') as file:
         file.truncate(archive.journal.stat().st_size - cut)
+    archive.close()
     again = open_archive(tmp_path)
     found, (warning,) = again.resume()
     assert [each.stamp_ns for each in found] == [1]
     assert 'line 3 was cut off' in warning
     again.add(sample(3))
-    assert stamps(open_archive(tmp_path)) == [1, 3]
+    assert stamps(tmp_path) == [1, 3]
 
 
 def test_a_full_disk_loses_nothing(tmp_path):
@@ -120,7 +134,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
         assert 'the disk is full' in archive.error
         archive.write()
         assert len(list(tmp_path.glob('*.csv'))) == 1
-        assert stamps(open_archive(tmp_path)) == []
+        assert stamps(tmp_path) == []
     assert len(os.listdir('/proc/self/fd')) == files
     archive.write()
     assert archive.error == ''
@@ -129,12 +143,12 @@ def test_a_full_disk_loses_nothing(tmp_path):
         for each in samples[2:]:
             archive.add(each)
         assert archive.error
-        assert stamps(open_archive(tmp_path)) == [1, 2]
+        assert stamps(tmp_path) == [1, 2]
         archive.remove(samples[1])
         archive.remove(samples[3])
     archive.write()
     assert archive.error == ''
-    assert stamps(open_archive(tmp_path)) == [1, 3, 5, 6, 7]
+    assert stamps(tmp_path) == [1, 3, 5, 6, 7]
 
 
 def test_what_waits_for_room_is_not_written_after_a_clear(tmp_path):
@@ -144,15 +158,16 @@ def test_what_waits_for_room_is_not_written_after_a_clear(tmp_path):
         archive.add(sample(2))
         archive.begin_anew()
     archive.add(sample(3))
-    assert stamps(open_archive(tmp_path)) == [3]
+    assert stamps(tmp_path) == [3]
 
 
 def test_no_calibration_is_overwritten(tmp_path):
     archive = open_archive(tmp_path)
-    path = archive.save('first', tmp_path / 'sub' / 'arm.yaml')
+    path = archive.save('first', 'settings: a\n', tmp_path / 'sub' / 'arm.yaml')
     with pytest.raises(InputError, match='exists already'):
-        archive.save('second', path)
+        archive.save('second', 'settings: b\n', path)
     with full_disk(2), pytest.raises(OSError, match='File too large'):
-        archive.save('third')
+        archive.save('third', '')
     assert path.read_text() == 'first'
+    assert path.with_suffix('.settings.yaml').read_text() == 'settings: a\n'
     assert not list(tmp_path.glob('*Z.yaml'))

@@ -295,6 +295,39 @@ def test_a_capture_in_dwell_mode_does_not_sample_the_stop_again():
     assert made.unused[REST] > 300
 
 
+def test_a_capture_leaves_the_stop_before_its_sample():
+    """It comes before `lateness` has passed since that stop."""
+    motion = stops(STOPS[:3], 0.3, 0.5)
+    made = collector()
+    asking, answers = ask([1.25])
+    samples = play(made, joint_events(motion, 2.4), pose_events(motion, 2.4), asking)
+    assert answers == [(1, '')]
+    for sample, where in zip(samples, STOPS[:3], strict=True):
+        np.testing.assert_allclose(sample.joints, where, atol=1e-3)
+
+
+def test_a_capture_that_gives_nothing_leaves_the_stop_its_sample():
+    motion = stops(STOPS[:2], 1.0, 1.0)
+    made = collector()
+    asking, answers = ask([2.35])
+    late = [(time + 0.4, happens) for time, happens in pose_events(motion, 8.0)]
+    samples = play(made, joint_events(motion, 8.0), late, asking)
+    assert answers == [(0, 'no measurement within this stop')]
+    assert len(samples) == 2
+    assert samples[1].count > 200
+
+
+def test_in_continuous_mode_a_capture_takes_nothing_away():
+    motion = tour()
+    asking, answers = ask([1.7])
+    expected = play(
+        collector(mode='continuous'), joint_events(motion, 9.5), pose_events(motion, 9.5)
+    )
+    made = collector(mode='continuous')
+    assert_same(play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), asking), expected)
+    assert answers == [(0, 'every measurement is taken in mode continuous')]
+
+
 # Order of arrival
 
 

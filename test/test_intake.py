@@ -128,3 +128,37 @@ def test_a_damaged_message_is_told_and_the_others_are_taken():
     (problem,) = feed(session, messages, STORE.deserialize_cdr)
     assert problem.startswith('a message on joints cannot be decoded')
     assert session.received['joints'] == 19
+
+
+def test_streams_of_the_same_joints_share_a_buffer():
+    """Two drivers name the joints in another order: their samples are kept together."""
+    order = list(reversed(ARM.joint_names))
+    messages = [
+        joints(stream, START + k * 1_000_000, names, np.zeros(6))
+        for k in range(200)
+        for stream, names in ((JOINTS, ARM.joint_names), (GRIPPER, order))
+    ]
+    session = CalibrationSession(ARM, Settings(joint_buffer=150))
+    assert feed(session, messages[:2], STORE.deserialize_cdr) == []
+    assert feed(session, messages[2:], STORE.deserialize_cdr) == []
+    assert session.received['joints'] == 400
+
+
+def test_an_error_in_a_batch_costs_no_other_message():
+    stamps = [START + k * 10_000_000 for k in range(2000)]
+    messages = [
+        message
+        for stamp in stamps
+        for message in (
+            joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)),
+            pose(stamp, (0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)),
+        )
+    ]
+
+    def fail(sample):
+        raise RuntimeError('no room for a sample')
+
+    session = CalibrationSession(ARM, on_sample=fail)
+    (problem,) = feed(session, messages, STORE.deserialize_cdr)
+    assert 'no room for a sample' in problem
+    assert session.received == {'joints': 2000, 'poses': 2000}

@@ -63,6 +63,7 @@ def samples(draw):
         session=draw(names),
         device=draw(names.filter(bool)),
         target=draw(names),
+        frame_id=draw(names),
         eye_in_hand=eye,
         validation=draw(st.booleans()),
         delay=draw(floats),

@@ -380,6 +380,36 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         assert 'RMS 3.0' in broken.message
 
 
+def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, recording):
+    saved = tmp_path / 'saved.yaml'
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
+    with Cell(**parameters, serial='7', target_filename=str(saved)) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        assert cell.call('save').success
+    for serial, loads in (('8', False), ('7', True), ('', True)):
+        with Cell(**parameters, serial=serial, calibration_filename=str(saved)) as cell:
+            answer = cell.call('load')
+            assert answer.success == loads, answer.message
+            assert loads or 'the robot with serial "7", this is "8"' in answer.message
+            assert (cell.node.session.calibration is not None) == loads
+
+
+def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording):
+    """Whatever has been changed since."""
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    with Cell(**parameters) as cell:
+        cell.play(topics(recording))
+        assert cell.set_parameters({'folds': 4})[0].successful
+        assert cell.call('identify').success
+        assert cell.set_parameters({'folds': 7})[0].successful
+        assert cell.call('save').success
+        (path,) = tmp_path.glob('*Z.yaml')
+        settings = yaml.safe_load(path.with_suffix('.settings.yaml').read_text())
+        used = settings['/**']['ros__parameters']
+        assert (used['chain'], used['serial'], used['folds']) == ('ur10e', '7', 4)
+
+
 @pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
 def test_messages_are_taken_while_an_identification_runs(
     monkeypatch, tmp_path, recording, executor
@@ -652,6 +682,7 @@ def test_several_robots_in_one_process(tmp_path, recording, truth):
     small = faulty(load_chain('meca500'), SimulatedCell(), rng)
     other = shift(small)
     with Cell() as cell:
+        reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
         for namespace, chain, played in (('/a', 'ur10e', recording), ('/b', 'meca500', other)):
             node = cell.start(namespace=namespace, chain=chain, data_dir=str(tmp_path))
             messages = {f'{namespace}/{name}': m for name, m in topics(played).items()}
@@ -666,6 +697,8 @@ def test_several_robots_in_one_process(tmp_path, recording, truth):
             error = node.session.calibration.chain.forward(unseen) - true.forward(unseen)
             assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 1e-4
             assert node.session.account().dropped == {}
+        lines = {'a/calibration_node: calibration', 'b/calibration_node: calibration'}
+        cell.spin_until(lambda: {report.status[0].name for report in reports} == lines)
     journals = sorted(path.name.partition('_')[0] for path in tmp_path.glob('*Z.csv'))
     assert journals == ['meca500', 'ur10e']
 

@@ -9,8 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_cell import (
     START,
@@ -33,6 +35,7 @@ from std_msgs.msg import String
 from calib_ros import node as node_module
 from calib_ros.archive import Archive
 from calib_ros.config import load_chain
+from calib_ros.errors import ConfigError
 from calib_ros.tables import read_journal
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -440,6 +443,30 @@ def test_an_overridden_qos(monkeypatch, tmp_path, recording):
         assert cell.node.session.received['joints'] == len(recording.joints)
         assert cell.call('identify').success
         cell.spin_until(lambda: 'best effort' not in heard[-1].status[0].message)
+
+
+def test_a_topic_of_another_type_is_told(cell):
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    context = rclpy.Context()  # a participant of its own: one has one type for each topic
+    rclpy.init(context=context, args=[], domain_id=cell.domain)
+    other = Node('other', context=context)
+    other.create_publisher(PointStamped, 'measured_pose', 10)
+    said = '/measured_pose is published as geometry_msgs/msg/PointStamped, not as'
+    cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
+    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    other.destroy_node()
+    cell.spin_until(lambda: said not in heard[-1].status[0].message)
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    ('policy', 'value', 'said'),
+    [('reliability', 'often', 'often'), ('depth', 0, 'must be >= 1')],
+)
+def test_a_qos_that_there_is_not_is_refused(tmp_path, policy, value, said):
+    override = {f'qos_overrides./joint_states.subscription.{policy}': value}
+    with pytest.raises(ConfigError, match=said), Cell() as cell:
+        cell.start(chain='ur10e', data_dir=str(tmp_path), **override)
 
 
 def test_an_overridden_qos_leaves_other_topics_alone(tmp_path):

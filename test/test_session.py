@@ -117,6 +117,26 @@ def test_restored_samples_come_first_and_are_as_good_as_new():
         assert one == other
 
 
+def test_restored_samples_know_their_frame():
+    made = session(samples(frame_id='world'))
+    assert made.problem().world_frame == 'world'
+    drive(made, UR5E.random_joints(2, np.random.default_rng(1)), [tracker()])  # in 'tracker'
+    with pytest.raises(InputError, match=r'different frames \(tracker, world\)'):
+        made.problem()
+
+
+def test_frames_without_end_are_not_remembered():
+    made = session()
+    drive(made, UR5E.random_joints(1, np.random.default_rng(1)), [])
+    for k in range(60):
+        message = pose(k + 1, np.zeros(3), np.eye(3))
+        message.header.frame_id = f'frame {k}' if k else 'line\nbreak'
+        made.take(TRACKER, POSE, message)
+    dropped = made.account().dropped
+    assert dropped['poses: in a frame whose name cannot be printed'] == 1
+    assert dropped['poses: in one of more than 50 frames'] == 9
+
+
 def test_samples_of_another_robot_are_not_restored():
     made = session(samples())
     with pytest.raises(InputError, match='have 7 joint values, chain "ur5e" has 6 joints'):
@@ -243,6 +263,13 @@ def test_the_calibration_of_another_robot_is_refused():
     made = session(samples())
     with pytest.raises(InputError, match='the calibration has the joints panda_joint1'):
         made.load(load_chain('franka_panda'))
+    for name in ('ur10e', 'ur5e'):  # a UR10e has joints of the same names
+        other = load_chain(name)
+        other = other.with_offsets({'elbow_joint.theta': 0.2}) if name == 'ur5e' else other
+        with pytest.raises(InputError, match=r'is not one of this robot: .*elbow_joint'):
+            made.load(other)
+    with pytest.raises(InputError, match='conventions'):
+        made.load(replace(UR5E, convention='modified'))
     assert made.calibration is None
 
 
@@ -328,6 +355,21 @@ def test_the_status_names_joints_that_hardly_moved():
     joints = [np.array([*each.joints[:5], 0.01 * k]) for k, each in enumerate(given)]
     made = session([replace(each, joints=q) for each, q in zip(given, joints, strict=True)])
     assert 'hardly moved so far: wrist_3_joint' in made.status()
+
+
+def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
+    """Of two drivers that each name some joints one has died."""
+    made = session()
+    for k in range(2000):
+        stamp = 1_700_000_000_000_000_000 + k * 5_000_000
+        made.take_joints(joint_state(stamp, UR5E.joint_names[:4], [0.0] * 4))
+        if k < 500:
+            made.take_joints(joint_state(stamp, UR5E.joint_names[4:], [0.0] * 2))
+        if k == 600:
+            assert 'the arm stands' in made.status()
+    assert made.status().endswith(
+        'nothing can be sampled: no joint states of wrist_2_joint, wrist_3_joint come any more'
+    )
 
 
 def test_the_status_is_never_an_error():

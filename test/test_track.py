@@ -431,11 +431,11 @@ def test_a_full_track_is_halved(capacity):
     made = track(capacity=capacity)
     taken = gone = 0
     for k in range(500):
-        if made.full(BOTH):
+        if not made.room(BOTH):
             made.sort()
             gone += made.halve()
-        assert not made.full(BOTH) or capacity == 1
-        if not made.full(BOTH):
+        assert made.room(BOTH) or capacity == 1
+        if made.room(BOTH):
             made.add(BOTH, k * MS, np.zeros(2))
             taken += 1
     made.sort()
