@@ -43,7 +43,9 @@ MOST_STEPS = 5
 START = 6
 """Configurations with which the frames can be found."""
 MOST_ANEW = 500
-"""Samples up to which the linear model is made anew."""
+"""Samples up to which the linear model is made anew, and with which it begins at most."""
+MOST_AT_ONCE = 2000
+"""Samples that one update adds at most; the rest waits for the next ones."""
 FAR_OFF = 7.0
 """Distance [standard deviations] from which a sample is left out as suspicious."""
 LEAST_NOISE = 1e-3
@@ -94,7 +96,8 @@ class LiveEstimate:
         self._names: tuple[str, ...] = ()
         self._chain: Chain | None = None
         self._added: list[Sample] = []
-        self._taken = 0
+        self._seen = 0
+        self._pending: list[Sample] = []
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
         """Samples that lie too far from what the others predict; they are left out here."""
@@ -102,22 +105,29 @@ class LiveEstimate:
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
         """Take what a growing list of samples has beyond that of the last call.
 
-        Returns None while there are too few.
+        Returns None while there are too few. An update is short, so that it may be called between
+        messages: of many samples it takes MOST_AT_ONCE.
         """
-        if self._latest is not None and len(samples) == self._taken:
+        if self._latest is not None and len(samples) == self._seen and not self._pending:
             return self._latest
-        fresh = [sample for sample in samples[self._taken :] if not sample.validation]
+        self._pending += [each for each in samples[self._seen :] if not each.validation]
+        self._seen = len(samples)
+        fresh = self._pending[:MOST_AT_ONCE]
         if self._chain is None or any(not self._knows(sample) for sample in fresh):
             fitted = [sample for sample in samples if not sample.validation]
-            if _distinct(fitted) < START or not self._begin(fitted):
+            first = _spread(fitted)
+            if _distinct(first) < START or not self._begin(first):
                 return None
+            chosen = set(first)
+            self._seen = len(samples)
+            self._pending = [sample for sample in fitted if sample not in chosen]
         elif fresh:
+            del self._pending[: len(fresh)]
             self._add(fresh)
             for _ in range(MOST_STEPS):
                 if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
                     break
                 self._linearise(self._estimate())
-        self._taken = len(samples)
         self._latest = self._result()
         return self._latest
 
@@ -236,6 +246,19 @@ def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
         for joint, reached, wanted in zip(chain.joints, span.tolist(), least, strict=True)
         if reached < wanted
     )
+
+
+def _spread(samples: Sequence[Sample]) -> list[Sample]:
+    """Return at most MOST_ANEW samples or so, evenly from those between each pair of frames."""
+    frames = Frames()
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, sample in enumerate(samples):
+        groups.setdefault(frames.of(sample), []).append(k)
+    chosen: set[int] = set()
+    for members in groups.values():
+        count = min(len(members), 1 + MOST_ANEW // len(groups))
+        chosen |= {members[k] for k in np.linspace(0, len(members) - 1, count).astype(int)}
+    return [samples[k] for k in sorted(chosen)]
 
 
 def _distinct(samples: Sequence[Sample]) -> int:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib_ros import live as live_module
 from calib_ros.chain import Chain, Joint
 from calib_ros.config import Settings, load_chain
 from calib_ros.identification import identify
@@ -93,6 +94,24 @@ def test_one_by_one_or_all_at_once_is_the_same(rng):
     once = LiveEstimate(session().problem_of).update(samples)
     assert apart(said[-1].chain, once.chain, rng) < 0.02 * NOISE[0]
     assert once.sigma == pytest.approx(said[-1].sigma, rel=0.02)
+
+
+def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
+    """An update is short whatever waits, and in the end nothing has been left out."""
+    monkeypatch.setattr(live_module, 'MOST_ANEW', 40)
+    monkeypatch.setattr(live_module, 'MOST_AT_ONCE', 25)
+    true = faulty(UR10E, Cell(), rng)
+    samples = seen(true, 80, rng) + [
+        replace(sample, target='other', stamp_ns=sample.stamp_ns + 10**6)
+        for sample in seen(true, 40, rng)
+    ]
+    live = LiveEstimate(session().problem_of)
+    counts = [live.update(samples).samples for _ in range(6)]
+    assert counts[0] <= 42
+    assert all(0 <= step <= 25 for step in np.diff(counts))
+    assert counts[-2:] == [120, 120]
+    _, said = growing(samples)
+    assert apart(said[-1].chain, live.update(samples).chain, rng) < 0.1 * NOISE[0]
 
 
 @pytest.mark.parametrize('oriented', [True, False])
