@@ -22,7 +22,7 @@ from calib_ros.se3 import FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 LARGEST = 1e6
-"""Largest number [m or rad] that is a measurement; some devices send the largest float for none."""
+"""Largest number [m or rad] that is measured; some devices send the largest float for none."""
 
 
 class MessageError(InputError):
