@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.messages import (
     JOINT_STATE,
+    LARGEST,
     JointReadings,
     MessageError,
     Readings,
@@ -125,8 +126,10 @@ def readings(
     distance = kind.endswith('/Range')
     if distance:
         numbers = numbers[:, 3:]
-        good &= numbers[:, 0] > 0.0
-    elif numbers.shape[1] >= 7:
+        good &= (numbers[:, 0] > 0.0) & (numbers[:, 0] <= LARGEST)
+    else:
+        good &= (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
+    if numbers.shape[1] >= 7:
         length = np.linalg.norm(numbers[:, 3:7], axis=1)
         good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
     if numbers.shape[1] > 7:

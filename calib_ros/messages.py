@@ -21,6 +21,8 @@ from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
+LARGEST = 1e6
+"""Largest number [m or rad] that is measured; some devices send the largest float for none."""
 
 
 class MessageError(InputError):
@@ -141,6 +143,8 @@ def distance(message: Any) -> Reading:
     value = float(message.range)
     if not (np.isfinite(value) and value > 0.0):
         raise MessageError('distance not a positive number')
+    if value > LARGEST:
+        raise MessageError('distance beyond 1000 km')
     return Reading(stamp(message.header.stamp), message.header.frame_id, distance=value)
 
 
@@ -168,6 +172,8 @@ def _pose(header: Any, point: Any, quaternion: Any) -> Reading:
     position = x, y, z = point.x, point.y, point.z
     if not math.isfinite(x + y + z):
         raise MessageError('NaN or infinite position')
+    if max(abs(x), abs(y), abs(z)) > LARGEST:
+        raise MessageError('position beyond 1000 km')
     quat = None
     if quaternion is not None:
         quat = qx, qy, qz, qw = quaternion.x, quaternion.y, quaternion.z, quaternion.w

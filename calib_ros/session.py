@@ -216,6 +216,9 @@ class CalibrationSession:
         if not math.isfinite(sum(values)):
             self._dropped['joints: NaN or infinite joint value'] += 1
             return
+        if max(map(abs, values)) > messages.LARGEST:
+            self._dropped['joints: joint value beyond 1e6'] += 1
+            return
         complete = len(columns) == len(self.chain.joints)
         if complete:
             self.latest = (reading.stamp_ns, values)
@@ -243,7 +246,7 @@ class CalibrationSession:
             return nothing
         stamps = readings.stamps_ns
         quiet = self._collector.uneventful(columns, stamps, among)
-        quiet &= np.isfinite(values).all(axis=1)
+        quiet &= (np.abs(values) <= messages.LARGEST).all(axis=1)
         if self._collector.holding:
             since = stamps - self._looked_ns
             quiet &= (since >= 0) & (since < LOOK_AGAIN_NS)

@@ -130,6 +130,29 @@ def test_a_damaged_message_is_told_and_the_others_are_taken():
     assert session.received['joints'] == 19
 
 
+@pytest.mark.parametrize('value', [1.79e308, 3.4e38, -1e7])
+@pytest.mark.parametrize('together', [True, False])
+def test_numbers_that_stand_for_nothing_are_dropped(value, together):
+    """Some devices send the largest number that there is while they see no target."""
+    messages = []
+    for k in range(600):
+        stamp = START + k * 10_000_000
+        lost = k % 5 == 0
+        values = np.full(6, value if k % 50 == 1 else 0.3 * np.sin(0.01 * k))
+        messages.append(joints(JOINTS, stamp, ARM.joint_names, values))
+        place = (0.5, value if lost else 0.4, 0.1)
+        messages.append(pose(stamp + 300_000, place, (0.0, 0.0, 0.0, 1.0)))
+    session = CalibrationSession(ARM, Settings(mode='continuous', delay=1e-3))
+    for begin in range(0, 1200, 1200 if together else 1):
+        part = messages[begin : begin + (1200 if together else 1)]
+        assert feed(session, part, STORE.deserialize_cdr) == []
+    session.finish()
+    dropped = session.account().dropped
+    assert dropped['poses: position beyond 1000 km'] == 120
+    assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 12
+    assert 'samples' in session.status()
+
+
 def test_streams_of_the_same_joints_share_a_buffer():
     """Two drivers name the joints in another order: their samples are kept together."""
     order = list(reversed(ARM.joint_names))
