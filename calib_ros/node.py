@@ -429,7 +429,7 @@ class CalibrationNode(Node):
             heard.deaf = True
 
         def note_lost(event: Any) -> None:
-            heard.lost += event.total_count_change
+            heard.lost = event.total_count  # the change leaves out what came with others
 
         return SubscriptionEventCallbacks(
             incompatible_qos=self._guarded(note_deaf), message_lost=self._guarded(note_lost)
