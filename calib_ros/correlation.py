@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize, signal, special
+from scipy import linalg, optimize, special
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -341,6 +341,8 @@ def _successive(
 
     The sum over all earlier stops follows the recursion y_j = decay (y_{j-1} + s_{j-1}).
     """
+    from scipy import signal  # half a second that most fits do not need
+
     found = np.zeros((len(names), len(names)))
     for samples in system.sets:
         states = [np.zeros((len(names), samples.width if part == 0 else 3, 1))] * len(kernels)
