@@ -26,7 +26,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from calib_ros.chain import Chain
 from calib_ros.leastsquares import System
@@ -103,7 +102,7 @@ class Shifts:
         for begins, residual in zip(self._begins, residuals, strict=True):
             series = _by_stop(residual, begins).T
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
-            self._circles.append(fft.rfft(circle))
+            self._circles.append(np.fft.rfft(circle))
             length = len(begins)
             squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
             slow = _correlation(_cosines(length)[:, np.newaxis], self._circles[-1], length)
@@ -165,8 +164,8 @@ def _cosines(length: int) -> FloatArray:
 
 def _correlation(series: FloatArray, circle: NDArray[np.complex128], length: int) -> FloatArray:
     """Return (..., c, 2 n): series (..., c, n) times the circle moved by each shift, summed."""
-    spectrum = np.conj(fft.rfft(series, 2 * length)) * circle
-    return np.asarray(fft.irfft(spectrum, 2 * length))
+    spectrum = np.conj(np.fft.rfft(series, 2 * length)) * circle
+    return np.asarray(np.fft.irfft(spectrum, 2 * length))
 
 
 def _root(matrix: FloatArray, size: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, optimize, special
+from scipy import linalg, special
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
@@ -232,6 +232,8 @@ class _Forms:
 
     def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
         """Return, by part, the sizes (1 + K,) of what is independent and of each kernel."""
+        from scipy import optimize  # as below, what most fits do not need
+
         forms = []
         for part in self.parts:
             matrices = [np.eye(len(self._units))]
