@@ -96,7 +96,7 @@ class Shifts:
         numbers = [stops(samples.observations.joints) for samples in system.sets]
         self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
         count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
-        self._share = np.arange(count) / max(count, 1)
+        self._share = np.arange(count) / count
         self._circles: list[NDArray[np.complex128]] = []
         self._energy = np.zeros(count)
         for begins, residual in zip(self._begins, residuals, strict=True):
@@ -148,8 +148,6 @@ class Shifts:
 
 def _by_stop(values: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
     """Return (n, ...) the sums over each stop of (N, ...), by the root of their number."""
-    if not len(begins):
-        return np.zeros((0, *values.shape[1:]))
     count = np.diff([*begins, len(values)])
     sums = np.add.reduceat(values, begins, axis=0)
     return np.asarray(sums / np.sqrt(count).reshape(-1, *[1] * (values.ndim - 1)))
@@ -158,8 +156,8 @@ def _by_stop(values: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
 def _cosines(length: int) -> FloatArray:
     """Return (K, length) orthonormal: the constant and the slowest cosines of a series."""
     order = np.arange(1 + min(SLOW, length // 10))
-    waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / max(length, 1)))
-    return np.asarray(waves / np.maximum(np.linalg.norm(waves, axis=1, keepdims=True), 1e-300))
+    waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
+    return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 
 
 def _correlation(series: FloatArray, circle: NDArray[np.complex128], length: int) -> FloatArray:

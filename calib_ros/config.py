@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.chain import DH_KINDS, Chain, Convention, Frame, Joint
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
+from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
+from calib_ros.se3 import FloatArray
 from calib_ros.urdf import chain_from_urdf
 
 CHAIN_KEYS = (
@@ -137,7 +138,7 @@ class Settings:
         priors = {}
         for text in self.priors:
             name, _, sigma = text.partition('=')
-            priors[name] = _number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
+            priors[name] = parse_number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
         names = ['sigma_position', 'sigma_orientation', 'fixed', 'folds', 'largest_length']
         names += ['largest_angle', 'largest_error', 'loss']
         named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
@@ -252,7 +253,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
             **_gravity(content, where),
         ).with_effect_values(
             {
-                name: _number(value, f'{where}: effects: {name}')
+                name: parse_number(value, f'{where}: effects: {name}')
                 for name, value in _dictionary(content.get('effects'), f'{where}: effects').items()
             }
         )
@@ -289,11 +290,14 @@ def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> Chain:
     return parse_calibration(read_text(file), str(file), nominal)[0]
 
 
-def parse_calibration(text: str, where: str, nominal: Chain) -> tuple[Chain, dict[str, Any]]:
+def parse_calibration(
+    text: str, where: str, nominal: Chain, settings: Settings | None = None
+) -> tuple[Chain, dict[str, Any]]:
     """Turn the text of a calibration into the corrected chain and the record of its origin.
 
     A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
-    all that calib_ros writes, and must not speak against this nominal chain.
+    all that calib_ros writes, and must not speak against this nominal chain; nor may the numbers
+    be further from it than `largest_length` and `largest_angle` of the settings allow.
 
     Raises
     ------
@@ -320,6 +324,12 @@ def parse_calibration(text: str, where: str, nominal: Chain) -> tuple[Chain, dic
     if record.get('accepted') is False:
         raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
     _check_nominal(record.get('nominal'), nominal, where)
+    differing = _differing(chain, nominal, settings or Settings())
+    if differing:
+        raise ConfigError(
+            f'{where} is not the calibration of this robot: {", ".join(differing)} differ from '
+            f'chain "{nominal.name}" by more than largest_length and largest_angle allow'
+        )
     return chain, record
 
 
@@ -336,7 +346,7 @@ def _check_nominal(recorded: object, nominal: Chain, where: str) -> None:
         return
     rows = _dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
     for joint in nominal.joints:
-        row = _numbers(rows.get(joint.name), len(DH_KINDS), f'{where}: nominal {joint.name}')
+        row = parse_numbers(rows.get(joint.name), len(DH_KINDS), f'{where}: nominal {joint.name}')
         for kind, value in zip(DH_KINDS, row.tolist(), strict=True):
             if abs(value - getattr(joint, kind)) > SAME:
                 raise ConfigError(
@@ -344,6 +354,21 @@ def _check_nominal(recorded: object, nominal: Chain, where: str) -> None:
                     f'{value:.9g} and not {getattr(joint, kind):.9g}: give that one, or identify '
                     'again'
                 )
+
+
+def _differing(chain: Chain, nominal: Chain, settings: Settings) -> list[str]:
+    """Return what of the joints differs by more than errors of one robot can."""
+    if chain.convention != nominal.convention:
+        return [f'the conventions ({chain.convention}, {nominal.convention})']
+    names = []
+    for joint, other in zip(chain.joints, nominal.joints, strict=True):
+        if joint.sign != other.sign:
+            names.append(f'the sign of {joint.name}')
+        for kind in DH_KINDS:
+            limit = settings.largest_angle if kind in ANGLES else settings.largest_length
+            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
+                names.append(f'{joint.name}.{kind}')
+    return names
 
 
 def chain_document(chain: Chain) -> dict[str, Any]:
@@ -415,20 +440,24 @@ def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]
     return value
 
 
-def _number(value: object, where: str) -> float:
+def parse_number(value: object, where: str, error: type[CalibrationError] = ConfigError) -> float:
+    """Return a finite number from YAML or a table; `where` names it in the error."""
     try:  # YAML 1.1 reads 1e-3, without a dot, as a string
         number = float(value) if isinstance(value, int | float | str) else math.nan
     except (ValueError, OverflowError):
         number = math.nan
     if isinstance(value, bool) or not math.isfinite(number):
-        raise ConfigError(f'{where} must be a finite number, not {value!r}')
+        raise error(f'{where} must be a finite number, not {value!r}')
     return number
 
 
-def _numbers(value: object, count: int, where: str) -> np.ndarray[Any, np.dtype[np.float64]]:
+def parse_numbers(
+    value: object, count: int, where: str, error: type[CalibrationError] = ConfigError
+) -> FloatArray:
+    """Return so many finite numbers (count,) from YAML; `where` names them in the error."""
     if not isinstance(value, list) or len(value) != count:
-        raise ConfigError(f'{where} must be a list of {count} numbers, not {value!r}')
-    return np.array([_number(item, where) for item in value])
+        raise error(f'{where} must be a list of {count} numbers, not {value!r}')
+    return np.array([parse_number(item, where, error) for item in value])
 
 
 def _dictionary(value: object, where: str) -> dict[str, Any]:
@@ -442,7 +471,7 @@ def _dictionary(value: object, where: str) -> dict[str, Any]:
 def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
     if content.get('gravity') is None:
         return {}
-    x, y, z = _numbers(content['gravity'], 3, f'{where}: gravity').tolist()
+    x, y, z = parse_numbers(content['gravity'], 3, f'{where}: gravity').tolist()
     return {'gravity': (x, y, z)}
 
 
@@ -452,12 +481,12 @@ def _joint(row: object, where: str) -> Joint:
         if key not in content:
             raise ConfigError(f'{where}: key "{key}" is missing')
     numbers = {
-        key: _number(content[key], f'{where}: {key}')
+        key: parse_number(content[key], f'{where}: {key}')
         for key in (*DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'gear_ratio')
         if content.get(key) is not None
     }
     sign = numbers.pop('sign', 1.0)
-    centre = _numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
+    centre = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
     if sign not in (1.0, -1.0):
         raise ConfigError(f'{where}: sign must be 1 or -1, not {sign:g}')
     return Joint(
@@ -473,8 +502,8 @@ def _frame(value: object, where: str) -> Frame | None:
     if value is None:
         return None
     content = _mapping(value, FRAME_KEYS, where)
-    xyz = _numbers(content.get('xyz', [0.0, 0.0, 0.0]), 3, f'{where}.xyz')
-    quat = _numbers(content.get('quat_xyzw', [0.0, 0.0, 0.0, 1.0]), 4, f'{where}.quat_xyzw')
+    xyz = parse_numbers(content.get('xyz', [0.0, 0.0, 0.0]), 3, f'{where}.xyz')
+    quat = parse_numbers(content.get('quat_xyzw', [0.0, 0.0, 0.0, 1.0]), 4, f'{where}.quat_xyzw')
     length = float(np.linalg.norm(quat))
     if abs(length - 1.0) > QUATERNION_TOLERANCE:
         raise ConfigError(f'{where}.quat_xyzw must have length 1 (x, y, z, w), not {length:.6g}')
@@ -485,5 +514,5 @@ def _frame(value: object, where: str) -> Frame | None:
     return Frame(
         se3.transform(se3.from_quat(quat), xyz),
         fixed,
-        None if delay is None else _number(delay, f'{where}.delay'),
+        None if delay is None else parse_number(delay, f'{where}.delay'),
     )

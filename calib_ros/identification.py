@@ -269,7 +269,6 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     sets = [
         _some(each.select(np.flatnonzero(which)))
         for each, which in zip(problem.sets, good, strict=True)
-        if which.any()
     ]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]

@@ -555,7 +555,9 @@ class CalibrationNode(Node):
                 f'{self._archive.folder}: set calibration_filename'
             )
         text = read_text(path)
-        chain, record = parse_calibration(text, str(path), self.session.chain)
+        chain, record = parse_calibration(
+            text, str(path), self.session.chain, self.session.settings
+        )
         serial = record.get('robot_serial')
         if serial and self._serial and serial != self._serial:
             raise InputError(

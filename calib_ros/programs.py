@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros.compensation import Program
+from calib_ros.config import parse_number, parse_numbers
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
 
@@ -87,7 +87,10 @@ def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
         index = [header.index(name) for name in columns]
         return np.array(
             [
-                [_number(row[i], f'{where}, line {line}: {header[i]}') for i in index]
+                [
+                    parse_number(row[i], f'{where}, line {line}: {header[i]}', InputError)
+                    for i in index
+                ]
                 for line, row in rows
             ]
         )
@@ -178,7 +181,7 @@ def trajectory_program(
             return None
         return np.array(
             [
-                _row(row, len(names), f'{where}, point {k + 1}: {key}')
+                parse_numbers(row, len(names), f'{where}, point {k + 1}: {key}', InputError)
                 for k, row in enumerate(given)
             ]
         )
@@ -189,19 +192,3 @@ def trajectory_program(
     return Program(
         tuple(map(str, names)), positions, values('velocities'), values('accelerations')
     )
-
-
-def _row(value: object, count: int, where: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != count:
-        raise InputError(f'{where} must be a list of {count} numbers, not {value!r}')
-    return [_number(item, where) for item in value]
-
-
-def _number(value: object, where: str) -> float:
-    try:  # YAML 1.1 reads 1e-3, without a dot, as a string
-        number = float(value) if isinstance(value, int | float | str) else math.nan
-    except (ValueError, OverflowError):
-        number = math.nan
-    if isinstance(value, bool) or not math.isfinite(number):
-        raise InputError(f'{where} must be a finite number, not {value!r}')
-    return number

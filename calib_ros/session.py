@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import messages
-from calib_ros.chain import ANGLES, DH_KINDS, Chain
+from calib_ros.chain import Chain
 from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
 from calib_ros.delays import Delay, Watch
@@ -525,20 +525,13 @@ class CalibrationSession:
         Raises
         ------
         InputError
-            When it is that of another robot, also of one whose joints have the same names.
+            When it has other joints.
 
         """
         if chain.joint_names != self.chain.joint_names:
             raise InputError(
                 f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
-            )
-        limits = (self.settings.largest_length, self.settings.largest_angle)
-        differing = _differing(chain, self.chain, *limits)
-        if differing:
-            raise InputError(
-                f'the calibration is not one of this robot: {", ".join(differing)} differ from '
-                f'chain "{self.chain.name}" by more than largest_length and largest_angle allow'
             )
         self.calibration = Calibration(chain, None, world_frame, rms_mm, frozenset(self.samples))
 
@@ -666,21 +659,6 @@ class CalibrationSession:
         self._looked_ns = now_ns or 0
         self.delay = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None
-
-
-def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
-    """Return what of the joints differs by more than errors [m, rad] of one robot can."""
-    if chain.convention != nominal.convention:
-        return [f'the conventions ({chain.convention}, {nominal.convention})']
-    names = []
-    for joint, other in zip(chain.joints, nominal.joints, strict=True):
-        if (joint.type, joint.sign) != (other.type, other.sign):
-            names.append(f'type or sign of {joint.name}')
-        for kind in DH_KINDS:
-            limit = angle if kind in ANGLES else length
-            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
-                names.append(f'{joint.name}.{kind}')
-    return names
 
 
 def _stream(source: Source, frame_id: str, child: str, distance: bool) -> StreamKey:

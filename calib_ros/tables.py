@@ -274,15 +274,7 @@ class _Reader:
         return np.array([self._number(line, row, name) for name in names])
 
     def _number(self, line: int, row: Row, name: str) -> float:
-        text = row.get(name)
-        try:
-            number = float(text or 'blank')
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            found = 'the row ends before it' if text is None else f'not {text!r}'
-            raise InputError(f'{self._path}, line {line}: {name} must be a number, {found}')
-        return number
+        return cell_number(row.get(name), f'{self._path}, line {line}: {name}')
 
     def _flag(self, line: int, row: Row, name: str) -> bool:
         text = row.get(name) or ''
@@ -295,6 +287,18 @@ class _Reader:
         if not text.lstrip('-').isdigit():
             raise InputError(f'{self._path}, line {line}: {name} must be an integer, not {text!r}')
         return int(text)
+
+
+def cell_number(text: str | None, where: str) -> float:
+    """Return the number in a cell of a table; None where the row ends before it."""
+    try:
+        number = float(text or 'blank')
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        found = 'the row ends before it' if text is None else f'not {text!r}'
+        raise InputError(f'{where} must be a number, {found}')
+    return number
 
 
 def _read(

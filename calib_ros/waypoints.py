@@ -20,6 +20,7 @@ from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError
 from calib_ros.inverse import limits
 from calib_ros.se3 import FloatArray
+from calib_ros.tables import cell_number
 
 BEYOND = 1e-3
 """How far [rad or m] an arm may stand beyond a limit."""
@@ -109,18 +110,7 @@ def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int], Se
     if not rows:
         raise InputError(f'{path} has no rows')
     numbers = [
-        [_number(row[name], f'{path}, line {line}: {name}') for name in columns]
+        [cell_number(row[name], f'{path}, line {line}: {name}') for name in columns]
         for line, row in rows
     ]
     return np.array(numbers), [line for line, _ in rows], header
-
-
-def _number(text: str | None, where: str) -> float:
-    try:
-        number = float(text or 'blank')
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        found = 'the row ends before it' if text is None else f'not {text!r}'
-        raise InputError(f'{where} must be a number, {found}')
-    return number

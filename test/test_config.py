@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -491,6 +492,7 @@ def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
         ('ur10e', {}, 'is a chain, but no calibration'),
         ('ur10e', {'accepted': False}, 'was not accepted'),
         ('puma560', {'samples': 3}, 'is it the right nominal chain'),
+        ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),
         ('ur10', {'nominal': nominal_record(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
         ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
         ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
@@ -502,7 +504,7 @@ def test_what_is_no_calibration_of_a_nominal_chain_is_refused(nominal, record, m
         parse_calibration(text, 'calibration.yaml', load_chain(nominal))
 
 
-def test_a_calibration_in_another_convention_is_taken_as_it_is():
+def test_a_record_in_another_convention_is_taken_as_it_is():
     """Its numbers cannot be compared with those of the nominal chain."""
     nominal = load_chain('ur10e')
     record = {'nominal': nominal_record(load_chain('franka_fr3'))}
@@ -510,3 +512,14 @@ def test_a_calibration_in_another_convention_is_taken_as_it_is():
     chain, found = parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
     assert found == record
     assert chain.joint_names == nominal.joint_names
+
+
+def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
+    nominal = load_chain('ur5e')
+    far = calibrated_text(nominal.with_offsets({'elbow_joint.theta': 0.2}), {'samples': 3})
+    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+        parse_calibration(far, 'c.yaml', nominal)
+    parse_calibration(far, 'c.yaml', nominal, Settings(largest_angle=0.3))
+    near = calibrated_text(nominal, {'samples': 3})
+    with pytest.raises(ConfigError, match='conventions'):
+        parse_calibration(near, 'c.yaml', replace(nominal, convention='modified'))

@@ -263,13 +263,6 @@ def test_the_calibration_of_another_robot_is_refused():
     made = session(samples())
     with pytest.raises(InputError, match='the calibration has the joints panda_joint1'):
         made.load(load_chain('franka_panda'))
-    for name in ('ur10e', 'ur5e'):  # a UR10e has joints of the same names
-        other = load_chain(name)
-        other = other.with_offsets({'elbow_joint.theta': 0.2}) if name == 'ur5e' else other
-        with pytest.raises(InputError, match=r'is not one of this robot: .*elbow_joint'):
-            made.load(other)
-    with pytest.raises(InputError, match='conventions'):
-        made.load(replace(UR5E, convention='modified'))
     assert made.calibration is None
 
 
