@@ -21,8 +21,10 @@ at consecutive parallel revolute axes, where a tiny tilt moves the common normal
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -98,7 +100,7 @@ class Joint:
         if self.sign not in (1, -1):
             raise ConfigError(f'sign of joint "{self.name}" must be 1 or -1, not {self.sign}')
         for kind in DH_KINDS:
-            if not np.isfinite(getattr(self, kind)):
+            if not math.isfinite(getattr(self, kind)):
                 raise ConfigError(f'{kind} of joint "{self.name}" must be a finite number')
         if self.lower is not None and self.upper is not None and not self.lower < self.upper:
             raise ConfigError(
@@ -214,12 +216,12 @@ class Chain:
                 found.append(joint.name)
         return tuple(found)
 
-    @property
+    @cached_property
     def joint_names(self) -> tuple[str, ...]:
         """Return the names of the joints, in the order of the chain."""
         return tuple(joint.name for joint in self.joints)
 
-    @property
+    @cached_property
     def parameter_names(self) -> tuple[str, ...]:
         """Return the names of all parameters of the error model, frames first.
 
@@ -232,7 +234,7 @@ class Chain:
             names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
         return (*names, *(name for name, _ in self.effects))
 
-    @property
+    @cached_property
     def frame_names(self) -> tuple[str, ...]:
         """Return the names of all base and tool frames."""
         return ('base', 'tool', *(name for name, _ in self.frames))
@@ -246,7 +248,7 @@ class Chain:
         """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
         owner, kind = self._split(name)
         if isinstance(owner, Joint):
-            return float(getattr(owner, kind)) if kind in DH_KINDS else dict(self.effects)[name]
+            return float(getattr(owner, kind)) if kind in DH_KINDS else self._effect_values[name]
         if kind == DELAY:
             return owner.delay or 0.0
         return float(owner.offsets()[FRAME_KINDS.index(kind)])
@@ -261,8 +263,7 @@ class Chain:
 
     def frame(self, name: str) -> Frame:
         """Return a base or tool frame by its name, the identity when nothing is known."""
-        frame = {'base': self.base, 'tool': self.tool, **dict(self.frames)}[name]
-        return Frame() if frame is None else frame
+        return self._frames[name] or Frame()
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""
@@ -305,10 +306,9 @@ class Chain:
             own = by_owner.get(joint.name, {})
             values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in DH_KINDS}
             joints.append(replace(joint, **values) if values else joint)
-        known = {'base': self.base, 'tool': self.tool, **dict(self.frames)}
         frames = {
             key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
-            for key, frame in known.items()
+            for key, frame in self._frames.items()
         }
         return replace(
             self,
@@ -441,11 +441,24 @@ class Chain:
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
         owner, _, kind = name.partition('.')
-        if owner in self.frame_names and kind in (*FRAME_KINDS, DELAY):
+        if owner in self._frames and kind in (*FRAME_KINDS, DELAY):
             return self.frame(owner), kind
-        for joint in self.joints:
-            if joint.name == owner and (kind in DH_KINDS or name in dict(self.effects)):
-                if kind not in DH_KINDS:
-                    effects.check(name, self.joint_names)
-                return joint, kind
+        joint = self._joints.get(owner)
+        if joint is not None and kind in DH_KINDS:
+            return joint, kind
+        if joint is not None and name in self._effect_values:
+            effects.check(name, self.joint_names)
+            return joint, kind
         raise UnknownNameError('parameter', name, self.parameter_names)
+
+    @cached_property
+    def _frames(self) -> Mapping[str, Frame | None]:
+        return {'base': self.base, 'tool': self.tool, **dict(self.frames)}
+
+    @cached_property
+    def _joints(self) -> Mapping[str, Joint]:
+        return {joint.name: joint for joint in self.joints}
+
+    @cached_property
+    def _effect_values(self) -> Mapping[str, float]:
+        return dict(self.effects)

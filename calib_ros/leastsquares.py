@@ -30,7 +30,7 @@ from calib_ros.observations import Observations
 from calib_ros.se3 import FloatArray
 
 BLOCK = 1024
-STEP_TOLERANCE = 1e-8
+STEP_TOLERANCE = 1e-6
 """The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
 larger, in RMS residuals)."""
 MAX_ITERATIONS = 50

@@ -147,7 +147,7 @@ class LiveEstimate:
         except (CalibrationError, np.linalg.LinAlgError):
             return False
         wide = {name: _wide(name) for name in self._names if not model.owns_frame(name)}
-        self._prior = Prior(model, wide | problem.prior_sigmas)
+        self._prior = Prior(model, {**wide, **problem.prior_sigmas})
         self._joints = chain.random_joints(LOOK, np.random.default_rng(0))
         self._added = list(fitted)
         for _ in range(MOST_STEPS):

@@ -7,6 +7,7 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -133,19 +134,19 @@ class Problem:
         if not self.free:
             raise ConfigError('every parameter is fixed: nothing is left to identify')
 
-    @property
+    @cached_property
     def sets(self) -> tuple[Observations, ...]:
         """Return all sets of observations to fit."""
         return (self.observations, *self.more)
 
-    @property
+    @cached_property
     def judging(self) -> tuple[Observations, ...]:
         """Return the held-out sets that hold anything."""
         held_out = self.held_out or ()
         sets = (held_out,) if isinstance(held_out, Observations) else tuple(held_out)
         return tuple(each for each in sets if len(each))
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[identifiability.Kind, ...]:
         """Return what each set measures."""
         return tuple(
@@ -160,7 +161,7 @@ class Problem:
             for each in self.sets
         )
 
-    @property
+    @cached_property
     def model(self) -> Chain:
         """Return the nominal chain with every frame and effect that is to be fitted."""
         chain = self.chain
@@ -175,8 +176,8 @@ class Problem:
         wanted = [each for name in self.effects for each in effects.resolve(chain, name)]
         return chain.with_effects(wanted)
 
-    @property
-    def prior_sigmas(self) -> dict[str, float]:
+    @cached_property
+    def prior_sigmas(self) -> Mapping[str, float]:
         """Return the standard deviations [m, rad] of the priors of all parameters that have one.
 
         Frames have none; effects always have one.
@@ -191,7 +192,7 @@ class Problem:
             sigmas.setdefault(name, effects.expected(name))
         return sigmas
 
-    @property
+    @cached_property
     def informed(self) -> frozenset[str]:
         """Return the DH parameters whose prior says more than common sense does."""
         known = dict(self.model.effects)
@@ -214,7 +215,7 @@ class Problem:
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
         return System(tuple(samples), prior, apart)
 
-    @property
+    @cached_property
     def free(self) -> tuple[str, ...]:
         """Return the parameters that may be fitted, in the order of their priority.
 
