@@ -190,7 +190,7 @@ class _Forms:
 
     def _form(self, part: int, matrix: FloatArray) -> _Form:
         basis, residual = self._basis[part], self._residual[part]
-        product = (matrix @ basis.reshape(len(matrix), -1)).reshape(basis.shape)
+        product = self._product(part, matrix)
         return _Form(
             part,
             matrix,
@@ -198,6 +198,12 @@ class _Forms:
             np.einsum('ncp,ncr->pr', basis, product, optimize=True),
             float((residual * (matrix @ residual)).sum()),
         )
+
+    def _product(self, part: int, matrix: FloatArray | csr_array) -> FloatArray:
+        """Return A Q (n, c, P), zero in rows that were not measured."""
+        basis = self._basis[part]
+        product = (matrix @ basis.reshape(len(basis), -1)).reshape(basis.shape)
+        return np.asarray(product * self._known[part][:, :, np.newaxis])
 
     def _trace(self, first: _Form, second: _Form) -> float:
         """Return tr(A B C B) of two forms A and C."""
@@ -214,7 +220,7 @@ class _Forms:
         The score is standard normal where nothing is shared.
         """
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
-        product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
+        product = self._product(part, links)
         white = np.einsum('ncp,ncr->pr', basis, basis, optimize=True)
         linked = np.einsum('ncp,ncr->pr', basis, product, optimize=True)
         pairs = float((known * (links @ known)).sum())

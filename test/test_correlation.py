@@ -212,3 +212,41 @@ def test_few_poses_do_no_harm(count):
     priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
     result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
     assert result.noise.shared == ()
+
+
+def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
+    """Against the same traces of whole matrices."""
+    rng = np.random.default_rng(0)
+    count, width = 20, 4
+    parts = [rng.normal(size=(width + 1, 3, count)) for _ in range(2)]
+    parts[1][:, :, ::3] = 0.0  # every third stop without orientation
+    place = rng.normal(size=(count, 2))
+    units = correlation._Stops(parts, np.ones(count), place, np.arange(count, dtype=float))
+    forms = correlation._Forms(units, np.zeros((0, width)))
+    rows = np.concatenate([part.reshape(width + 1, -1).T for part in parts])
+    basis = np.linalg.qr(rows[:, :-1])[0]
+    measured = np.concatenate([part.any(axis=0).ravel() for part in parts])
+    left = np.diag(measured.astype(float)) - basis @ basis.T
+
+    def whole(part, matrix):
+        shares = np.zeros((2, 2))
+        shares[part, part] = 1.0
+        return np.kron(shares, np.kron(np.eye(3), matrix))
+
+    kernels = [('successive', 5.0), ('near', 0.3)]
+    cases = [(part, units.kernel(*kernel)) for part in (0, 1) for kernel in kernels]
+    for first in cases:
+        for second in cases:
+            expected = np.trace(whole(*first) @ left @ whole(*second) @ left)
+            found = forms._trace(forms._form(*first), forms._form(*second))
+            assert found == pytest.approx(expected, abs=1e-9)
+    links = units.links('successive')
+    dense = whole(1, links.toarray())
+    free = left[60:, 60:]
+    ratio = np.trace(dense @ left) / np.trace(free)
+    centred = dense @ left - ratio * whole(1, np.eye(count)) @ left
+    residual = left @ rows[:, -1]
+    excess = residual @ dense @ residual - ratio * (residual[60:] ** 2).sum()
+    excess *= np.trace(free) / (residual[60:] ** 2).sum()
+    expected = excess / np.sqrt(2.0 * np.trace(centred @ centred))
+    assert forms.test(1, links)[1] == pytest.approx(expected, rel=1e-9)
