@@ -131,7 +131,7 @@ class Frame:
         matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
         turn = np.array([offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]])
         if turn.any():
-            matrix[:3, :3] = se3.nearest_rotation(se3.exp_rotation(turn) @ matrix[:3, :3])
+            matrix[:3, :3] = se3.exp_rotation(turn) @ matrix[:3, :3]
         if 'delay' in offsets:
             return replace(self, matrix=matrix, delay=(self.delay or 0.0) + offsets['delay'])
         return replace(self, matrix=matrix)

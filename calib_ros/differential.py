@@ -22,9 +22,12 @@ Arrays are laid out (parameter, component, sample): each operation runs over man
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros import effects, se3
 from calib_ros.chain import ANGLES, DELAY, DH_KINDS, FRAME_KINDS, Chain
@@ -53,30 +56,13 @@ class ErrorModel:
         self.chain = chain
         self.names = tuple(names)
         self._ends = (base, tool)
-        rotates: dict[str, bool] = {}
-        for frame in chain.frame_names:
-            rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
-            rotates[f'{frame}.{DELAY}'] = True
-        for joint in chain.joints:
-            rotates |= {f'{joint.name}.{kind}': kind in ANGLES for kind in DH_KINDS}
-        self._effects = [name for name, _ in chain.effects if name in self.names]
-        self._driven: dict[str, list[str]] = {}
-        for name in self._effects:
-            joint_name = name.partition('.')[0]
-            joint = chain.joints[chain.joint_names.index(joint_name)]
-            rotates[name] = joint.type == 'revolute'
-            driven = f'{joint_name}.{"theta" if rotates[name] else "d"}'
-            self._driven.setdefault(driven, []).append(name)
+        joints = tuple((joint.name, joint.type) for joint in chain.joints)
+        fitted = tuple(name for name, _ in chain.effects if name in self.names)
+        self._layout = _layout(self.names, joints, chain.frame_names, fitted, self._ends)
         self._signs = {joint.name: joint.sign for joint in chain.joints}
-        for name in self.names:
-            if name not in rotates:
-                raise UnknownNameError('parameter', name, chain.parameter_names)
-        turning = [name for name in self.names if rotates[name]]
-        shifting = [name for name in self.names if not rotates[name]]
-        self.rotations = len(turning)
+        self.rotations = self._layout.rotations
         """Number of rotational parameters; they come first in the arrays of `linearise`."""
-        self._row = {name: row for row, name in enumerate(turning + shifting)}
-        self.order = np.array([self._row[name] for name in self.names], dtype=np.intp)
+        self.order = self._layout.order
         """Row of each named parameter in the arrays of `linearise`."""
 
     def linearise(
@@ -109,26 +95,19 @@ class ErrorModel:
             Derivative of the orientation as a rotation vector in the world. Likewise.
 
         """
-        samples, rotations, row = q.shape[1], self.rotations, self._row
+        samples, rotations, row = q.shape[1], self.rotations, self._layout.row
         shift = np.empty((len(row) + 1, 3, samples))
         turn = np.empty((rotations + 1, 3, samples))
         arm = np.empty((rotations, 3, samples))
-        for name in row:
-            frame = name.partition('.')[0]
-            if name.endswith(f'.{DELAY}') or (
-                frame in self.chain.frame_names and frame not in self._ends
-            ):
-                k = row[name]
-                (turn if k < rotations else shift)[k] = 0.0
-                if k < rotations:
-                    arm[k] = 0.0
-        phi = dict(
-            zip(
-                self._effects,
-                effects.basis(self.chain, self._effects, q, approach) if self._effects else (),
-                strict=True,
-            )
-        )
+        for k in self._layout.still:
+            (turn if k < rotations else shift)[k] = 0.0
+            if k < rotations:
+                arm[k] = 0.0
+        fitted = self._layout.effects
+        phi: dict[str, FloatArray] = {}
+        if fitted:
+            rows = effects.basis(self.chain, fitted, q, approach)
+            phi = dict(zip(fitted, rows, strict=True))
 
         late = None
         if velocity is not None and f'{self._ends[0]}.{DELAY}' in row:
@@ -145,7 +124,7 @@ class ErrorModel:
             k = row.get(name)
             if k is not None:
                 put(k, rotates, axis, point)
-            for effect in self._driven.get(name, ()):
+            for effect in self._layout.driven.get(name, ()):
                 sign = self._signs[effect.partition('.')[0]]
                 put(row[effect], rotates, axis * (sign * phi[effect]), point)
             if late is not None:
@@ -180,6 +159,59 @@ class ErrorModel:
         rotational = self.order < self.rotations
         full[:, 3:, rotational] = turn[self.order[rotational]].transpose(2, 1, 0)
         return full
+
+
+class _Layout(NamedTuple):
+    """Where the columns of parameters stand.
+
+    `row` of each parameter, rotations first, of which there are so many; `order` of the rows in
+    the order of the names; the `effects` among them, and which of them every joint's parameter
+    drives; `still` the rows of what does not move a target between these frames.
+    """
+
+    row: Mapping[str, int]
+    rotations: int
+    order: NDArray[np.intp]
+    effects: tuple[str, ...]
+    driven: Mapping[str, Sequence[str]]
+    still: tuple[int, ...]
+
+
+@lru_cache(maxsize=64)
+def _layout(
+    names: tuple[str, ...],
+    joints: tuple[tuple[str, str], ...],
+    frames: tuple[str, ...],
+    fitted: tuple[str, ...],
+    ends: tuple[str, str],
+) -> _Layout:
+    """Return the layout of named parameters of joints (name, type), frames and fitted effects."""
+    rotates: dict[str, bool] = {}
+    for frame in frames:
+        rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
+        rotates[f'{frame}.{DELAY}'] = True
+    for joint, _ in joints:
+        rotates |= {f'{joint}.{kind}': kind in ANGLES for kind in DH_KINDS}
+    driven: dict[str, list[str]] = {}
+    for name in fitted:
+        joint = name.partition('.')[0]
+        rotates[name] = dict(joints)[joint] == 'revolute'
+        driven.setdefault(f'{joint}.{"theta" if rotates[name] else "d"}', []).append(name)
+    for name in names:
+        if name not in rotates:
+            raise UnknownNameError('parameter', name, rotates)
+    turning = [name for name in names if rotates[name]]
+    shifting = [name for name in names if not rotates[name]]
+    row = {name: k for k, name in enumerate(turning + shifting)}
+    elsewhere = set(frames) - set(ends)
+    still = [
+        k
+        for name, k in row.items()
+        if name.endswith(f'.{DELAY}') or name.partition('.')[0] in elsewhere
+    ]
+    order = np.array([row[name] for name in names], dtype=np.intp)
+    order.setflags(write=False)
+    return _Layout(row, len(turning), order, fitted, driven, tuple(still))
 
 
 class _Twist:
