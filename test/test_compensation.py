@@ -106,16 +106,20 @@ def with_effects(chain, seed=0):
     return chain.with_effect_values(dict(zip(names, values, strict=True)))
 
 
+def true_arms(nominal):
+    """Return an arm with geometric errors, and one with other errors besides."""
+    rngs = map(np.random.default_rng, (1, 2))
+    geometric, other = (faulty(nominal, CELL, rng) for rng in rngs)
+    return geometric, with_effects(other)
+
+
 # Reaching the pose
 
 
 @pytest.mark.parametrize('name', SIX)
 def test_six_joints_reach_the_pose_exactly(name):
     nominal = ROBOTS[name]
-    for true in (
-        faulty(nominal, CELL, np.random.default_rng(1)),
-        with_effects(faulty(nominal, CELL, np.random.default_rng(2))),
-    ):
+    for true in true_arms(nominal):
         compensator = Compensator(nominal, true)
         q = regular(nominal, 300)
         result = compensate(compensator, q)
@@ -135,10 +139,7 @@ def test_six_joints_reach_the_pose_exactly(name):
 @pytest.mark.parametrize('name', REDUNDANT)
 def test_redundant_arms_reach_the_pose_by_the_least_change(name):
     nominal = ROBOTS[name]
-    for true in (
-        faulty(nominal, CELL, np.random.default_rng(1)),
-        with_effects(faulty(nominal, CELL, np.random.default_rng(2))),
-    ):
+    for true in true_arms(nominal):
         compensator = Compensator(nominal, true)
         q = regular(nominal, 200)
         result = compensate(compensator, q)
