@@ -43,8 +43,8 @@ def records(content: bytes, start: int = 0) -> Iterator[tuple[int, bytes]]:
         start += size
 
 
-def logged(chunk: bytes, channels: Mapping[int, Channel]) -> list[tuple[Channel, bytes]]:
-    """Return the messages on some channels of a chunk, in the order in which they were logged.
+def logged(chunk: bytes, channels: Mapping[int, Channel]) -> Iterator[tuple[Channel, bytes]]:
+    """Yield the messages on some channels of a chunk, in the order in which they were logged.
 
     Parameters
     ----------
@@ -56,7 +56,8 @@ def logged(chunk: bytes, channels: Mapping[int, Channel]) -> list[tuple[Channel,
     Raises
     ------
     ValueError
-        When it is damaged.
+        When the chunk does not have its size and checksum; when a record in it is damaged, after
+        the messages before it.
 
     """
     chunk = chunk[_HEAD.size :]
@@ -64,16 +65,21 @@ def logged(chunk: bytes, channels: Mapping[int, Channel]) -> list[tuple[Channel,
     content = _unpacked(chunk)
     if len(content) != size or checksum not in (0, zlib.crc32(content)):
         raise ValueError('a chunk does not have its size and checksum')
-    times, found = [], []
-    for kind, record in records(content):
-        if kind == MESSAGE:
-            key, _, time = _LOGGED.unpack_from(record)
-            if key in channels and begin <= time <= end:
-                times.append(time)
-                found.append((channels[key], record[MESSAGE_HEAD:]))
-    if times == sorted(times):
-        return found
-    return [found[k] for k in sorted(range(len(times)), key=times.__getitem__)]
+    times, found, problem = [], [], None
+    try:
+        for kind, record in records(content):
+            if kind == MESSAGE:
+                key, _, time = _LOGGED.unpack_from(record)
+                if key in channels and begin <= time <= end:
+                    times.append(time)
+                    found.append((channels[key], record[MESSAGE_HEAD:]))
+    except (EOFError, struct.error) as err:
+        problem = err
+    if times != sorted(times):
+        found = [found[k] for k in sorted(range(len(times)), key=times.__getitem__)]
+    yield from found
+    if problem is not None:
+        raise ValueError('a record in a chunk is damaged') from problem
 
 
 def string(record: bytes, start: int) -> str:

@@ -181,17 +181,24 @@ def _is_consecutive(storage: Any) -> bool:
 
 
 def _by_chunks(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-    """Yield the messages of an mcap file."""
+    """Yield the messages of an mcap file; what is wrong with a chunk is raised at the end."""
     channels = {
         each.id: streams[each.topic]
         for each in storage.connections
         if each.topic in streams and each.msgtype == streams[each.topic].type
     }
+    problem = None
     with storage.path.open('rb') as file:
         for chunk in storage.chunks:
-            if any(chunk.channel_count.get(key) for key in channels):
-                file.seek(chunk.chunk_start_offset)
+            if not any(chunk.channel_count.get(key) for key in channels):
+                continue
+            file.seek(chunk.chunk_start_offset)
+            try:
                 yield from logged(file.read(chunk.chunk_length), channels)
+            except Exception as err:  # see `replay`
+                problem = err
+    if problem is not None:
+        raise problem
 
 
 def _feed(
