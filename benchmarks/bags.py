@@ -128,7 +128,7 @@ class Nobody:
     settings = Settings()
     warnings = ()
 
-    def uneventful(self, readings):
+    def uneventful(self, readings, among):
         """Return that nothing ever happens."""
         return np.ones(len(readings.stamps_ns), dtype=bool)
 
@@ -147,37 +147,41 @@ def by_rosbags(path):
             STORE.deserialize_cdr(data, connection.msgtype)
 
 
-def shortest(work, times):
-    """Return the shortest CPU time of some work [s]."""
-    spent = []
-    for _ in range(times):
-        begin = time.process_time()
-        work()
-        spent.append(time.process_time() - begin)
-    return min(spent)
+def by_other(python, path):
+    """Return the CPU time per message [us] of mcap-ros2-support."""
+    (file,) = path.glob('*.mcap')
+    done = subprocess.run([python, '-c', OTHER, file], stdout=subprocess.PIPE, check=True)
+    return float(done.stdout)
 
 
-def measured(path, count, other, times):
-    """Return CPU times per message [us] of one bag."""
+def measured(path, large, count, other):
+    """Return CPU times per message [us] of one bag and of that with pictures.
+
+    The shortest of three times, all in turn, so that they share what else the machine does.
+    """
     sessions = []
 
     def whole():
         sessions.append(CalibrationSession(load_chain('ur10e')))
         replay(path, sessions[-1])
 
-    figures = {
-        'decoded': shortest(lambda: replay(path, Nobody()), times),
-        'replay': shortest(whole, times),
-        'rosbags': shortest(lambda: by_rosbags(path), 1),
+    def timed(work):
+        begin = time.process_time()
+        work()
+        return 1e6 * (time.process_time() - begin) / count
+
+    works = {
+        'decoded': lambda: timed(lambda: replay(path, Nobody())),
+        'replay': lambda: timed(whole),
+        'rosbags': lambda: timed(lambda: by_rosbags(path)),
+        'foreign': lambda: timed(lambda: replay(large, Nobody())),
     }
-    figures = {name: 1e6 * seconds / count for name, seconds in figures.items()}
+    if other and any(path.glob('*.mcap')):
+        works['mcap-ros2-support'] = lambda: by_other(other, path)
+    rounds = [{name: work() for name, work in works.items()} for _ in range(3)]
     account = sessions[-1].account()
     assert account.joint_states + account.poses == count, account
-    (file, *_) = [each for each in path.iterdir() if each.suffix in ('.mcap', '.db3')]
-    if other and file.suffix == '.mcap':
-        done = subprocess.run([other, '-c', OTHER, file], stdout=subprocess.PIPE, check=True)
-        figures['mcap-ros2-support'] = float(done.stdout)
-    return figures
+    return {name: min(each[name] for each in rounds) for name in works}
 
 
 def main():
@@ -196,14 +200,12 @@ def main():
         for k, (kind, how) in enumerate(BAGS.items()):
             path, large = Path(name) / f'{k}', Path(name) / f'{k}_large'
             write(path, content, *how)
-            figures = measured(path, len(content), other, 3)
-            figures['rosbags / decoded'] = figures['rosbags'] / figures['decoded']
-            if 'mcap-ros2-support' in figures:
-                ratio = figures['mcap-ros2-support'] / figures['decoded']
-                figures['mcap-ros2-support / decoded'] = ratio
             write(large, with_pictures(content), *how)
-            spent = shortest(lambda path=large: replay(path, Nobody()), 3) * 1e6 / len(content)
-            figures['foreign'] = spent / figures['decoded']
+            figures = measured(path, large, len(content), other)
+            for peer in ('rosbags', 'mcap-ros2-support'):
+                if peer in figures:
+                    figures[f'{peer} / decoded'] = figures[peer] / figures['decoded']
+            figures['foreign'] /= figures['decoded']
             found[kind] = figures
     if options.json:
         print(json.dumps({'machine': machine(), 'messages': len(content), 'bags': found}))

@@ -73,7 +73,7 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
     """
     first = blobs[0]
     length = len(first)
-    if first[:2] != LITTLE_ENDIAN or any(len(blob) != length for blob in blobs):
+    if first[:2] != LITTLE_ENDIAN or set(map(len, blobs)) != {length}:
         return None
     try:
         strings, begin, dtype, count = _layout(kind, first)

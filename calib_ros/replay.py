@@ -19,6 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
 from calib_ros.intake import Stream, feed
+from calib_ros.mcap import logged
 from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
@@ -145,11 +146,8 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
     with closing(reader):
         available = {c.topic: c.msgtype for c in reader.connections}
         topics = Topics.choose(available, session.settings)
-        connections = [c for c in reader.connections if c.topic in topics.types]
-        expected = sum(c.msgcount for c in connections)
-        streams = topics.streams
-        messages = ((streams[c.topic], data) for c, _, data in reader.messages(connections))
-        count, problem = _feed(session, messages)
+        expected = sum(c.msgcount for c in reader.connections if c.topic in topics.types)
+        count, problem = _feed(session, read(reader, topics.streams))
     if problem is not None and count == 0:
         found = salvage(path)
         if found is not None:
@@ -162,6 +160,47 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
     )
 
 
+def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+    """Return the messages of an open bag on some topics, in the order in which they were logged.
+
+    Those of mcap files come chunk by chunk where each chunk ends before the next begins. All
+    others come as the library merges them, which takes twice as long for mcap.
+    """
+    storages = getattr(reader.storage, 'storages', [reader.storage])
+    if reader.compression_mode != 'message' and all(map(_is_consecutive, storages)):
+        return itertools.chain.from_iterable(_by_chunks(each, streams) for each in storages)
+    connections = [c for c in reader.connections if c.topic in streams]
+    return ((streams[c.topic], data) for c, _, data in reader.messages(connections))
+
+
+def _is_consecutive(storage: Any) -> bool:
+    """Return whether a file has chunks, each of which ends before the next one begins."""
+    chunks = getattr(storage, 'chunks', ())
+    pairs = itertools.pairwise(chunks)
+    return bool(chunks) and all(a.message_end_time <= b.message_start_time for a, b in pairs)
+
+
+def _by_chunks(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+    """Yield the messages of an mcap file; what is wrong with a chunk is raised at the end."""
+    channels = {
+        each.id: streams[each.topic]
+        for each in storage.connections
+        if each.topic in streams and each.msgtype == streams[each.topic].type
+    }
+    problem = None
+    with storage.path.open('rb') as file:
+        for chunk in storage.chunks:
+            if not any(chunk.channel_count.get(key) for key in channels):
+                continue
+            file.seek(chunk.chunk_start_offset)
+            try:
+                yield from logged(file.read(chunk.chunk_length), channels)
+            except Exception as err:  # see `replay`
+                problem = err
+    if problem is not None:
+        raise problem
+
+
 def _feed(
     session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
 ) -> tuple[int, str | None]:
@@ -170,8 +209,7 @@ def _feed(
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
         try:
-            for each in itertools.islice(messages, BATCH):
-                batch.append(each)
+            batch.extend(itertools.islice(messages, BATCH))  # up to an error
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True

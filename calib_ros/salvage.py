@@ -8,16 +8,13 @@ their beginning up to the damage.
 
 from __future__ import annotations
 
-import importlib
 import re
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-MCAP_MAGIC = b'\x89MCAP0\r\n'
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+from calib_ros import mcap
 
 
 def recorded(path: Path) -> int | None:
@@ -74,58 +71,23 @@ def _read_sqlite3(file: Path, found: Salvage) -> None:
 
 def _read_mcap(file: Path, found: Salvage) -> None:
     content = file.read_bytes()
-    if not content.startswith(MCAP_MAGIC):
+    if not content.startswith(mcap.MAGIC):
         return
     schemas: dict[int, str] = {}
     channels: dict[int, str] = {}
     try:
-        for kind, record in _records(content, len(MCAP_MAGIC)):
-            if kind == _SCHEMA:
+        for kind, record in mcap.records(content, len(mcap.MAGIC)):
+            if kind == mcap.SCHEMA:
                 (key,) = struct.unpack_from('<H', record)
-                schemas[key] = _string(record, 2)
-            elif kind == _CHANNEL:
+                schemas[key] = mcap.string(record, 2)
+            elif kind == mcap.CHANNEL:
                 key, schema = struct.unpack_from('<HH', record)
-                channels[key] = _string(record, 4)
+                channels[key] = mcap.string(record, 4)
                 found.topics[channels[key]] = schemas[schema]
-            elif kind == _MESSAGE:
+            elif kind == mcap.MESSAGE:
                 (key,) = struct.unpack_from('<H', record)
-                found.messages.append((channels[key], record[22:]))
+                found.messages.append((channels[key], record[mcap.MESSAGE_HEAD :]))
+            elif kind == mcap.DATA_END:
+                break
     except Exception as err:  # decompressors have errors of their own
         found.problem = f'cut off or damaged: {err}'
-
-
-def _records(content: bytes, start: int) -> Iterator[tuple[int, bytes]]:
-    """Yield (kind, content) of the records of an mcap file, those inside chunks included."""
-    while start < len(content):
-        kind, size = struct.unpack_from('<BQ', content, start)
-        start += 9
-        if kind == _DATA_END:
-            return
-        record = content[start : start + size]
-        if kind == _CHUNK:
-            compression = _string(record, 28)
-            body = record[40 + len(compression) :]
-            yield from _records(_decompressor(compression)(body), 0)
-        elif len(record) == size:
-            yield kind, record
-        if len(record) < size:
-            raise EOFError(f'{size - len(record)} bytes are missing at the end')
-        start += size
-
-
-def _decompressor(name: str) -> Callable[[bytes], bytes]:
-    """Return what decompresses a chunk; the modules are those that rosbags brings."""
-    if not name:
-        return bytes
-    for module in {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd')}[name]:
-        try:
-            decompress: Callable[[bytes], bytes] = importlib.import_module(module).decompress
-        except ImportError:
-            continue
-        return decompress
-    raise OSError(f'no module to decompress {name}')
-
-
-def _string(record: bytes, start: int) -> str:
-    (size,) = struct.unpack_from('<I', record, start)
-    return record[start + 4 : start + 4 + size].decode()

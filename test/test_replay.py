@@ -12,8 +12,9 @@ from calib_ros import simulation
 from calib_ros.chain import Chain, Joint
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
+from calib_ros.intake import Stream
 from calib_ros.messages import DECODERS, JOINT_STATE
-from calib_ros.replay import STORAGES, Recording, replay, write_bag
+from calib_ros.replay import STORAGES, Recording, read, replay, write_bag
 from calib_ros.session import CalibrationSession
 
 MS = 1_000_000
@@ -628,6 +629,109 @@ def test_one_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
     assert session.account().samples >= 2
     assert len(warnings) == 1
     assert 'lost' in warnings[0]
+
+
+STREAMS = {
+    '/joint_states': Stream('/joint_states', JOINT_STATE),
+    '/pose': Stream('/pose', 'geometry_msgs/msg/PoseStamped'),
+}
+COMPRESSIONS = [
+    *((storage, mode) for storage in sorted(STORAGES) for mode in ('none', 'message', 'file')),
+    ('mcap', 'storage'),
+]
+LOG_TIMES = {
+    'in order': lambda k, rng: k,
+    'of a coarse clock': lambda k, rng: k // 40,
+    'not in order within a chunk': lambda k, rng: k - (k - 1) % 5 + rng.integers(5),
+    'not in order among chunks': lambda k, rng: rng.integers(300),
+}
+
+
+def record_in_chunks(path, storage, mode='none', log_time=LOG_TIMES['in order']):
+    """Write 300 messages in some chunks of 1 MB, filled with long texts that nobody wants."""
+    rng = np.random.default_rng(7)
+    writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
+    if mode != 'none':
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    types = {each.topic: each.type for each in STREAMS.values()} | {'/x': 'std_msgs/msg/String'}
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
+            for topic, kind in types.items()
+        }
+        for k in range(300):
+            topic, message = '/joint_states', joint_state((k + 1) * 10 * MS, rng.normal(size=3))
+            if k % 3 == 1:
+                topic, message = '/pose', pose_stamped((k + 1) * 10 * MS, rng.normal(size=3))
+            elif k % 10 == 0:
+                topic, message = '/x', text_message(rng.bytes(200_000).hex())
+            data = TYPESTORE.serialize_cdr(message, types[topic])
+            writer.write(connections[topic], 10 + int(log_time(k, rng)), data)
+    return path
+
+
+@pytest.mark.parametrize('log_times', LOG_TIMES)
+@pytest.mark.parametrize(('storage', 'mode'), COMPRESSIONS)
+def test_messages_are_those_of_the_library_in_its_order(tmp_path, storage, mode, log_times):
+    path = record_in_chunks(tmp_path / 'bag', storage, mode, LOG_TIMES[log_times])
+    with Reader(path) as reader:
+        connections = [each for each in reader.connections if each.topic in STREAMS]
+        expected = [(STREAMS[c.topic], bytes(data)) for c, _, data in reader.messages(connections)]
+        assert list(read(reader, STREAMS)) == expected
+    assert len(expected) == 280
+
+
+@pytest.mark.parametrize('log_times', LOG_TIMES)
+def test_chunks_are_merged_only_where_they_overlap(tmp_path, monkeypatch, log_times):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap', log_time=LOG_TIMES[log_times])
+    merged = []
+    monkeypatch.setattr(Reader, 'messages', lambda *_: merged.append(True) or iter(()))
+    with Reader(path) as reader:
+        found = list(read(reader, STREAMS))
+    assert len(found) == (280 if not merged else 0)
+    assert bool(merged) == (log_times == 'not in order among chunks')
+
+
+def test_the_files_of_a_split_bag_are_read_one_after_the_other(tmp_path):
+    path, other = (record_in_chunks(tmp_path / name, 'mcap') for name in ('bag', 'other'))
+    (other / 'other.mcap').rename(path / 'a.mcap')
+    metadata = (path / 'metadata.yaml').read_text()
+    (path / 'metadata.yaml').write_text(
+        metadata.replace('  - bag.mcap', '  - bag.mcap\n  - a.mcap')
+    )
+    with Reader(path) as reader:
+        connections = [each for each in reader.connections if each.topic in STREAMS]
+        expected = [(STREAMS[c.topic], bytes(data)) for c, _, data in reader.messages(connections)]
+        assert list(read(reader, STREAMS)) == expected
+    assert len(expected) == 560
+
+
+@pytest.mark.parametrize('kind', ['std_msgs/msg/String', 'geometry_msgs/msg/PointStamped'])
+def test_a_channel_of_another_type_is_not_read(tmp_path, kind):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    with Reader(path) as reader:
+        found = list(read(reader, {'/pose': Stream('/pose', kind)}))
+    assert found == []
+
+
+@pytest.mark.parametrize('damaged', [0, 5])
+def test_a_damaged_chunk_costs_its_messages_only(tmp_path, damaged):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    with Reader(path) as reader:
+        chunks = list(reader.storage.storages[0].chunks)
+        wanted = [each.id for each in reader.connections if each.topic in STREAMS]
+    assert len(chunks) > 6
+    lost = sum(chunks[damaged].channel_count.get(key, 0) for key in wanted)
+    file = damage(path)
+    content = bytearray(file.read_bytes())
+    place = chunks[damaged].chunk_start_offset + 33
+    content[place : place + 4] = b'\1\2\3\4'  # not its checksum
+    file.write_bytes(bytes(content))
+    session, (warning,) = session_of(path)
+    account = session.account()
+    assert 10 < lost < 100
+    assert account.joint_states + account.poses == 280 - lost
+    assert f'{lost} of 280 messages are lost' in warning
 
 
 def test_messages_are_read_by_their_attributes_only():
