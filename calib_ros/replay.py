@@ -8,13 +8,13 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
@@ -32,7 +32,6 @@ BATCH = 2000
 """Messages that are decoded at once."""
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
-_TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 @dataclass(frozen=True)
@@ -201,6 +200,18 @@ def _by_chunks(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[St
         raise problem
 
 
+@cache
+def _typestore() -> Any:
+    """Return the library's message types, which take a tenth of a second that few bags need."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def _deserialised(data: bytes, kind: str) -> Any:
+    return _typestore().deserialize_cdr(data, kind)
+
+
 def _feed(
     session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
 ) -> tuple[int, str | None]:
@@ -213,7 +224,7 @@ def _feed(
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        problems = feed(session, batch, _TYPESTORE.deserialize_cdr)
+        problems = feed(session, batch, _deserialised)
         count += len(batch) - len(problems)
         problem = (problem, *problems)[-1]
     session.finish()
@@ -264,7 +275,8 @@ def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
     """
     if path.exists():
         raise InputError(f'{path} exists already: remove it or choose another name')
-    types = _TYPESTORE.types
+    store = _typestore()
+    types = store.types
     time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
     joint_state, poses = types[JOINT_STATE], recording.poses
     oriented = bool(poses.oriented.all())
@@ -288,11 +300,9 @@ def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
     stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
     names = list(recording.joint_names)
     with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
-        joint_connection = writer.add_connection(
-            '/joint_states', JOINT_STATE, typestore=_TYPESTORE
-        )
+        joint_connection = writer.add_connection('/joint_states', JOINT_STATE, typestore=store)
         pose_connections = [
-            writer.add_connection(f'/{prefix}{noun}', kind, typestore=_TYPESTORE)
+            writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)
             for prefix in ('measured_', VALIDATION)[: 1 + int(recording.held_out.any())]
         ]
         for k in np.argsort(stamps, kind='stable').tolist():
@@ -300,9 +310,9 @@ def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
             if k < len(recording.joints):
                 values = np.ascontiguousarray(recording.joints[k])
                 message = joint_state(head(stamp_ns, ''), names, values, none, none)
-                data = _TYPESTORE.serialize_cdr(message, JOINT_STATE)
+                data = store.serialize_cdr(message, JOINT_STATE)
                 writer.write(joint_connection, stamp_ns, data)
                 continue
             k -= len(recording.joints)
-            data = _TYPESTORE.serialize_cdr(measured(k, stamp_ns), kind)
+            data = store.serialize_cdr(measured(k, stamp_ns), kind)
             writer.write(pose_connections[int(recording.held_out[k])], stamp_ns, data)
