@@ -213,6 +213,8 @@ class CalibrationNode(Node):
         self._heard: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
         self._status_text = ''
+        self._failed: dict[str, str] = {}  # parts of the last second, and how
+        self._logged: dict[str, str] = {}
         self._posed: tuple[int, Sequence[float]] | None = None
         self._inputs: dict[Subscription, tuple[Stream, Hearing]] = {}
         self._sources = parse_sources(settings.sources) or STANDARD
@@ -593,29 +595,54 @@ class CalibrationNode(Node):
         )
 
     def _on_second(self) -> None:
-        self._take_messages()
-        self._archive.write()
+        """Do what is due once a second; a part that fails does not keep the others from it."""
+        self._failed = {}
+        self._tried('taking messages', self._take_messages)
+        self._tried('the journal', self._archive.write)
+        status = self._tried('the status', self._publish_status) or ''
+        self._tried('the next pose', self._guide.advise)
+        self._tried('the rates', self._look)
+        account = self._tried('the account', self.session.account)
+        level, words, figures = DiagnosticStatus.OK, '', {}
+        if account is not None:
+            judged = self._tried('judging', lambda: self._judged(account))
+            level, words = judged or (level, words)
+            figures = self._tried('the figures', lambda: self._figures(account)) or {}
+        if self._failed:
+            level = DiagnosticStatus.ERROR
+            words = ''.join(f'{text}; ' for text in self._failed.values()) + words
+        name = f'{self.get_fully_qualified_name().lstrip("/")}: calibration'
+        message = DiagnosticArray(
+            status=[outgoing.status(name, self._serial, level, f'{words}{status}', figures)]
+        )
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def _tried(self, what: str, work: Callable[[], Any]) -> Any:
+        """Return what work returns; None when it fails, which the log and `_failed` tell then."""
+        try:
+            return work()
+        except Exception as err:
+            self._failed[what] = f'{what} failed: {err!r}'
+            if self._logged.get(what) != str(err):  # not every second
+                self._logged[what] = str(err)
+                self.get_logger().error(f'internal error: {traceback.format_exc()}')
+            return None
+
+    def _publish_status(self) -> str:
+        """Return the status, which is published when it has changed."""
         text = self.session.status()
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
-        self._guide.advise()
+        return text
+
+    def _look(self) -> None:
+        """Note the rates at which messages come."""
         now = time.monotonic()
         span, self._looked_at = now - self._looked_at, now
         for heard in self._heard.values():
             heard.look(now, span)
-        account = self.session.account()
-        name = f'{self.get_fully_qualified_name().lstrip("/")}: calibration'
-        level, words = self._judged(account)
-        message = DiagnosticArray(
-            status=[
-                outgoing.status(
-                    name, self._serial, level, f'{words}{text}', self._figures(account)
-                )
-            ]
-        )
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
 
     def _judged(self, account: Account) -> tuple[bytes, str]:
         """Return how grave what is wrong is, and what it is in words."""
