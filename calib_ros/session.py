@@ -39,6 +39,10 @@ LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
 SILENT_NS = 5_000_000_000
 """Time after which joints of which nothing is heard, while others are, count as silent."""
+EARLY = 0.03
+"""Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
+delay. Of what then shows the arm leaving, most is left out as spikes; the rest moves the mean by
+less than the noise of a measurement."""
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
 
@@ -417,10 +421,11 @@ class CalibrationSession:
         if self.delay is None or self.settings.mode == 'continuous':
             return ()  # there it is a parameter of the fit
         left = self.delay.seconds - self.settings.delay
-        if abs(left) <= self.settings.settle:
-            return ()
+        if -EARLY <= left <= self.settings.settle:
+            return ()  # no stop is spoilt by it
+        words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
         return (
-            f'measurements are stamped {left:.3f} s later than the joint states of their time: '
+            f'measurements are stamped {words} than the joint states of their time: '
             f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
         )
 
