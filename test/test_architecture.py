@@ -32,12 +32,12 @@ ORDER = [
     {'planning', 'plots', 'session', 'testposes'},
     {'intake', 'report'},
     {'replay'},
-    {'deferred', 'options', 'outgoing'},
-    {'commands', 'guide'},
+    {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
+    {'commands', 'diagnostics', 'guide'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'guide', 'outgoing'}
+ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'outgoing', 'parameters'}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,

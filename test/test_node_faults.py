@@ -32,12 +32,13 @@ from ros_cell import (
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from calib_ros import inputs as inputs_module
 from calib_ros import node as node_module
 from calib_ros.archive import Archive
 from calib_ros.config import load_chain
+from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import ConfigError
 from calib_ros.guide import Guide
-from calib_ros.node import CalibrationNode
 from calib_ros.session import CalibrationSession
 from calib_ros.tables import read_journal
 
@@ -274,7 +275,7 @@ BROKEN = {
     'the status': (CalibrationSession, 'status'),
     'the next pose': (Guide, 'advise'),
     'the account': (CalibrationSession, 'account'),
-    'judging': (CalibrationNode, '_judged'),
+    'judging': (Diagnostics, '_judged'),
     'the figures': (Guide, 'figures'),
 }
 
@@ -312,7 +313,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
 
 
 def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
-    monkeypatch.setattr(node_module, 'SILENCE', 0.4)
+    monkeypatch.setattr(inputs_module, 'SILENCE', 0.4)
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     joints, poses = topics(recording).values()
     arm = cell.publisher(JointState, 'joint_states')
