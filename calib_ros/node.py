@@ -22,7 +22,6 @@ from typing import Any, NamedTuple
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import rclpy
-from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import RCLError  # has no public name in Jazzy
 from rclpy.clock import Clock, ClockType
@@ -32,21 +31,19 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros import outgoing, report
 from calib_ros.archive import Archive
-from calib_ros.chain import Chain
-from calib_ros.config import calibration_record, parse_calibration, read_text
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.diagnostics import Diagnostics
-from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.export import exports
+from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.guide import Guide
 from calib_ros.inputs import Inputs, deserialised
 from calib_ros.intake import Stream, feed
+from calib_ros.keeper import Exportable, Keeper, Published
 from calib_ros.messages import JOINT_STATE
 from calib_ros.parameters import changed, declare_all, load_robot
 from calib_ros.problem import Problem
@@ -54,7 +51,6 @@ from calib_ros.samples import Sample
 from calib_ros.selection import identify_model
 from calib_ros.session import CalibrationSession, check_settings
 from calib_ros.sources import STANDARD, parse_sources
-from calib_ros.urdf import corrected_urdf
 from calib_ros.waypoints import read_joints
 
 try:
@@ -79,13 +75,6 @@ class Snapshot(NamedTuple):
     configuration: str
 
 
-class Published(NamedTuple):
-    """A calibration as the text of a file, and by which configuration it was made, if known."""
-
-    text: str
-    configuration: str
-
-
 class CalibrationNode(Node):
     """Calibrates one robot from its joint states and measurements."""
 
@@ -93,7 +82,7 @@ class CalibrationNode(Node):
         super().__init__('calibration_node', **node_options)
         given = declare_all(self)
         home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
-        chain, self._urdf = load_robot(self, given)
+        chain, urdf = load_robot(self, given)
         self._given = given
         self._archive = Archive(
             given.data_dir or home / 'calib_ros',
@@ -104,10 +93,7 @@ class CalibrationNode(Node):
         self.session = CalibrationSession(chain, given.settings, self._on_sample)
         self._last = 'nothing identified yet'
         self._observability = ''
-        self._published = Published('', '')
-        self._publishing = threading.Lock()
         self._status_text = ''
-        self._posed: tuple[int, Sequence[float]] | None = None
         streams = self._streams()
         if given.resume:
             self._resume()
@@ -119,11 +105,9 @@ class CalibrationNode(Node):
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
-        self._dh_parameters = self.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
-        self._calibration = self.create_publisher(String, '~/calibration', latched)
+        self._keeper = Keeper(self, self.session, self._archive, given, urdf, latched)
         self._status = self.create_publisher(String, '~/status', latched)
         self._residuals = self.create_publisher(MarkerArray, '~/residuals', latched)
-        self._corrected_pose = self.create_publisher(PoseStamped, '~/corrected_pose', 10)
         self._diagnostics = Diagnostics(
             self, self.session, self._archive, self._inputs, given.serial, self._answers
         )
@@ -138,7 +122,7 @@ class CalibrationNode(Node):
             self, '~/identify', self._answer, self._snapshot, self._run
         )
         self._export = DeferredTrigger(
-            self, '~/export', self._answer, self._to_export, self._write_exports
+            self, '~/export', self._answer, self._to_export, self._keeper.export
         )
         for kind, name, callback in (
             (Trigger, '~/capture', self._on_capture),
@@ -272,9 +256,7 @@ class CalibrationNode(Node):
         )
         if result.accepted:
             text = report.calibration_yaml(result, given.origin)
-            with self._publishing:
-                self.session.adopt(result, given.samples)
-                self._publish_calibration(result.chain, Published(text, given.configuration))
+            self._keeper.adopt(result, given.samples, Published(text, given.configuration))
             self._guide.show(result)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
@@ -309,74 +291,21 @@ class CalibrationNode(Node):
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
     def _on_save(self, request: Any) -> tuple[bool, str]:
-        if not self._published.text:
-            return False, 'there is no accepted calibration to save: call ~/identify first'
-        target = self.get_parameter('target_filename').value
-        path = self._archive.save(*self._published, Path(target).expanduser() if target else None)
-        return True, f'saved to {path}'
-
-    def _to_export(self) -> tuple[Chain, str, Any]:
-        """Return the calibrated chain, its text, and the joint values (N, n) of the samples."""
-        self._take_messages()
-        if self.session.calibration is None:
-            raise InputError('there is no calibration to export: call ~/identify or ~/load first')
-        joints = [sample.joints for sample in self.session.samples]
-        with self._publishing:
-            return self.session.calibration.chain, self._published.text, joints or None
-
-    def _write_exports(self, given: tuple[Chain, str, Any]) -> tuple[bool, str]:
-        """Write a calibration in all forms, on a thread of its own."""
-        chain, text, joints = given
-        found = exports(chain, self.session.chain, joints, calibration_record(text))
-        files = {each.name: each.content for each in found}
-        if self._urdf:
-            files['corrected.urdf'] = corrected_urdf(self._urdf, chain, **self._given.links)
-        return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
+        return True, f'saved to {self._keeper.save()}'
 
     def _on_load(self, request: Any) -> tuple[bool, str]:
-        name = self.get_parameter('calibration_filename').value
-        path = Path(name).expanduser() if name else self._archive.newest_calibration()
-        if path is None:
-            raise InputError(
-                f'there is no saved calibration of {self.session.chain.name} in '
-                f'{self._archive.folder}: set calibration_filename'
-            )
-        text = read_text(path)
-        chain, record = parse_calibration(
-            text, str(path), self.session.chain, self.session.settings
-        )
-        serial, ours = record.get('robot_serial'), self._given.serial
-        if serial and ours and serial != ours:
-            raise InputError(
-                f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
-            )
-        with self._publishing:
-            self.session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
-            self._publish_calibration(chain, Published(text, ''))
-        self._last = f'loaded {path}'
+        self._last = f'loaded {self._keeper.load()}'
         return True, self._last
+
+    def _to_export(self) -> Exportable:
+        self._take_messages()
+        return self._keeper.exportable()
 
     # Topics out
 
-    def _publish_calibration(self, chain: Chain, published: Published) -> None:
-        self._published = published
-        self._dh_parameters.publish(outgoing.dh_parameters(chain))
-        self._calibration.publish(String(data=published.text))
-
     def _on_tick(self) -> None:
         self._take_messages()
-        self._publish_corrected_pose()
-
-    def _publish_corrected_pose(self) -> None:
-        calibration = self.session.calibration
-        latest = self.session.latest
-        if calibration is None or latest is None or latest is self._posed:
-            return
-        self._posed = latest
-        stamp_ns, values = latest
-        self._corrected_pose.publish(
-            outgoing.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
-        )
+        self._keeper.publish_pose()
 
     def _on_second(self) -> None:
         """Do what is due once a second; a part that fails does not keep the others from it."""

@@ -33,11 +33,11 @@ ORDER = [
     {'intake', 'report'},
     {'replay'},
     {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
-    {'commands', 'diagnostics', 'guide'},
+    {'commands', 'diagnostics', 'guide', 'keeper'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'outgoing', 'parameters'}
+ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'keeper', 'outgoing', 'parameters'}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,
