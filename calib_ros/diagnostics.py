@@ -12,9 +12,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 
 from calib_ros import outgoing
+from calib_ros.account import Account
 from calib_ros.archive import Archive
 from calib_ros.inputs import Inputs
-from calib_ros.session import Account, CalibrationSession
+from calib_ros.session import CalibrationSession
 
 
 class Diagnostics:
