@@ -104,7 +104,7 @@ class LiveEstimate:
         self._names: tuple[str, ...] = ()
         self._chain: Chain | None = None
         self._added: list[Sample] = []
-        self._begun = 0  # with how many samples
+        self._begun = 0  # how many samples there were then
         self._seen = 0
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
@@ -128,6 +128,7 @@ class LiveEstimate:
             if _distinct(first) < START or not self._begin(first):
                 return None
             chosen = set(first)
+            self._begun = len(fitted)
             self._seen = len(samples)
             self._pending = [sample for sample in fitted if sample not in chosen]
         elif fresh:
@@ -170,7 +171,6 @@ class LiveEstimate:
         robust = thorough_fit(chain, self._names, system, loss)
         members = [sample for group, _ in groups for sample in group]
         judged = list(zip(members, robust.outliers.tolist(), strict=True))
-        self._begun = len(fitted)
         self._added = [sample for sample, gross in judged if not gross]
         self._linearise(robust.fit.chain)
         self._add([sample for sample, gross in judged if gross])

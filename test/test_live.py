@@ -114,6 +114,15 @@ def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
     assert apart(said[-1].chain, live.update(samples).chain, rng) < 0.1 * NOISE[0]
 
 
+def test_what_it_does_not_begin_with_is_taken_next(rng, monkeypatch):
+    """Of many samples of one target and few of another it begins with a part of the many."""
+    monkeypatch.setattr(live_module, 'MOST_ANEW', 60)
+    true = faulty(UR10E, Cell(), rng)
+    samples = seen(true, 50, rng) + seen(true, 8, rng, start=100, target='other')
+    live = LiveEstimate(session().problem_of)
+    assert [live.update(samples).samples for _ in range(3)] == [31 + 8, 58, 58]
+
+
 @pytest.mark.parametrize('oriented', [True, False])
 def test_a_sample_of_gross_error_is_flagged_and_left_out(oriented, rng):
     true = faulty(UR10E, Cell(), rng)
