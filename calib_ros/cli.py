@@ -190,6 +190,7 @@ def _identify(options: argparse.Namespace) -> int:
             table.held_out,
             more=table.fitted[1:],
             separations=tuple((*pair, sockets) for pair in table.pairs),
+            world_frame=table.world_frame,
             **settings.for_problem(),
         )
         result = identify_model(problem, settings.model)

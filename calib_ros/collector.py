@@ -34,8 +34,11 @@ ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
 JUMP = 20
 """So many joint samples in succession from before the buffer mean that the clock jumped back."""
+MOST_STREAMS = 50
+"""Streams of measurements that are told apart: a tracker may number its markers without end."""
 _DISTANCE, _POSITION, _QUAT, _COVARIANCE = slice(0, 1), slice(0, 3), slice(3, 7), slice(7, 43)
 _WIDTH = 43
+TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
 _ONE = np.ones(1, dtype=bool)
 _FOREVER = np.iinfo(np.int64).max
 
@@ -172,6 +175,9 @@ class Collector:
     def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray) -> None:
         """Take measurements with nothing eventful between them: numbers (M, w) at stamps (M,)."""
         rows = self._stream(key)
+        if rows is None:
+            self.dropped[TOO_MANY] += len(stamps)
+            return
         due = np.flatnonzero(stamps - self.delay_ns > self._settled_ns)
         taken = due[: rows.capacity - rows.count]
         if len(due) < len(stamps):
@@ -180,15 +186,30 @@ class Collector:
             self.dropped['poses: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
 
-    def _stream(self, key: StreamKey) -> Rows:
+    def _stream(self, key: StreamKey) -> Rows | None:
+        """Return the buffer of a stream; None when too many others are in use."""
         rows = self._waiting.get(key)
         if rows is None:
+            if len(self._waiting) >= MOST_STREAMS:
+                self._forget_idle()
+            if len(self._waiting) >= MOST_STREAMS:
+                return None
             rows = self._waiting[key] = Rows(_WIDTH, self.settings.pose_buffer)
         return rows
+
+    def _forget_idle(self) -> None:
+        """Forget the streams of which nothing waits and no sample was made."""
+        for key in [key for key, rows in self._waiting.items() if not rows.count]:
+            if not self._taken.get(key):
+                del self._waiting[key]
+                self._taken.pop(key, None)
 
     def add(self, key: StreamKey, reading: Reading) -> None:
         """Take a measurement."""
         rows = self._stream(key)
+        if rows is None:
+            self.dropped[TOO_MANY] += 1
+            return
         if reading.stamp_ns - self.delay_ns <= self._settled_ns:
             self.dropped['poses: later than lateness allows'] += 1
             return

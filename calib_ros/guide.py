@@ -26,6 +26,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros import outgoing
+from calib_ros.calibration import Calibration
 from calib_ros.candidates import draw_candidates
 from calib_ros.compensation import Compensator, compensate_program, in_words
 from calib_ros.design import Design
@@ -38,7 +39,7 @@ from calib_ros.problem import Problem
 from calib_ros.programs import RATES, trajectory_program
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
-from calib_ros.session import Calibration, CalibrationSession
+from calib_ros.session import CalibrationSession
 from calib_ros.workspace import CalibratedArm, survey
 
 CANDIDATES = 300

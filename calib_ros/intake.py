@@ -120,9 +120,8 @@ def _decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
 
 def _keep(session: CalibrationSession, groups: Sequence[Group]) -> None:
     joints, measured = [], []
-    for group in groups:
-        if not len(group.places):
-            continue
+    present = [group for group in groups if len(group.places)]
+    for group in sorted(present, key=lambda group: int(group.places[0])):  # who comes first counts
         if isinstance(group.readings, JointReadings):
             joints.append((group.places, group.readings))
         elif group.stream.source is not None:

@@ -7,6 +7,11 @@ matrix and vector, so the estimate and its covariance follow each sample at the 
 alone (an information filter; Maybeck 1979). The point of linearisation moves to the estimate when
 that has gone further than the linear model holds. Wide priors stand for what no sample has told
 yet; at the end they weigh nothing, and the estimate is that of the batch.
+
+A sample that lies too far from where the others predict it is left out as suspicious. The first
+ones cannot be judged so, because the estimate bends to them. So it begins anew, from the nominal
+chain and by the robust fit of the identification (`robust.py`), each time the number of samples
+has grown by a fifth: an early gross error is found, and what was left out wrongly comes back.
 """
 
 from __future__ import annotations
@@ -30,8 +35,9 @@ from calib_ros.leastsquares import (
     normal_equations,
     residual_arrays,
 )
-from calib_ros.observations import configurations
+from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
+from calib_ros.robust import thorough_fit
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
 
@@ -44,6 +50,8 @@ START = 6
 """Configurations with which the frames can be found."""
 MOST_ANEW = 500
 """Samples up to which the linear model is made anew, and with which it begins at most."""
+GROWN = 1.2
+"""Growth of the number of samples from which all of them are judged anew."""
 MOST_AT_ONCE = 2000
 """Samples that one update adds at most; the rest waits for the next ones."""
 FAR_OFF = 7.0
@@ -96,6 +104,7 @@ class LiveEstimate:
         self._names: tuple[str, ...] = ()
         self._chain: Chain | None = None
         self._added: list[Sample] = []
+        self._begun = 0  # how many samples there were then
         self._seen = 0
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
@@ -113,30 +122,37 @@ class LiveEstimate:
         self._pending += [each for each in samples[self._seen :] if not each.validation]
         self._seen = len(samples)
         fresh = self._pending[:MOST_AT_ONCE]
-        if self._chain is None or any(not self._knows(sample) for sample in fresh):
+        if self._outgrown(fresh) or any(not self._knows(sample) for sample in fresh):
             fitted = [sample for sample in samples if not sample.validation]
             first = _spread(fitted)
             if _distinct(first) < START or not self._begin(first):
                 return None
             chosen = set(first)
+            self._begun = len(fitted)
             self._seen = len(samples)
             self._pending = [sample for sample in fitted if sample not in chosen]
         elif fresh:
             del self._pending[: len(fresh)]
             self._add(fresh)
-            for _ in range(MOST_STEPS):
-                if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
-                    break
-                self._linearise(self._estimate())
+            self._settle()
         self._latest = self._result()
         return self._latest
+
+    def _outgrown(self, fresh: Sequence[Sample]) -> bool:
+        """Tell whether it is time to begin, or to begin anew."""
+        count = len(self._added) + len(self.suspicious) + len(fresh)
+        return self._chain is None or GROWN * self._begun < count <= MOST_ANEW
 
     def _knows(self, sample: Sample) -> bool:
         assert self._chain is not None
         return set(self._frames.of(sample)) <= set(self._chain.frame_names)
 
     def _begin(self, fitted: Sequence[Sample]) -> bool:
-        """Choose the parameters, and a first chain with frames near the samples."""
+        """Choose the parameters, and fit them to the samples but those of gross error.
+
+        What the robust fit leaves out comes back where the others predict it within the sigmas
+        given.
+        """
         self.restart()
         problem = self._problem_of(fitted)
         model = problem.model
@@ -149,13 +165,24 @@ class LiveEstimate:
         wide = {name: _wide(name) for name in self._names if not model.owns_frame(name)}
         self._prior = Prior(model, {**wide, **problem.prior_sigmas})
         self._joints = chain.random_joints(LOOK, np.random.default_rng(0))
-        self._added = list(fitted)
-        for _ in range(MOST_STEPS):
-            self._linearise(chain)
-            chain = self._estimate()
-            if np.abs(self._step()).max() < FAR:
-                break
+        groups = self._groups(fitted)
+        system = self._system(groups, self._prior)
+        loss = 'redescending' if self._enough(system.rows) else 'none'
+        robust = thorough_fit(chain, self._names, system, loss)
+        members = [sample for group, _ in groups for sample in group]
+        judged = list(zip(members, robust.outliers.tolist(), strict=True))
+        self._added = [sample for sample, gross in judged if not gross]
+        self._linearise(robust.fit.chain)
+        self._add([sample for sample, gross in judged if gross])
+        self._settle()
         return True
+
+    def _settle(self) -> None:
+        """Move the point of linearisation to the estimate while that is far from it."""
+        for _ in range(MOST_STEPS):
+            if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
+                break
+            self._linearise(self._estimate())
 
     def _linearise(self, chain: Chain) -> None:
         """Begin the information anew at a chain, with the samples taken so far."""
@@ -170,10 +197,9 @@ class LiveEstimate:
     def _add(self, samples: Sequence[Sample], gate: bool = True) -> None:
         """Add the information of samples."""
         assert self._chain is not None
-        if gate and self._rows > 2 * len(self._names):
+        if gate and self._enough(self._rows):
             samples = self._plausible(samples)
-        sets, _ = collect(samples, self._sigmas, self._frames)
-        system = System(tuple(Samples(each, *self._sigmas) for each in sets))
+        system = self._system(self._groups(samples))
         normal = normal_equations(self._chain, self._names, system)
         self._information = self._information + normal.matrix
         self._vector = self._vector + normal.gradient
@@ -181,19 +207,35 @@ class LiveEstimate:
         self._rows += system.rows
         self._added += samples
 
+    def _enough(self, rows: int) -> bool:
+        """Tell whether there are equations enough to know a gross error by."""
+        return rows > 2 * len(self._names)
+
+    def _groups(self, samples: Sequence[Sample]) -> list[tuple[list[Sample], Observations]]:
+        """Return samples of one kind between the same frames, and the same as observations."""
+        groups: dict[tuple[Any, ...], list[Sample]] = {}
+        for sample in samples:
+            key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
+            groups.setdefault(key, []).append(sample)
+        found = []
+        for members in groups.values():
+            ((observations,), _) = collect(members, self._sigmas, self._frames)
+            found.append((members, observations))
+        return found
+
+    def _system(
+        self, groups: Sequence[tuple[list[Sample], Observations]], prior: Prior | None = None
+    ) -> System:
+        return System(tuple(Samples(each, *self._sigmas) for _, each in groups), prior)
+
     def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
         """Return the samples that lie where the others predict them."""
         chain = self._estimate()
         covariance, noise = self._uncertainty()
         # Samples of one place may agree better than the model does elsewhere.
         covariance, noise = covariance * max(1.0 / noise, 1.0), max(noise, 1.0)
-        groups: dict[tuple[Any, ...], list[Sample]] = {}
-        for sample in samples:
-            key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
-            groups.setdefault(key, []).append(sample)
         good: list[Sample] = []
-        for members in groups.values():
-            ((some,), _) = collect(members, self._sigmas, self._frames)
+        for members, some in self._groups(samples):
             left = residual_arrays(chain, some)[0]
             model = ErrorModel(chain, self._names, some.base, some.tool)
             jacobian = model.jacobian(some.joints, some.approach, some.velocity)[:, :3]

@@ -7,14 +7,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
-from operator import itemgetter
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros import messages
+from calib_ros.account import Account
+from calib_ros.calibration import Calibration
 from calib_ros.chain import Chain
 from calib_ros.collector import Collector, StreamKey
 from calib_ros.config import Settings
@@ -22,86 +23,26 @@ from calib_ros.delays import Delay, Watch
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
 from calib_ros.live import Estimate, LiveEstimate, barely_moved
+from calib_ros.names import FrameNames, JointNames
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
-from calib_ros.samples import Frames, Sample, collect
+from calib_ros.samples import Sample, collect
 from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.sources import Source
 from calib_ros.track import Stamps
-from calib_ros.validation import ErrorFigures, compare
+from calib_ros.validation import ErrorFigures
 
-Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
 Positions: TypeAlias = NDArray[np.intp]
-Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
 SILENT_NS = 5_000_000_000
 """Time after which joints of which nothing is heard, while others are, count as silent."""
-MOST_NAMES = 50
-"""Frames of measurements, and sets of joint names, that are told apart."""
-
-
-@dataclass(frozen=True)
-class Account:
-    """What became of the messages: how many came, how many samples, what was dropped and why."""
-
-    joint_states: int
-    poses: int
-    waiting: int
-    samples: int
-    held_out: int
-    configurations: int
-    unused: dict[str, int]
-    dropped: dict[str, int]
-    notes: dict[str, int]
-    foreign_names: tuple[str, ...]
-
-    def as_document(self) -> dict[str, Any]:
-        """Return the account as plain values."""
-        return asdict(self)
-
-    def __str__(self) -> str:
-        """Return the account in words."""
-        text = f'{self.joint_states} joint states and {self.poses} poses gave {self.samples} '
-        text += 'samples'
-        if self.held_out:
-            text += f' to fit and {self.held_out} held out'
-        text += f' in {self.configurations} configurations'
-        if self.waiting:
-            text += f', {self.waiting} poses wait'
-        for label, counts in (
-            ('not used', self.unused),
-            ('dropped', self.dropped),
-            ('note', self.notes),
-        ):
-            if counts:
-                parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
-                text += f'; {label}: {parts}'
-        if self.foreign_names:
-            text += (
-                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints of '
-                'the chain by other names, set joint_names (--joint-names)'
-            )
-        return text
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """A corrected chain in use.
-
-    `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
-    the error that it was judged to have, and `known` holds the samples that were there by then.
-    `result` is the identification that it comes from, if it was here.
-    """
-
-    chain: Chain
-    before: Chain | None
-    world_frame: str
-    rms_mm: float | None
-    known: frozenset[Sample]
-    result: Identification | None = None
+EARLY = 0.03
+"""Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
+delay. Of what then shows the arm leaving, most is left out as spikes; the rest moves the mean by
+less than the noise of a measurement."""
 
 
 def check_settings(chain: Chain, settings: Settings) -> None:
@@ -173,9 +114,8 @@ class CalibrationSession:
         self._notes: Counter[str] = Counter()
         self._newest = {'joints': 0, 'poses': 0}
         self._looked_ns = 0
-        self._frame_ids: dict[str, list[str]] = {}
-        self._layouts: dict[tuple[str, ...], Layout] = {}
-        self._foreign_names: list[str] = []
+        self._frames = FrameNames()
+        self._names = JointNames(self.joint_names)
         self._live = LiveEstimate(self.problem_of)
 
     def change(self, settings: Settings) -> None:
@@ -208,7 +148,7 @@ class CalibrationSession:
         """Take decoded joint values."""
         self.received['joints'] += 1
         try:
-            columns, pick = self._layout(reading.names)
+            columns, pick = self._names.layout(reading.names)
         except messages.MessageError as err:
             self._dropped[f'joints: {err}'] += 1
             return
@@ -241,7 +181,7 @@ class CalibrationSession:
         if not self.recording:
             return nothing
         try:
-            columns, values = self._values(readings)
+            columns, values = self._names.values(readings)
         except messages.MessageError:
             return nothing
         stamps = readings.stamps_ns
@@ -266,7 +206,7 @@ class CalibrationSession:
         parts = []
         for where, readings in joints:
             stamps = readings.stamps_ns
-            columns, values = self._values(readings)
+            columns, values = self._names.values(readings)
             self.received['joints'] += len(stamps)
             self._collector.extend_joints(columns, stamps, values)
             parts.append((where, stamps, values))
@@ -295,7 +235,7 @@ class CalibrationSession:
             self._unused['poses: not recording'] += count
             return False
         try:
-            self._check_frame(source.device, readings.frame_id)
+            self._frames.check(source.device, readings.frame_id, self.settings.frame_id)
         except messages.MessageError as err:
             self._dropped[f'poses: {err}'] += count
             return False
@@ -320,7 +260,7 @@ class CalibrationSession:
             self._unused['poses: not recording'] += 1
             return
         try:
-            self._check_frame(source.device, reading.frame_id)
+            self._frames.check(source.device, reading.frame_id, self.settings.frame_id)
         except messages.MessageError as err:
             self._dropped[f'poses: {err}'] += 1
             return
@@ -370,7 +310,7 @@ class CalibrationSession:
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
             if sample.frame_id:
-                self._note_frame(sample.device, sample.frame_id)
+                self._frames.note(sample.device, sample.frame_id)
         self._collector.remember(samples)
         self.samples = [*samples, *self.samples]
         self._live.restart()
@@ -383,10 +323,10 @@ class CalibrationSession:
         if silent:
             return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
         missing = [self.joint_names[k] for k in track.missing]
-        if missing and self._foreign_names:
+        if missing and self._names.foreign:
             return (
                 f'waiting for joint states of {", ".join(missing)}; those that come name '
-                f'{", ".join(self._foreign_names)}: set joint_names?'
+                f'{", ".join(self._names.foreign)}: set joint_names?'
             )
         return self._collector.state()
 
@@ -408,7 +348,7 @@ class CalibrationSession:
             dict(sorted((self._unused + collector.unused).items())),
             dict(sorted(dropped.items())),
             dict(sorted((self._notes + collector.notes).items())),
-            tuple(self._foreign_names),
+            self._names.foreign,
         )
 
     @property
@@ -417,10 +357,11 @@ class CalibrationSession:
         if self.delay is None or self.settings.mode == 'continuous':
             return ()  # there it is a parameter of the fit
         left = self.delay.seconds - self.settings.delay
-        if abs(left) <= self.settings.settle:
-            return ()
+        if -EARLY <= left <= self.settings.settle:
+            return ()  # no stop is spoilt by it
+        words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
         return (
-            f'measurements are stamped {left:.3f} s later than the joint states of their time: '
+            f'measurements are stamped {words} than the joint states of their time: '
             f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
         )
 
@@ -465,13 +406,7 @@ class CalibrationSession:
         self._look_for_delay(None)
         self._collector.flush()
         self._take()
-        for frame_ids in self._frame_ids.values():
-            if len(frame_ids) > 1:
-                raise InputError(
-                    f'poses came in different frames ({", ".join(sorted(frame_ids))}), one is '
-                    'needed: set frame_id (--frame-id) to the one to use, or give each source a '
-                    'device of its own; then clear and measure again'
-                )
+        self._frames.refuse_different()
         return self.problem_of(self.samples)
 
     def problem_of(self, samples: Sequence[Sample]) -> Problem:
@@ -492,7 +427,7 @@ class CalibrationSession:
             fitted[0],
             held_out,
             more=fitted[1:],
-            world_frame=next((ids[0] for ids in self._frame_ids.values()), ''),
+            world_frame=self._frames.world,
             **settings.for_problem(),
         )
 
@@ -555,24 +490,9 @@ class CalibrationSession:
             raise InputError('there is no calibration to judge: identify or load one first')
         self._collector.flush()
         self._take()
-        frames = Frames()
-        for sample in self.samples:
-            frames.of(sample)
-        sigmas = (self.settings.sigma_position, self.settings.sigma_orientation)
-        since = [each for each in self.samples if each not in self.calibration.known]
-        sets = [each for part in collect(since, sigmas, frames) for each in part]
-        if not sets:
-            raise InputError('no samples have been taken since: measure some new poses first')
-        known = self.calibration.chain.frame_names
-        for each in sets:
-            if each.base not in known or each.tool not in known:
-                raise InputError(
-                    'the samples since were measured by a device or on a target that the '
-                    'calibration does not know'
-                )
-        before, after = self.calibration.before, self.calibration.chain
-        figures = compare(before or after, after, sets).figures
-        return figures[1], figures[0] if before is not None else None
+        settings = self.settings
+        sigmas = (settings.sigma_position, settings.sigma_orientation)
+        return self.calibration.judged(self.samples, sigmas)
 
     # Details
 
@@ -581,44 +501,6 @@ class CalibrationSession:
         for sample in self._collector.take():
             self.samples.append(sample)
             self.on_sample(sample)
-
-    def _layout(self, names: Sequence[str]) -> Layout:
-        """Return which joints of the chain a message names, and how to pick their values."""
-        key = tuple(names)
-        if key not in self._layouts:
-            if len(self._layouts) == MOST_NAMES:
-                self._layouts.clear()
-            known = [(k, key.index(n)) for k, n in enumerate(self.joint_names) if n in key]
-            self._layouts[key] = (tuple(k for k, _ in known), _picker([i for _, i in known]))
-            named = {name for names in self._layouts for name in names}
-            missing = [name for name in self.joint_names if name not in named]
-            self._foreign_names = sorted(named) if missing else []
-        layout = self._layouts[key]
-        if not layout[0]:
-            raise messages.MessageError('none of the joints in the message')
-        return layout
-
-    def _values(self, readings: messages.JointReadings) -> tuple[tuple[int, ...], FloatArray]:
-        """Return which joints of the chain messages name, and their values (N, k)."""
-        columns, pick = self._layout(readings.names)
-        index = np.array(pick(range(len(readings.names))), dtype=np.intp)
-        return columns, readings.values[:, index]
-
-    def _check_frame(self, device: str, frame_id: str) -> None:
-        if self.settings.frame_id and frame_id != self.settings.frame_id:
-            raise messages.MessageError(
-                f'in frame "{frame_id}", not in frame_id "{self.settings.frame_id}"'
-            )
-        if not frame_id.isprintable():  # it shall be a cell of a table
-            raise messages.MessageError('in a frame whose name cannot be printed')
-        self._note_frame(device, frame_id)
-
-    def _note_frame(self, device: str, frame_id: str) -> None:
-        known = self._frame_ids.setdefault(device, [])
-        if frame_id not in known:
-            if len(known) == MOST_NAMES:
-                raise messages.MessageError(f'in one of more than {MOST_NAMES} frames')
-            known.append(frame_id)
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
         """Note stamps that go backwards; samples go by stamps, so nothing is lost by it."""
@@ -684,10 +566,3 @@ def _in_order(
 def _padded(rows: FloatArray, width: int) -> FloatArray:
     missing = width - rows.shape[1]
     return np.pad(rows, ((0, 0), (0, missing)), constant_values=np.nan)
-
-
-def _picker(index: Sequence[int]) -> Picker:
-    """Return a function that picks some values of a sequence."""
-    if len(index) > 1:
-        return itemgetter(*index)
-    return lambda values: tuple(values[i] for i in index)

@@ -32,6 +32,8 @@ UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 SPLITS = ('', 'train', 'test', 'removed')
+MOST_LINES = 5
+"""Lines that an error names."""
 Row: TypeAlias = Mapping[str, str | None]
 
 
@@ -47,6 +49,11 @@ class Table:
     held_out: tuple[Observations, ...]
     pairs: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+
+    @property
+    def world_frame(self) -> str:
+        """Return the first frame of measurements that the table names, if any."""
+        return next((sample.frame_id for sample in self.samples if sample.frame_id), '')
 
 
 def read_table(
@@ -74,13 +81,14 @@ def read_table(
     Raises
     ------
     InputError
-        For a missing column, a value that is no number, or several sessions to choose from. The
-        message names the line.
+        For a missing column, a value that is no number, several sessions to choose from, or
+        measurements of one device in different frames. The message names the line.
 
     """
     header, rows, warnings = _read(path, columns(joints))
     reader = _Reader(path, joints, header)
     samples = reader.samples(_of_sessions(path, header, rows, sessions))
+    reader.refuse_different_frames(samples)
     found = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples]
     if not any(not sample.validation for sample in found):
         raise InputError(f'{path} has no rows to fit, only such that are marked test')
@@ -143,6 +151,7 @@ class _Reader:
         self._joints = joints
         self._quaternion = bool(set(QUATERNION) & self._header)
         self._places: dict[tuple[str, str, str], Sample] = {}
+        self._lines: dict[Sample, int] = {}
         needed = [f'q{k + 1}' for k in range(joints)]
         if not {'distance', 'socket'} & self._header or set(POSITION) & self._header:
             needed += POSITION
@@ -179,7 +188,26 @@ class _Reader:
                     f'{self._path}, line {line}: stamp_ns {sample.stamp_ns} is there already'
                 )
             found[key] = sample
+            self._lines[sample] = line
         return tuple(found.values())
+
+    def refuse_different_frames(self, samples: Sequence[Sample]) -> None:
+        """Refuse what one device measured in different frames, as a session does.
+
+        A row that names no frame may be of any.
+        """
+        lines: dict[tuple[str, str], dict[str, list[int]]] = {}
+        for sample in samples:
+            if sample.frame_id:
+                frames = lines.setdefault((sample.session, sample.device), {})
+                frames.setdefault(sample.frame_id, []).append(self._lines[sample])
+        for frames in lines.values():
+            if len(frames) > 1:
+                found = ', '.join(f'{name} ({_in_words(where)})' for name, where in frames.items())
+                raise InputError(
+                    f'{self._path}: poses came in different frames: {found}; one is needed: '
+                    'leave out the rows of the others, or give each a device of its own'
+                )
 
     def sample(self, line: int, row: Row) -> Sample:
         """Return the sample of a row."""
@@ -287,6 +315,12 @@ class _Reader:
         if not text.lstrip('-').isdigit():
             raise InputError(f'{self._path}, line {line}: {name} must be an integer, not {text!r}')
         return int(text)
+
+
+def _in_words(lines: Sequence[int]) -> str:
+    shown = ', '.join(map(str, lines[:MOST_LINES]))
+    more = f' and {len(lines) - MOST_LINES} more' if len(lines) > MOST_LINES else ''
+    return f'line{"s" if len(lines) > 1 else ""} {shown}{more}'
 
 
 def cell_number(text: str | None, where: str) -> float:

@@ -21,23 +21,23 @@ ORDER = [
     {'config', 'differential', 'observations'},
     {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
     {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
-    {'following', 'robust', 'waypoints'},
+    {'account', 'following', 'names', 'robust', 'waypoints'},
     {'compensation'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
     {'chance', 'live', 'noise', 'validation'},
     {'identification'},
-    {'design', 'salvage', 'selection', 'workspace'},
+    {'calibration', 'design', 'salvage', 'selection', 'workspace'},
     {'candidates', 'placement', 'verification'},
     {'planning', 'plots', 'session', 'testposes'},
     {'intake', 'report'},
     {'replay'},
-    {'deferred', 'options', 'outgoing'},
-    {'commands', 'guide'},
+    {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
+    {'commands', 'diagnostics', 'guide', 'keeper'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'guide', 'outgoing'}
+ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'keeper', 'outgoing', 'parameters'}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,

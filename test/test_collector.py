@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
-from calib_ros.collector import Collector, StreamKey
+from calib_ros.collector import MOST_STREAMS, TOO_MANY, Collector, StreamKey
 from calib_ros.config import Settings
 from calib_ros.messages import Reading
 from calib_ros.samples import Sample
@@ -501,3 +501,54 @@ def test_the_state_follows_the_arm():
     play(made, joint_events(motion, 1.5, begin=0.6), finish=False)
     assert made.state() == 'the arm is moving'
     assert collector(mode='continuous').state() == 'waiting for joint states'
+
+
+# Targets without end
+
+
+def marker(number):
+    return POSE._replace(target=str(number))
+
+
+def glimpse(number, time):
+    """Return the event of one measurement of a marker."""
+    stamp = int(stamps(np.array([time]))[0])
+    reading = Reading(stamp, 'world', (0.0, 0.0, 0.0))
+    return time, lambda made: made.add(marker(number), reading)
+
+
+def test_targets_without_end_are_dropped_and_counted():
+    """A tracker numbers its markers anew with each measurement; memory stays bounded."""
+    made = collector()
+    play(made, [glimpse(k, 0.5 + 1e-4 * k) for k in range(200)], finish=False)
+    last = stamps(np.array([0.6, 0.7]))
+    made.extend(marker(200), last, np.zeros((2, 3)))
+    assert made.waiting == MOST_STREAMS
+    assert made.dropped == {TOO_MANY: 200 - MOST_STREAMS + 2}
+
+
+def test_targets_that_gave_no_sample_make_room_for_others():
+    """Many markers are seen in every motion; the one that is sampled stays."""
+    motion = tour()
+    made = collector()
+    begins = np.array([1.2, 3.2, 5.2, 7.2])
+    glimpses = [
+        glimpse(100 * leg + k, begins[leg] + 5e-3 * k) for leg in range(4) for k in range(100)
+    ]
+    samples = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), glimpses)
+    assert len(samples) == 5
+    assert {each.target for each in samples} == {''}
+    assert made.dropped == {TOO_MANY: 4 * (100 - (MOST_STREAMS - 1))}
+
+
+def test_a_target_that_was_sampled_makes_no_room(monkeypatch):
+    monkeypatch.setattr('calib_ros.collector.MOST_STREAMS', 2)
+    motion = tour()
+    made = collector()
+    both = [pose_events(motion, 1.5, key=marker(k)) for k in (1, 2)]
+    samples = play(made, joint_events(motion, 9.5), *both, [glimpse(3, 4.5)])
+    assert [each.target for each in samples] == ['1', '2']
+    assert made.dropped == {TOO_MANY: 1}
+    made.forget(samples[0])
+    made.add(marker(3), Reading(stamps(np.array([9.6]))[0], 'world', (0.0, 0.0, 0.0)))
+    assert made.waiting == 1

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A cell measured in motion by a device whose clock or transport is late."""
 
+import re
+
 import numpy as np
 import pytest
 from streams import POINT, POSE, START, TRACKER, joint_state, point, pose, stamps, stops, sweep
@@ -25,7 +27,7 @@ def recorded(lag, seed=0, oriented=True, seconds=SECONDS, motion=None, **setting
     """Return a session that has heard a moving arm, its true chain and its motion."""
     true, moving, rng = true_cell(seed)
     motion = motion or moving
-    session = CalibrationSession(UR10E, Settings(mode='continuous', **settings))
+    session = CalibrationSession(UR10E, Settings(**{'mode': 'continuous'} | settings))
     joint_times = np.arange(0.0, seconds, 0.005)
     times = np.arange(0.05, seconds - 0.3, 0.02)
     seen = measure(true, motion(times), rng, *NOISE, oriented)
@@ -91,6 +93,38 @@ def test_without_motion_there_is_no_delay():
     account = still.account()
     assert account.samples > 400
     assert account.waiting == 0
+
+
+@pytest.mark.parametrize(
+    ('lag', 'settings', 'said'),
+    [
+        (0.09, {}, None),  # within settle
+        (0.15, {}, '0.150 s later .* set delay to 0.150'),
+        (0.15, {'settle': 0.2}, None),
+        (0.15, {'delay': 0.15}, None),
+        (-0.01, {}, None),
+        (-0.09, {}, '0.090 s earlier .* set delay to -0.090'),  # nothing settles as it leaves
+        (-0.09, {'delay': -0.09}, None),
+    ],
+)
+def test_stops_spoilt_by_a_delay_are_told(lag, settings, said):
+    """Where nothing is told the mean of a stop is as good as without a delay, or nearly."""
+    motion = stops(UR10E.random_joints(25, np.random.default_rng(1)) * 0.5, 0.5, 0.5)
+    session, true, _ = recorded(lag, motion=motion, seconds=24.0, mode='dwell', **settings)
+    assert session.delay.seconds == pytest.approx(lag, abs=5e-3)
+    if said:
+        (warning,) = session.warnings
+        assert re.search(said.replace('0.150', '0.1[45].').replace('0.090', '0.0[89].'), warning)
+        assert warning in session.status()
+        return
+    assert session.warnings == ()
+    assert len(session.samples) >= 23
+    joints = np.array([each.joints for each in session.samples])
+    found = np.array([each.position for each in session.samples])
+    errors = found - true.forward(joints)[:, :3, 3]
+    expected = NOISE[0] / np.sqrt(np.mean([each.count for each in session.samples]))
+    early = lag < settings.get('delay', 0.0)  # the first of the motion is no spike yet
+    assert np.sqrt((errors**2).mean()) < (0.5 * NOISE[0] if early else 1.3 * expected)
 
 
 def speeds(delay, seconds, rng, motion):

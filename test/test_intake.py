@@ -93,8 +93,10 @@ def outcome(session):
 
 @pytest.mark.parametrize('seed', range(6))
 @pytest.mark.parametrize('mode', ['dwell', 'continuous'])
-def test_a_batch_is_taken_as_its_messages_are(seed, mode):
+def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     rng = np.random.default_rng(seed)
+    if seed == 4:  # the first stream that comes when none is in use takes the only place
+        monkeypatch.setattr('calib_ros.collector.MOST_STREAMS', 1)
     first, second = shift(rng), shift(rng)
     # The clock jumps back when the recording begins again.
     messages = first + (second if seed % 2 else [])
@@ -118,6 +120,18 @@ def test_a_batch_is_taken_as_its_messages_are(seed, mode):
     many.finish()
     assert outcome(one) == outcome(many)
     assert one.samples
+
+
+def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
+    monkeypatch.setattr('calib_ros.collector.MOST_STREAMS', 1)
+    quat = [0.0, 0.0, 0.0, 1.0]
+    messages = [pose(START, [np.nan, 0.0, 0.0], quat)]
+    for k in range(1, 5):
+        messages += [point(START + k, np.zeros(3)), pose(START + k, np.zeros(3), quat)]
+    session = CalibrationSession(ARM)
+    assert feed(session, messages, STORE.deserialize_cdr) == []
+    assert session.account().waiting == 4
+    assert [key.device for key in session._collector._waiting] == ['camera']
 
 
 def test_a_damaged_message_is_told_and_the_others_are_taken():

@@ -114,6 +114,15 @@ def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
     assert apart(said[-1].chain, live.update(samples).chain, rng) < 0.1 * NOISE[0]
 
 
+def test_what_it_does_not_begin_with_is_taken_next(rng, monkeypatch):
+    """Of many samples of one target and few of another it begins with a part of the many."""
+    monkeypatch.setattr(live_module, 'MOST_ANEW', 60)
+    true = faulty(UR10E, Cell(), rng)
+    samples = seen(true, 50, rng) + seen(true, 8, rng, start=100, target='other')
+    live = LiveEstimate(session().problem_of)
+    assert [live.update(samples).samples for _ in range(3)] == [31 + 8, 58, 58]
+
+
 @pytest.mark.parametrize('oriented', [True, False])
 def test_a_sample_of_gross_error_is_flagged_and_left_out(oriented, rng):
     true = faulty(UR10E, Cell(), rng)
@@ -124,6 +133,35 @@ def test_a_sample_of_gross_error_is_flagged_and_left_out(oriented, rng):
     assert live.suspicious == [samples[wrong]]
     assert said[-1].samples == 59
     assert apart(said[-1].chain, true, rng) < 3.0 * said[-1].sigma
+
+
+@pytest.mark.parametrize('places', [[0], [1], [9], [0, 3, 8], list(range(START))])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_gross_errors_among_the_first_samples_are_found_later(oriented, places, rng):
+    """However the estimate bent to them: at the end it is that of the good ones alone."""
+    samples = seen(faulty(UR10E, Cell(), rng), 50, rng, oriented)
+    for k in places:
+        way = rng.normal(size=3)
+        shift = rng.uniform(5e-3, 50e-3) * way / np.linalg.norm(way)
+        samples[k] = replace(samples[k], position=samples[k].position + shift)
+    live, said = growing(samples)
+    assert set(live.suspicious) == {samples[k] for k in places}
+    good = [each for k, each in enumerate(samples) if k not in places]
+    batch = identify(session().problem_of(good))
+    assert said[-1].samples == len(good)
+    assert apart(said[-1].chain, batch.chain, rng) < 0.05 * NOISE[0]
+
+
+def test_samples_that_early_ones_speak_against_come_back(rng):
+    """The target was knocked after twenty samples; forty more, and those of before are wrong."""
+    true = faulty(UR10E, Cell(), rng)
+    knocked = replace(true, tool=true.tool.moved({'x': 5e-3}))
+    samples = seen(true, 20, rng) + seen(knocked, 40, rng, start=20)
+    live, _ = growing(samples[:30])
+    assert set(live.suspicious) == set(samples[20:30])
+    live, said = growing(samples)
+    assert set(live.suspicious) == set(samples[:20])
+    assert apart(said[-1].chain, knocked, rng) < 3.0 * said[-1].sigma
 
 
 def test_good_samples_are_not_flagged():

@@ -32,10 +32,14 @@ from ros_cell import (
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from calib_ros import inputs as inputs_module
 from calib_ros import node as node_module
 from calib_ros.archive import Archive
 from calib_ros.config import load_chain
+from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import ConfigError
+from calib_ros.guide import Guide
+from calib_ros.session import CalibrationSession
 from calib_ros.tables import read_journal
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -265,8 +269,51 @@ def test_a_full_disk(tmp_path, recording):
 # Sources
 
 
+BROKEN = {
+    'taking messages': (node_module, 'feed'),
+    'the journal': (Archive, 'write'),
+    'the status': (CalibrationSession, 'status'),
+    'the next pose': (Guide, 'advise'),
+    'the account': (CalibrationSession, 'account'),
+    'judging': (Diagnostics, '_judged'),
+    'the figures': (Guide, 'figures'),
+}
+
+
+@pytest.mark.parametrize('what', BROKEN)
+def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, recording, what):
+    """It is told at level ERROR, and everything is as before when it works again."""
+    diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    status = cell.listen(String, '/calibration_node/status')
+    cell.play(part(recording, 0, 10))
+
+    def fail(*arguments):
+        raise ZeroDivisionError(f'{what} is broken')
+
+    with monkeypatch.context() as broken:
+        broken.setattr(*BROKEN[what], fail)
+        cell.spin_until(lambda: diagnostics and what in diagnostics[-1].status[0].message)
+        found = diagnostics[-1].status[0]
+        assert found.level == DiagnosticStatus.ERROR
+        assert f'{what} failed' in found.message
+        assert f'{what} is broken' in found.message
+        assert (what != 'the status') == ('samples' in found.message)
+        assert (what in ('the account', 'the figures')) == (not found.values)
+        if what not in ('taking messages', 'the status'):
+            heard = len(status)
+            cell.play(part(recording, 10, 13))
+            cell.spin_until(lambda: len(status) > heard)
+    count = len(diagnostics)
+    cell.spin_until(lambda: len(diagnostics) > count + 2)
+    found = diagnostics[-1].status[0]
+    assert found.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
+    assert 'failed' not in found.message
+    assert 'samples' in found.message
+    assert int(values_of(diagnostics[-1])['samples']) >= 8
+
+
 def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
-    monkeypatch.setattr(node_module, 'SILENCE', 0.4)
+    monkeypatch.setattr(inputs_module, 'SILENCE', 0.4)
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     joints, poses = topics(recording).values()
     arm = cell.publisher(JointState, 'joint_states')

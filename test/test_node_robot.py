@@ -10,7 +10,7 @@ import yaml
 from ros_cell import LATCHED, Cell, shift, topics, true_arm
 from std_msgs.msg import String
 
-from calib_ros import node as node_module
+from calib_ros import parameters as parameters_module
 from calib_ros.config import load_chain
 from calib_ros.errors import ConfigError
 from calib_ros.export import kinematics_yaml
@@ -82,7 +82,7 @@ def test_a_table_is_exported_without_a_urdf(tmp_path):
 
 
 def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
-    monkeypatch.setattr(node_module, 'DESCRIPTION_WAIT', 0.2)
+    monkeypatch.setattr(parameters_module, 'DESCRIPTION_WAIT', 0.2)
     with Cell() as cell, pytest.raises(ConfigError, match='no robot_description has come within'):
         cell.start(chain='robot_description', data_dir=str(tmp_path))
 

@@ -95,7 +95,8 @@ def test_rviz_shows_what_the_node_publishes():
     content = yaml.safe_load((ROOT / 'config/calibration.rviz').read_text())
     manager = content['Visualization Manager']
     topics = {d['Class']: d['Topic'] for d in manager['Displays'] if 'Topic' in d}
-    node = ''.join((ROOT / f'calib_ros/{name}.py').read_text() for name in ('node', 'guide'))
+    rooms = ('node', 'guide', 'keeper')
+    node = ''.join((ROOT / f'calib_ros/{name}.py').read_text() for name in rooms)
     for topic in topics.values():
         assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in node
     # These are published once: a display that comes later must ask for the last ones.

@@ -181,3 +181,45 @@ def test_a_flag_that_is_none_is_named_with_its_line(read, flag):
     text = f'q1,q2,x,y,z,qx,qy,qz,qw,eye_in_hand\n1,0,1,0,0,0,0,0,1,{flag}\n'
     with pytest.raises(InputError, match=f"line 2: eye_in_hand must be 0 or 1, not '{flag}'"):
         read(text)
+
+
+FRAMES = """session,device,frame_id,q1,q2,x,y,z,split
+A,left,world,1,0,1,0,0,
+A,left,,2,0,2,0,0,
+A,right,cell,3,0,3,0,0,
+A,left,map,4,0,4,0,0,
+A,left,world,5,0,5,0,0,test
+B,left,map,6,0,6,0,0,
+"""
+
+
+def test_different_frames_of_one_device_are_refused_with_their_lines(read):
+    said = r'different frames: world \(lines 2, 6\), map \(line 5\); one is needed'
+    with pytest.raises(InputError, match=said):
+        read(FRAMES, 'A')
+
+
+def test_many_lines_are_cut_short(read):
+    rows = [f'{k},0,1,0,0,{"map" if k else "world"}' for k in range(9)]
+    with pytest.raises(InputError, match=r'map \(lines 3, 4, 5, 6, 7 and 3 more\)'):
+        read('\n'.join(['q1,q2,x,y,z,frame_id', *rows, '']))
+
+
+def test_each_device_and_session_has_a_frame_of_its_own(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(FRAMES.replace('A,left,map', 'A,other,map'))
+    table = read_table(path, 2, ('A', 'B'))
+    assert [each.base for each in table.fitted] == ['base', 'base_right', 'base_other', 'base_B']
+    assert table.world_frame == 'world'
+
+
+def test_a_row_that_was_taken_back_may_be_in_any_frame(read):
+    rows = ['1,1,0,1,0,0,world,', '2,2,0,2,0,0,map,', '2,2,0,2,0,0,map,removed']
+    fitted, _ = read('\n'.join(['stamp_ns,q1,q2,x,y,z,frame_id,split', *rows, '']))
+    assert len(fitted) == 1
+
+
+def test_a_table_without_frames_has_none(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(POINTS)
+    assert read_table(path, 2).world_frame == ''

@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration in use: published, saved, loaded, and exported."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64MultiArray, String
+
+from calib_ros import outgoing
+from calib_ros.archive import Archive
+from calib_ros.chain import Chain
+from calib_ros.config import calibration_record, parse_calibration, read_text
+from calib_ros.errors import InputError
+from calib_ros.export import exports
+from calib_ros.identification import Identification
+from calib_ros.parameters import Given
+from calib_ros.samples import Sample
+from calib_ros.se3 import FloatArray
+from calib_ros.session import CalibrationSession
+from calib_ros.urdf import corrected_urdf
+
+
+class Published(NamedTuple):
+    """A calibration as the text of a file, and by which configuration it was made, if known."""
+
+    text: str
+    configuration: str
+
+
+class Exportable(NamedTuple):
+    """The calibrated chain, its text, and the joint values of the samples."""
+
+    chain: Chain
+    text: str
+    joints: Sequence[FloatArray] | None
+
+
+class Keeper:
+    """Keeps the calibration of a session, its publishers and its files together.
+
+    Parameters
+    ----------
+    node : Node
+    session : CalibrationSession
+    archive : Archive
+    given : Given
+        What the node was started with.
+    urdf : str
+        The URDF of the robot, if there is one.
+    latched : QoSProfile
+        For topics whose last message a late subscriber gets.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        session: CalibrationSession,
+        archive: Archive,
+        given: Given,
+        urdf: str,
+        latched: QoSProfile,
+    ) -> None:
+        self._node, self._session, self._archive = node, session, archive
+        self._given, self._urdf = given, urdf
+        self._published = Published('', '')
+        self._lock = threading.Lock()  # identifications end on a thread of their own
+        self._posed: tuple[int, Sequence[float]] | None = None
+        self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
+        self._calibration = node.create_publisher(String, '~/calibration', latched)
+        self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
+
+    def adopt(
+        self, result: Identification, samples: Sequence[Sample], published: Published
+    ) -> None:
+        """Take an accepted result as the calibration in use."""
+        with self._lock:
+            self._session.adopt(result, samples)
+            self._publish(result.chain, published)
+
+    def save(self) -> Path:
+        """Write the calibration to `target_filename` or a new file; return its path."""
+        if not self._published.text:
+            raise InputError('there is no accepted calibration to save: call ~/identify first')
+        target = self._node.get_parameter('target_filename').value
+        return self._archive.save(*self._published, Path(target).expanduser() if target else None)
+
+    def load(self) -> Path:
+        """Take the calibration in `calibration_filename` or the newest one; return its path."""
+        name = self._node.get_parameter('calibration_filename').value
+        path = Path(name).expanduser() if name else self._archive.newest_calibration()
+        session = self._session
+        if path is None:
+            raise InputError(
+                f'there is no saved calibration of {session.chain.name} in '
+                f'{self._archive.folder}: set calibration_filename'
+            )
+        text = read_text(path)
+        chain, record = parse_calibration(text, str(path), session.chain, session.settings)
+        serial, ours = record.get('robot_serial'), self._given.serial
+        if serial and ours and serial != ours:
+            raise InputError(
+                f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
+            )
+        with self._lock:
+            session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
+            self._publish(chain, Published(text, ''))
+        return path
+
+    def exportable(self) -> Exportable:
+        """Return what there is to export, as it is now."""
+        session = self._session
+        if session.calibration is None:
+            raise InputError('there is no calibration to export: call ~/identify or ~/load first')
+        joints = [sample.joints for sample in session.samples]
+        with self._lock:
+            return Exportable(session.calibration.chain, self._published.text, joints or None)
+
+    def export(self, found: Exportable) -> tuple[bool, str]:
+        """Write a calibration in all forms; return success, and where in words."""
+        record = calibration_record(found.text)
+        forms = exports(found.chain, self._session.chain, found.joints, record)
+        files = {each.name: each.content for each in forms}
+        if self._urdf:
+            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **self._given.links)
+        return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
+
+    def publish_pose(self) -> None:
+        """Publish the corrected pose of the latest joint values, once."""
+        calibration, latest = self._session.calibration, self._session.latest
+        if calibration is None or latest is None or latest is self._posed:
+            return
+        self._posed = latest
+        stamp_ns, values = latest
+        self._corrected_pose.publish(
+            outgoing.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
+        )
+
+    def _publish(self, chain: Chain, published: Published) -> None:
+        self._published = published
+        self._dh_parameters.publish(outgoing.dh_parameters(chain))
+        self._calibration.publish(String(data=published.text))

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Names in messages: which joints of the chain they hold, in which frames things are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from operator import itemgetter
+from typing import TypeAlias
+
+import numpy as np
+
+from calib_ros.errors import InputError
+from calib_ros.messages import JointReadings, MessageError
+from calib_ros.se3 import FloatArray
+
+Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
+Layout: TypeAlias = tuple[tuple[int, ...], Picker]
+
+MOST_NAMES = 50
+"""Frames of measurements, and sets of joint names, that are told apart."""
+
+
+class JointNames:
+    """Finds the joints of a chain in messages that may name others, and only part of them.
+
+    Parameters
+    ----------
+    names : sequence of str
+        How messages name the joints of the chain, in its order.
+
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._layouts: dict[tuple[str, ...], Layout] = {}
+        self.foreign: tuple[str, ...] = ()
+        """Names that come while some of the chain's joints are never named."""
+
+    def layout(self, names: Sequence[str]) -> Layout:
+        """Return which joints of the chain a message names, and how to pick their values.
+
+        Raises
+        ------
+        MessageError
+            When it names none of them.
+
+        """
+        key = tuple(names)
+        if key not in self._layouts:
+            if len(self._layouts) == MOST_NAMES:
+                self._layouts.clear()
+            known = [(k, key.index(n)) for k, n in enumerate(self._names) if n in key]
+            self._layouts[key] = (tuple(k for k, _ in known), _picker([i for _, i in known]))
+            named = {name for names in self._layouts for name in names}
+            missing = [name for name in self._names if name not in named]
+            self.foreign = tuple(sorted(named)) if missing else ()
+        layout = self._layouts[key]
+        if not layout[0]:
+            raise MessageError('none of the joints in the message')
+        return layout
+
+    def values(self, readings: JointReadings) -> tuple[tuple[int, ...], FloatArray]:
+        """Return which joints of the chain messages name, and their values (N, k)."""
+        columns, pick = self.layout(readings.names)
+        index = np.array(pick(range(len(readings.names))), dtype=np.intp)
+        return columns, readings.values[:, index]
+
+
+class FrameNames:
+    """The frames in which each device has measured; there should be one of each."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, list[str]] = {}
+
+    def check(self, device: str, frame_id: str, wanted: str) -> None:
+        """Note the frame of a measurement.
+
+        Raises
+        ------
+        MessageError
+            When it is not the one `wanted`, if any is, or cannot be told from others.
+
+        """
+        if wanted and frame_id != wanted:
+            raise MessageError(f'in frame "{frame_id}", not in frame_id "{wanted}"')
+        if not frame_id.isprintable():  # it shall be a cell of a table
+            raise MessageError('in a frame whose name cannot be printed')
+        self.note(device, frame_id)
+
+    def note(self, device: str, frame_id: str) -> None:
+        """Note the frame of a measurement that was taken before."""
+        known = self._known.setdefault(device, [])
+        if frame_id not in known:
+            if len(known) == MOST_NAMES:
+                raise MessageError(f'in one of more than {MOST_NAMES} frames')
+            known.append(frame_id)
+
+    def refuse_different(self) -> None:
+        """Refuse what one device measured in different frames.
+
+        Raises
+        ------
+        InputError
+            When there is such a device.
+
+        """
+        for names in self._known.values():
+            if len(names) > 1:
+                raise InputError(
+                    f'poses came in different frames ({", ".join(sorted(names))}), one is '
+                    'needed: set frame_id (--frame-id) to the one to use, or give each source a '
+                    'device of its own; then clear and measure again'
+                )
+
+    @property
+    def world(self) -> str:
+        """Return the frame of the device that was heard first; empty before."""
+        return next((names[0] for names in self._known.values()), '')
+
+
+def _picker(index: Sequence[int]) -> Picker:
+    """Return a function that picks some values of a sequence."""
+    if len(index) > 1:
+        return itemgetter(*index)
+    return lambda values: tuple(values[i] for i in index)

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node is set to: parameters with their ranges, and the robot that they name.
+
+Every field of `Settings` is a parameter of the same name, with its text and its smallest value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import String
+
+from calib_ros.chain import Chain
+from calib_ros.config import STARTUP, URDF_SUFFIXES, Settings, load_chain, read_text
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.urdf import chain_from_urdf
+
+DESCRIPTION_WAIT = 10.0
+"""Time [s] for which the node waits for the robot's description."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a node was started with; what else may change is read where it is used."""
+
+    chain: str
+    links: dict[str, str | None]
+    serial: str
+    data_dir: Path | None
+    resume: bool
+    candidates: Path | None
+    settings: Settings
+
+
+def declare_all(node: Node) -> Given:
+    """Declare all parameters of the node and return what they were set to.
+
+    Raises
+    ------
+    ConfigError
+        When a value cannot be, or a parameter was set that does not exist.
+
+    """
+    chain = _declare(
+        node,
+        'chain',
+        '',
+        'chain file or URDF of the robot, the name of one that calib_ros ships, or '
+        'robot_description: the URDF on that topic',
+    )
+    links = {
+        name: _declare(node, name, '', f'of a URDF: {text}') or None
+        for name, text in (
+            ('base_link', 'where the arm starts; default: its root'),
+            ('tip_link', 'where the arm ends; default: tool0, flange or its only end'),
+        )
+    }
+    _declare(node, 'executor', 'events', 'events or single_threaded: how messages are taken')
+    serial = _declare(node, 'serial', '', 'serial number of the robot, for the record')
+    data_dir = _declare(
+        node, 'data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'
+    )
+    resume = _declare(node, 'resume', False, 'go on with the newest journal of this robot')
+    for name, default, text in (
+        ('target_filename', '', 'file that ~/save writes; default: a new one in data_dir'),
+        ('calibration_filename', '', 'file that ~/load reads; default: the newest saved'),
+        ('marker_scale', 200.0, 'residual vectors are drawn so many times as long'),
+    ):
+        _declare(node, name, default, text, read_only=False)
+    candidates = _declare(
+        node,
+        'candidates',
+        '',
+        'table of poses (q1 ... qn) for ~/next_pose to choose; default: any',
+    )
+    settings = Settings(**{item.name: _declare_setting(node, item) for item in fields(Settings)})
+    _refuse_unknown(node)
+    if not chain:
+        raise ConfigError(
+            'parameter "chain" is not set: give the chain file of the robot, for example '
+            '--ros-args -p chain:=ur10e'
+        )
+    return Given(chain, links, serial, _path(data_dir), resume, _path(candidates), settings)
+
+
+def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
+    """Return settings with what changes of parameters make of them."""
+    known = {item.name: item.default for item in fields(Settings)}
+    values = {
+        each.name: _names(each.value) if isinstance(known[each.name], tuple) else each.value
+        for each in changes
+        if each.name in known
+    }
+    return replace(settings, **values)
+
+
+def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
+    """Return the nominal chain, and the URDF that it comes from if it does."""
+    name, links = given.chain, given.links
+    if name == 'robot_description':
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        found, message = wait_for_message(
+            String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
+        )
+        if not found:
+            raise ConfigError(
+                f'no robot_description has come within {DESCRIPTION_WAIT:g} s: start '
+                'robot_state_publisher first, or set chain to a file'
+            )
+        text = message.data
+    elif Path(name).suffix in URDF_SUFFIXES:
+        text = read_text(Path(name))
+    elif any(links.values()):
+        raise ConfigError('base_link and tip_link are of use with a URDF only')
+    else:
+        return load_chain(name), ''
+    return replace(chain_from_urdf(text, **links), base=None, tool=None), text
+
+
+def _path(name: str) -> Path | None:
+    return Path(name).expanduser() if name else None
+
+
+def _declare(
+    node: Node, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
+) -> Any:
+    descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
+    return node.declare_parameter(name, default, descriptor).value
+
+
+def _declare_setting(node: Node, item: Any) -> Any:
+    text, lower = item.metadata['text'], item.metadata.get('lower')
+    fixed = item.name in STARTUP
+    if isinstance(item.default, tuple):  # an empty list has no type in ROS, [''] has one
+        return _names(_declare(node, item.name, [''], text, fixed))
+    if isinstance(item.default, str):
+        return _declare(node, item.name, item.default, text, fixed)
+    if isinstance(item.default, int):
+        span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)
+        return _declare(node, item.name, item.default, text, fixed, integer_range=[span])
+    # Declared with any type first, so that "max_gap: 1" is taken as 1.0.
+    loose = ParameterDescriptor(dynamic_typing=True)
+    value = node.declare_parameter(item.name, item.default, loose).value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError(f'parameter "{item.name}" must be a number, not {value!r}')
+    node.undeclare_parameter(item.name)
+    span = FloatingPointRange(from_value=float(lower), to_value=1e9)
+    descriptor = ParameterDescriptor(
+        description=text, read_only=fixed, floating_point_range=[span]
+    )
+    return node.declare_parameter(item.name, float(value), descriptor, ignore_override=True).value
+
+
+def _refuse_unknown(node: Node) -> None:
+    """Refuse parameters that were set but do not exist; ROS ignores them."""
+    known = [*node._parameters]
+    for name in node._parameter_overrides:
+        if name not in known and not name.startswith(('qos_overrides.', 'use_sim_time')):
+            raise UnknownNameError('parameter', name, known)
+
+
+def _names(values: Sequence[str] | None) -> tuple[str, ...]:
+    return tuple(name for name in values or () if name)
