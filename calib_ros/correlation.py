@@ -347,8 +347,8 @@ def _successive(
 ) -> FloatArray:
     """Return J^T K J of errors that fade in succession, for (length, size) each.
 
-    The sum over all earlier stops follows the recursion y_j = decay (y_{j-1} + s_{j-1}), a
-    system of equations with two diagonals.
+    The sum over all stops so far follows the recursion y_j = decay y_{j-1} + s_j, a system of
+    equations with two diagonals.
     """
     found = np.zeros((len(names), len(names)))
     for samples in system.sets:
@@ -360,13 +360,11 @@ def _successive(
             own = np.einsum('pcn,rcn->pr', rows, rows, optimize=True)
             for k, (length, size) in enumerate(kernels):
                 decay = float(np.exp(-1.0 / length))
-                last = np.concatenate([before[k][..., np.newaxis], rows[..., :-1]], axis=2)
-                bands = np.tile([[1.0], [-decay]], rows.shape[2])
-                flat = linalg.solve_banded(
-                    (1, 0), bands, decay * last.reshape(-1, len(bands[0])).T
-                )
-                earlier = flat.T.reshape(rows.shape)
-                before[k] = earlier[..., -1] + rows[..., -1]
-                cross = np.einsum('pcn,rcn->pr', rows, earlier, optimize=True)
+                added = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
+                bands = np.tile([[1.0], [-decay]], added.shape[2])
+                flat = linalg.solve_banded((1, 0), bands, added.reshape(-1, added.shape[2]).T)
+                so_far = flat.T.reshape(added.shape)
+                before[k] = so_far[..., -1]
+                cross = decay * np.einsum('pcn,rcn->pr', rows, so_far[..., :-1], optimize=True)
                 found += size * (own + cross + cross.T)
     return found

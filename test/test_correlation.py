@@ -167,6 +167,22 @@ def test_blocks_and_samples_of_a_stop_do_not_change_the_result(monkeypatch):
     np.testing.assert_allclose(in_blocks.covariance, whole.covariance, rtol=1e-6, atol=1e-18)
 
 
+@pytest.mark.parametrize('block', [1, 24, 96])  # 24: the last one holds a single stop
+def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypatch, block):
+    monkeypatch.setattr(leastsquares, 'BLOCK', block)
+    rng = np.random.default_rng(11)
+    samples = leastsquares.Samples(measure(UR10E, along_path(96, rng)[:73], rng, *NOISE), *NOISE)
+    names = UR10E.parameter_names
+    system, kernels = leastsquares.System((samples,)), [(3.0, 2.0), (20.0, 0.5)]
+    apart = np.abs(np.subtract.outer(np.arange(73), np.arange(73)))
+    kernel = sum(size * np.exp(-apart / length) for length, size in kernels)
+    rows = samples.rows_of(UR10E, names)[..., :-1]
+    for part, own in enumerate((rows[:, :3], rows[:, 3:])):
+        found = correlation._successive(UR10E, names, system, part, kernels)
+        expected = np.einsum('ncp,nm,mcr->pr', own, kernel, own, optimize=True)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * expected.max())
+
+
 def test_a_part_of_many_stops_tells_nearly_the_same(monkeypatch):
     whole = shifted_run(monkeypatch, 960, MOST=960)
     part = shifted_run(monkeypatch, 960, MOST=240)
