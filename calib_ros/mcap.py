@@ -97,11 +97,14 @@ def _decompressor(name: str) -> Callable[[bytes], bytes]:
     """Return what decompresses a chunk; the modules are those that rosbags brings."""
     if not name:
         return bytes
-    known = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd')}
+    known = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
     for module in known.get(name, ()):
         try:
-            decompress: Callable[[bytes], bytes] = importlib.import_module(module).decompress
+            found = importlib.import_module(module)
         except ImportError:
             continue
+        if module == 'zstandard':  # its plain function wants the size in the head of the frame
+            found = found.ZstdDecompressor().decompressobj()
+        decompress: Callable[[bytes], bytes] = found.decompress
         return decompress
     raise OSError(f'no module to decompress {name}')

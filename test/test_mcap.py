@@ -3,7 +3,9 @@
 """Chunks of mcap files, made here byte by byte as the specification says."""
 
 import struct
+import sys
 import zlib
+from types import SimpleNamespace
 
 import lz4.frame
 import pytest
@@ -86,6 +88,18 @@ def test_an_unknown_compression_is_named():
     named = chunk(CONTENT, 'zstd').replace(b'zstd', b'brot')
     with pytest.raises(OSError, match='decompress brot'):
         next(logged(named, {1: 1}))
+
+
+def test_the_zstd_of_older_rosbags_will_do(monkeypatch):
+    class Decompressor:
+        def decompressobj(self):
+            return SimpleNamespace(decompress=zstd.decompress)
+
+    for module in ('compression.zstd', 'backports.zstd'):
+        monkeypatch.setitem(sys.modules, module, None)
+    named = SimpleNamespace(ZstdDecompressor=Decompressor)
+    monkeypatch.setitem(sys.modules, 'zstandard', named)
+    assert list(logged(chunk(CONTENT, 'zstd'), {3: 'c'})) == [('c', b'three')]
 
 
 def test_records_of_chunks_come_among_the_others():
