@@ -169,7 +169,11 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
     if reader.compression_mode != 'message' and all(map(_is_consecutive, storages)):
         return itertools.chain.from_iterable(_by_chunks(each, streams) for each in storages)
     connections = [c for c in reader.connections if c.topic in streams]
-    return ((streams[c.topic], data) for c, _, data in reader.messages(connections))
+    return (
+        (streams[c.topic], data)
+        for c, _, data in reader.messages(connections)
+        if c.msgtype == streams[c.topic].type
+    )
 
 
 def _is_consecutive(storage: Any) -> bool:

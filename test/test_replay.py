@@ -706,9 +706,10 @@ def test_the_files_of_a_split_bag_are_read_one_after_the_other(tmp_path):
     assert len(expected) == 560
 
 
+@storages
 @pytest.mark.parametrize('kind', ['std_msgs/msg/String', 'geometry_msgs/msg/PointStamped'])
-def test_a_channel_of_another_type_is_not_read(tmp_path, kind):
-    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+def test_a_channel_of_another_type_is_not_read(tmp_path, storage, kind):
+    path = record_in_chunks(tmp_path / 'bag', storage)
     with Reader(path) as reader:
         found = list(read(reader, {'/pose': Stream('/pose', kind)}))
     assert found == []
