@@ -297,7 +297,8 @@ def parse_calibration(
 
     A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
     all that calib_ros writes, and must not speak against this nominal chain; nor may the numbers
-    be further from it than `largest_length` and `largest_angle` of the settings allow.
+    be further from it than `largest_length` and `largest_angle` of the settings allow. Without
+    settings the identification has judged that, if it records the numbers of this chain.
 
     Raises
     ------
@@ -323,8 +324,12 @@ def parse_calibration(
         )
     if record.get('accepted') is False:
         raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
-    _check_nominal(record.get('nominal'), nominal, where)
-    differing = _differing(chain, nominal, settings or Settings())
+    known = _check_nominal(record.get('nominal'), nominal, where)
+    limits = settings or Settings()
+    length, angle = limits.largest_length, limits.largest_angle
+    if known and settings is None:
+        length = angle = math.inf
+    differing = _differing(chain, nominal, length, angle)
     if differing:
         raise ConfigError(
             f'{where} is not the calibration of this robot: {", ".join(differing)} differ from '
@@ -339,11 +344,14 @@ def nominal_record(nominal: Chain) -> dict[str, Any]:
     return {'convention': nominal.convention, 'joints': rows}
 
 
-def _check_nominal(recorded: object, nominal: Chain, where: str) -> None:
-    """Refuse a nominal chain with other numbers than the one that a calibration comes from."""
+def _check_nominal(recorded: object, nominal: Chain, where: str) -> bool:
+    """Refuse a nominal chain with other numbers than the one that a calibration comes from.
+
+    Return whether those numbers are recorded and can be compared.
+    """
     known = _dictionary(recorded, f'{where}: calibration.nominal')
     if known.get('convention') != nominal.convention:  # nothing recorded, or not comparable
-        return
+        return False
     rows = _dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
     for joint in nominal.joints:
         row = parse_numbers(rows.get(joint.name), len(DH_KINDS), f'{where}: nominal {joint.name}')
@@ -354,10 +362,11 @@ def _check_nominal(recorded: object, nominal: Chain, where: str) -> None:
                     f'{value:.9g} and not {getattr(joint, kind):.9g}: give that one, or identify '
                     'again'
                 )
+    return True
 
 
-def _differing(chain: Chain, nominal: Chain, settings: Settings) -> list[str]:
-    """Return what of the joints differs by more than errors of one robot can."""
+def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
+    """Return what of the joints differs by more than errors of one robot can [m, rad]."""
     if chain.convention != nominal.convention:
         return [f'the conventions ({chain.convention}, {nominal.convention})']
     names = []
@@ -365,7 +374,7 @@ def _differing(chain: Chain, nominal: Chain, settings: Settings) -> list[str]:
         if joint.sign != other.sign:
             names.append(f'the sign of {joint.name}')
         for kind in DH_KINDS:
-            limit = settings.largest_angle if kind in ANGLES else settings.largest_length
+            limit = angle if kind in ANGLES else length
             if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
                 names.append(f'{joint.name}.{kind}')
     return names

@@ -523,3 +523,20 @@ def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
     near = calibrated_text(nominal, {'samples': 3})
     with pytest.raises(ConfigError, match='conventions'):
         parse_calibration(near, 'c.yaml', replace(nominal, convention='modified'))
+
+
+def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identified():
+    nominal = load_chain('ur5e')
+    record = {'accepted': True, 'nominal': nominal_record(nominal)}
+    true = nominal.with_offsets({'elbow_joint.theta': 0.2})
+    far = dump_chain(true, record)
+    assert parse_calibration(far, 'c.yaml', nominal)[0].value('elbow_joint.theta') == (
+        pytest.approx(true.value('elbow_joint.theta'))
+    )
+    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+        parse_calibration(far, 'c.yaml', nominal, Settings())
+    elbow = nominal.joint_names.index('elbow_joint')
+    joints = list(nominal.joints)
+    joints[elbow] = replace(joints[elbow], sign=-1)
+    with pytest.raises(ConfigError, match='the sign of elbow_joint'):
+        parse_calibration(far, 'c.yaml', replace(nominal, joints=tuple(joints)))
