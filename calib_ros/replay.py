@@ -162,12 +162,13 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
     """Return the messages of an open bag on some topics, in the order in which they were logged.
 
-    Those of mcap files come chunk by chunk where each chunk ends before the next begins. All
-    others come as the library merges them, which takes twice as long for mcap.
+    Those of mcap files come chunk by chunk where each chunk ends before the next begins, and as
+    they stand in the file where it has none. All others come as the library merges them, which
+    takes twice as long for mcap.
     """
     storages = getattr(reader.storage, 'storages', [reader.storage])
     if reader.compression_mode != 'message' and all(map(_is_consecutive, storages)):
-        return itertools.chain.from_iterable(_by_chunks(each, streams) for each in storages)
+        return itertools.chain.from_iterable(_in_place(each, streams) for each in storages)
     connections = [c for c in reader.connections if c.topic in streams]
     return (
         (streams[c.topic], data)
@@ -177,23 +178,28 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
 
 
 def _is_consecutive(storage: Any) -> bool:
-    """Return whether a file has chunks, each of which ends before the next one begins."""
-    chunks = getattr(storage, 'chunks', ())
-    pairs = itertools.pairwise(chunks)
-    return bool(chunks) and all(a.message_end_time <= b.message_start_time for a, b in pairs)
+    """Return whether it is an mcap file of which each chunk ends before the next one begins."""
+    if not (hasattr(storage, 'chunks') and hasattr(storage, 'messages_scan')):
+        return False
+    pairs = itertools.pairwise(storage.chunks)
+    return all(a.message_end_time <= b.message_start_time for a, b in pairs)
 
 
-def _by_chunks(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+def _in_place(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
     """Yield the messages of an mcap file; what is wrong with a chunk is raised at the end."""
     channels = {
         each.id: streams[each.topic]
         for each in storage.connections
         if each.topic in streams and each.msgtype == streams[each.topic].type
     }
+    if not storage.chunks:
+        wanted = [each for each in storage.connections if each.id in channels]
+        yield from ((channels[c.id], data) for c, _, data in storage.messages_scan(wanted))
     problem = None
     with storage.path.open('rb') as file:
         for chunk in storage.chunks:
-            if not any(chunk.channel_count.get(key) for key in channels):
+            counts = chunk.channel_count  # empty where the recorder wrote no index of messages
+            if counts and not any(counts.get(key) for key in channels):
                 continue
             file.seek(chunk.chunk_start_offset)
             try:

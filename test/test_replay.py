@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import os
+import struct
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ from calib_ros.chain import Chain, Joint
 from calib_ros.config import Settings
 from calib_ros.errors import InputError
 from calib_ros.intake import Stream
+from calib_ros.mcap import DATA_END, MAGIC, records
 from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.replay import STORAGES, Recording, read, replay, write_bag
 from calib_ros.session import CalibrationSession
@@ -690,6 +692,33 @@ def test_chunks_are_merged_only_where_they_overlap(tmp_path, monkeypatch, log_ti
         found = list(read(reader, STREAMS))
     assert len(found) == (280 if not merged else 0)
     assert bool(merged) == (log_times == 'not in order among chunks')
+
+
+@pytest.mark.parametrize('log_times', LOG_TIMES)
+def test_messages_without_chunks_come_as_they_stand_in_the_file(tmp_path, log_times):
+    """As of rosbag2 with the preset fastwrite; its log times need not be in order."""
+    path = record_in_chunks(tmp_path / 'bag', 'mcap', log_time=LOG_TIMES[log_times])
+    (file,) = path.glob('*.mcap')
+    flat = MAGIC
+    for kind, content in records(file.read_bytes(), len(MAGIC)):
+        flat += struct.pack('<BQ', kind, len(content)) + content
+        if kind == DATA_END:
+            break
+    file.write_bytes(flat + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + MAGIC)
+    session, warnings = session_of(file)
+    account = session.account()
+    assert (account.joint_states, account.poses) == (180, 100)
+    assert not warnings
+
+
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    with Reader(path) as reader:
+        expected = list(read(reader, STREAMS))
+        for chunk in reader.storage.storages[0].chunks:
+            chunk.channel_count.clear()
+        assert list(read(reader, STREAMS)) == expected
+    assert len(expected) == 280
 
 
 def test_the_files_of_a_split_bag_are_read_one_after_the_other(tmp_path):
