@@ -28,6 +28,12 @@ from calib_ros.session import CalibrationSession
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
+STORAGE_ATTRIBUTES = ('chunks', 'connections', 'messages_scan', 'path')
+CHUNK_ATTRIBUTES = (
+    *('message_start_time', 'message_end_time', 'channel_count'),
+    *('chunk_start_offset', 'chunk_length'),
+)
+"""What the library does not promise: without them, it is asked for the messages itself."""
 BATCH = 2000
 """Messages that are decoded at once."""
 STAND_NS = 400_000_000
@@ -166,7 +172,8 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
     they stand in the file where it has none. All others come as the library merges them, which
     takes twice as long for mcap.
     """
-    storages = getattr(reader.storage, 'storages', [reader.storage])
+    storage = getattr(reader, 'storage', None)
+    storages = getattr(storage, 'storages', [storage])
     if reader.compression_mode != 'message' and all(map(_is_consecutive, storages)):
         return itertools.chain.from_iterable(_in_place(each, streams) for each in storages)
     connections = [c for c in reader.connections if c.topic in streams]
@@ -179,7 +186,9 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
 
 def _is_consecutive(storage: Any) -> bool:
     """Return whether it is an mcap file of which each chunk ends before the next one begins."""
-    if not (hasattr(storage, 'chunks') and hasattr(storage, 'messages_scan')):
+    if not all(hasattr(storage, name) for name in STORAGE_ATTRIBUTES):
+        return False
+    if not all(hasattr(each, name) for each in storage.chunks for name in CHUNK_ATTRIBUTES):
         return False
     pairs = itertools.pairwise(storage.chunks)
     return all(a.message_end_time <= b.message_start_time for a, b in pairs)

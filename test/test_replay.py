@@ -16,7 +16,15 @@ from calib_ros.errors import InputError
 from calib_ros.intake import Stream
 from calib_ros.mcap import DATA_END, MAGIC, records
 from calib_ros.messages import DECODERS, JOINT_STATE
-from calib_ros.replay import STORAGES, Recording, read, replay, write_bag
+from calib_ros.replay import (
+    CHUNK_ATTRIBUTES,
+    STORAGE_ATTRIBUTES,
+    STORAGES,
+    Recording,
+    read,
+    replay,
+    write_bag,
+)
 from calib_ros.session import CalibrationSession
 
 MS = 1_000_000
@@ -719,6 +727,24 @@ def test_chunks_without_an_index_of_their_messages_are_read(tmp_path):
             chunk.channel_count.clear()
         assert list(read(reader, STREAMS)) == expected
     assert len(expected) == 280
+
+
+@pytest.mark.parametrize('missing', ['storage', *STORAGE_ATTRIBUTES, *CHUNK_ATTRIBUTES])
+def test_a_library_with_other_attributes_is_asked_itself(missing):
+    chunk = SimpleNamespace(**dict.fromkeys(CHUNK_ATTRIBUTES, 1))
+    storage = SimpleNamespace(**dict.fromkeys(STORAGE_ATTRIBUTES), storages=None)
+    storage.chunks, storage.storages = [chunk], [storage]
+    pose = SimpleNamespace(topic='/pose', msgtype=STREAMS['/pose'].type)
+    reader = SimpleNamespace(
+        storage=storage,
+        compression_mode=None,
+        connections=[pose],
+        messages=lambda connections: [(connections[0], 1, b'data')],
+    )
+    for each in (reader, storage, chunk):
+        if hasattr(each, missing) and not (each is reader and missing == 'connections'):
+            delattr(each, missing)
+    assert list(read(reader, STREAMS)) == [(STREAMS['/pose'], b'data')]
 
 
 def test_the_files_of_a_split_bag_are_read_one_after_the_other(tmp_path):
