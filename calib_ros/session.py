@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -26,7 +26,7 @@ from calib_ros.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.names import FrameNames, JointNames
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
-from calib_ros.samples import Sample, collect
+from calib_ros.samples import Sample, collect, named
 from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.sources import Source
@@ -441,7 +441,7 @@ class CalibrationSession:
         self.adopt(result, self.samples)
         return result
 
-    def adopt(self, result: Identification, samples: Iterable[Sample]) -> None:
+    def adopt(self, result: Identification, samples: Sequence[Sample]) -> None:
         """Keep a result as the calibration if it is accepted, else the last good one stays.
 
         `samples` are those there were when the identification began.
@@ -452,6 +452,7 @@ class CalibrationSession:
                 *(result.chain, result.before, result.world_frame, after.rms_mm),
                 known=frozenset(samples),
                 result=result,
+                frames=named(samples),
             )
 
     def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:

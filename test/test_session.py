@@ -230,6 +230,25 @@ def test_new_samples_judge_the_calibration():
     assert made.calibration.chain is result.chain
 
 
+@pytest.mark.parametrize('first', [0, 1])
+def test_samples_after_a_clear_are_judged_in_the_frames_of_their_targets(first):
+    """Whichever target is seen first, or alone."""
+    rng = np.random.default_rng(5)
+    ball = replace(TRUE, tool=random_frame(rng, 0.2))
+    sources = [tracker(), (Source('ball', target='ball'), *tracker(ball)[1:])]
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    drive(made, UR5E.random_joints(30, rng), sources)
+    result = made.identify()
+    made.clear()
+    drive(made, UR5E.random_joints(5, rng), sources[first : first + 1])
+    assert made.validate()[0].rms_mm < 0.15
+    drive(made, UR5E.random_joints(5, rng), sources)
+    now, nominal = made.validate()
+    assert now.count > 5
+    assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
+    assert made.calibration.chain is result.chain
+
+
 def test_a_bumped_robot_is_noticed():
     made = session(samples())
     made.identify()
