@@ -113,11 +113,6 @@ class FrameNames:
                     'device of its own; then clear and measure again'
                 )
 
-    @property
-    def world(self) -> str:
-        """Return the frame of the device that was heard first; empty before."""
-        return next((names[0] for names in self._known.values()), '')
-
 
 def _picker(index: Sequence[int]) -> Picker:
     """Return a function that picks some values of a sequence."""

@@ -427,7 +427,7 @@ class CalibrationSession:
             fitted[0],
             held_out,
             more=fitted[1:],
-            world_frame=self._frames.world,
+            world_frame=samples[0].frame_id,  # it is the frame of `base`
             **settings.for_problem(),
         )
 

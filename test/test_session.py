@@ -208,6 +208,28 @@ def test_the_frames_of_two_devices_may_differ():
         same.problem()
 
 
+def test_the_world_is_the_frame_of_the_base():
+    """Of two devices the one whose sample came first, and not the one that was heard first."""
+    source, kind, seen = tracker()
+    other = Source('a', device='A')
+
+    def elsewhere(stamp, row):
+        message = seen(stamp, row)
+        message.header.frame_id = 'other'
+        return message
+
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    two = [(other, kind, elsewhere), (source, kind, seen)]
+    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), two)
+    problem = made.problem()
+    assert [(each.device, each.frame_id) for each in made.samples[:2]] == [
+        ('', 'tracker'),
+        ('A', 'other'),
+    ]
+    assert [each.base for each in problem.sets] == ['base', 'base_A']
+    assert problem.world_frame == 'tracker'
+
+
 # Judging
 
 
