@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
+from calib_ros.errors import InputError
 from calib_ros.files import write_file
 from calib_ros.journal import Journal
 from calib_ros.samples import Sample
@@ -88,9 +89,20 @@ class Archive:
         """Begin another journal; return the path of the old one, which stays.
 
         The new one is written at once: after a crash it must be the newest.
+
+        Raises
+        ------
+        InputError
+            When samples cannot be written, which would be lost.
+
         """
+        self.write()
+        if self._waiting:
+            raise InputError(
+                f'samples are in memory only and would be lost: {self.error}; make room, or start '
+                'the node again with another data_dir'
+            )
         old = self.journal
-        self._waiting.clear()
         self.close()
         self._path = self._new_path(JOURNAL)
         self._due = old is not None

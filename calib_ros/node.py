@@ -281,8 +281,8 @@ class CalibrationNode(Node):
 
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)
-        self.session.clear()
         old = self._archive.begin_anew()
+        self.session.clear()
         kept = f'; they stay in {old}' if old else ''
         return True, f'{count} samples cleared{kept}; the calibration stays'
 

@@ -151,14 +151,17 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert stamps(tmp_path) == [1, 3, 5, 6, 7]
 
 
-def test_what_waits_for_room_is_not_written_after_a_clear(tmp_path):
+def test_what_waits_for_room_is_not_lost_by_a_clear(tmp_path):
     archive = open_archive(tmp_path)
     archive.add(sample(1))
     with full_disk(archive.journal.stat().st_size):
         archive.add(sample(2))
-        archive.begin_anew()
+        with pytest.raises(InputError, match='in memory only and would be lost'):
+            archive.begin_anew()
     archive.add(sample(3))
-    assert stamps(tmp_path) == [3]
+    assert stamps(tmp_path) == [1, 2, 3]
+    assert archive.begin_anew() is not None
+    assert stamps(tmp_path) == []
 
 
 def test_no_calibration_is_overwritten(tmp_path):

@@ -249,6 +249,9 @@ def test_a_full_disk(tmp_path, recording):
         level(DiagnosticStatus.ERROR, 'samples are in memory only')
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
+        answer = cell.call('clear')
+        assert not answer.success
+        assert 'samples are in memory only and would be lost' in answer.message
         answer = cell.call('identify')
         assert answer.success, answer.message
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
