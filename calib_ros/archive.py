@@ -8,6 +8,7 @@ Rows that cannot be written, because the disk is full say, wait in memory until 
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
@@ -151,11 +152,19 @@ class Archive:
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:
-        """Write files into a new folder; return its path."""
+        """Write files into a new folder, which is there with all of them or not at all.
+
+        Returns its path.
+        """
         folder = self._new_path('')
-        folder.mkdir(parents=True)
-        for name, content in files.items():
-            write_file(folder / name, content)
+        partial = folder.with_name(f'.{folder.name}.partial')
+        try:
+            partial.mkdir(parents=True)
+            for name, content in files.items():
+                write_file(partial / name, content)
+            partial.rename(folder)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
         return folder
 
     def close(self) -> None:

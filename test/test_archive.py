@@ -174,3 +174,14 @@ def test_no_calibration_is_overwritten(tmp_path):
     assert path.read_text() == 'first'
     assert path.with_suffix('.settings.yaml').read_text() == 'settings: a\n'
     assert not list(tmp_path.glob('*Z.yaml'))
+
+
+def test_an_export_is_whole_or_absent(tmp_path):
+    archive = open_archive(tmp_path / 'data')
+    files = {'a.csv': 'short', 'b.csv': 'too long for the disk'}
+    with full_disk(10), pytest.raises(OSError, match='File too large'):
+        archive.export(files)
+    assert list((tmp_path / 'data').iterdir()) == []
+    folder = archive.export(files)
+    assert list((tmp_path / 'data').iterdir()) == [folder]
+    assert {path.name: path.read_text() for path in folder.iterdir()} == files
