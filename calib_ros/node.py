@@ -304,8 +304,8 @@ class CalibrationNode(Node):
     # Topics out
 
     def _on_tick(self) -> None:
-        self._take_messages()
-        self._keeper.publish_pose()
+        self._diagnostics.tried('taking messages', self._take_messages)
+        self._diagnostics.tried('the corrected pose', self._keeper.publish_pose)
 
     def _on_second(self) -> None:
         """Do what is due once a second; a part that fails does not keep the others from it."""

@@ -39,6 +39,7 @@ from calib_ros.config import load_chain
 from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import ConfigError
 from calib_ros.guide import Guide
+from calib_ros.keeper import Keeper
 from calib_ros.session import CalibrationSession
 from calib_ros.tables import read_journal
 
@@ -274,6 +275,7 @@ def test_a_full_disk(tmp_path, recording):
 
 BROKEN = {
     'taking messages': (node_module, 'feed'),
+    'the corrected pose': (Keeper, 'publish_pose'),
     'the journal': (Archive, 'write'),
     'the status': (CalibrationSession, 'status'),
     'the next pose': (Guide, 'advise'),
