@@ -354,15 +354,20 @@ class CalibrationSession:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what an engineer should know about the measurements."""
+        return tuple(filter(None, (self._frames.different, self._disagreement)))
+
+    @property
+    def _disagreement(self) -> str:
+        """Return in words that the clocks do not agree; empty when they do."""
         if self.delay is None or self.settings.mode == 'continuous':
-            return ()  # there it is a parameter of the fit
+            return ''  # there it is a parameter of the fit
         left = self.delay.seconds - self.settings.delay
         if -EARLY <= left <= self.settings.settle:
-            return ()  # no stop is spoilt by it
+            return ''  # no stop is spoilt by it
         words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
         return (
             f'measurements are stamped {words} than the joint states of their time: '
-            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
+            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree'
         )
 
     @property
@@ -406,7 +411,8 @@ class CalibrationSession:
         self._look_for_delay(None)
         self._collector.flush()
         self._take()
-        self._frames.refuse_different()
+        if self._frames.different:
+            raise InputError(self._frames.different)
         return self.problem_of(self.samples)
 
     def problem_of(self, samples: Sequence[Sample]) -> Problem:

@@ -417,7 +417,9 @@ def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
 def test_poses_in_different_frames_are_refused(cell, recording):
     some = pose_messages(recording.poses)
     some[40].header.frame_id = 'camera'
+    words = cell.listen(String, 'calibration_node/status')
     cell.play(topics(recording, measured_pose=some))
+    cell.spin_until(lambda: words and 'different frames (camera, tracker)' in words[-1].data)
     answer = cell.call('identify')
     assert not answer.success
     assert 'different frames (camera, tracker)' in answer.message
