@@ -8,10 +8,12 @@ Rows that cannot be written, because the disk is full say, wait in memory until 
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
+from calib_ros.errors import InputError
 from calib_ros.files import write_file
 from calib_ros.journal import Journal
 from calib_ros.samples import Sample
@@ -88,9 +90,20 @@ class Archive:
         """Begin another journal; return the path of the old one, which stays.
 
         The new one is written at once: after a crash it must be the newest.
+
+        Raises
+        ------
+        InputError
+            When samples cannot be written, which would be lost.
+
         """
+        self.write()
+        if self._waiting:
+            raise InputError(
+                f'samples are in memory only and would be lost: {self.error}; make room, or start '
+                'the node again with another data_dir'
+            )
         old = self.journal
-        self._waiting.clear()
         self.close()
         self._path = self._new_path(JOURNAL)
         self._due = old is not None
@@ -139,11 +152,19 @@ class Archive:
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:
-        """Write files into a new folder; return its path."""
+        """Write files into a new folder, which is there with all of them or not at all.
+
+        Returns its path.
+        """
         folder = self._new_path('')
-        folder.mkdir(parents=True)
-        for name, content in files.items():
-            write_file(folder / name, content)
+        partial = folder.with_name(f'.{folder.name}.partial')
+        try:
+            partial.mkdir(parents=True)
+            for name, content in files.items():
+                write_file(partial / name, content)
+            partial.rename(folder)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
         return folder
 
     def close(self) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from calib_ros.chain import Chain
 from calib_ros.errors import InputError
 from calib_ros.identification import Identification
-from calib_ros.samples import Frames, Sample, collect
+from calib_ros.samples import Frames, Sample, collect, named
 from calib_ros.validation import ErrorFigures, compare
 
 
@@ -20,7 +20,8 @@ class Calibration:
 
     `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
     the error that it was judged to have, and `known` holds the samples that were there by then.
-    `result` is the identification that it comes from, if it was here.
+    `result` is the identification that it comes from, and `frames` holds the names that the
+    frames had there, if it was here.
     """
 
     chain: Chain
@@ -29,6 +30,7 @@ class Calibration:
     rms_mm: float | None
     known: frozenset[Sample]
     result: Identification | None = None
+    frames: Frames | None = None
 
     def judged(
         self, samples: Sequence[Sample], sigmas: tuple[float, float]
@@ -44,9 +46,9 @@ class Calibration:
             Without such samples, or when they are between frames that it does not have.
 
         """
-        frames = Frames()
-        for sample in samples:
-            frames.of(sample)
+        frames = self.frames
+        if frames is None:  # the first device and target are taken for those of the file
+            frames = named(samples)
         since = [each for each in samples if each not in self.known]
         sets = [each for part in collect(since, sigmas, frames) for each in part]
         if not sets:

@@ -324,6 +324,7 @@ def parse_calibration(
         )
     if record.get('accepted') is False:
         raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
+    _check_figures(record, where)
     known = _check_nominal(record.get('nominal'), nominal, where)
     limits = settings or Settings()
     length, angle = limits.largest_length, limits.largest_angle
@@ -342,6 +343,16 @@ def nominal_record(nominal: Chain) -> dict[str, Any]:
     """Return the numbers of the chain that a calibration belongs to, row by row."""
     rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
     return {'convention': nominal.convention, 'joints': rows}
+
+
+def _check_figures(record: dict[str, Any], where: str) -> None:
+    """Refuse what a calibration could not be judged by, or published under."""
+    rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
+    number = isinstance(rms, int | float) and not isinstance(rms, bool)
+    if not number or not 0.0 <= rms < math.inf:
+        raise ConfigError(f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}')
+    if not isinstance(frame, str):
+        raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
 
 
 def _check_nominal(recorded: object, nominal: Chain, where: str) -> bool:

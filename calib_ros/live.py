@@ -37,7 +37,7 @@ from calib_ros.leastsquares import (
 )
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
-from calib_ros.robust import thorough_fit
+from calib_ros.robust import robust_fit, thorough_fit
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
 
@@ -50,6 +50,8 @@ START = 6
 """Configurations with which the frames can be found."""
 MOST_ANEW = 500
 """Samples up to which the linear model is made anew, and with which it begins at most."""
+MOST_THOROUGH = 60
+"""Parameters up to which it begins with the thorough fit, which takes too long for more."""
 GROWN = 1.2
 """Growth of the number of samples from which all of them are judged anew."""
 MOST_AT_ONCE = 2000
@@ -168,7 +170,8 @@ class LiveEstimate:
         groups = self._groups(fitted)
         system = self._system(groups, self._prior)
         loss = 'redescending' if self._enough(system.rows) else 'none'
-        robust = thorough_fit(chain, self._names, system, loss)
+        fit = thorough_fit if len(self._names) <= MOST_THOROUGH else robust_fit
+        robust = fit(chain, self._names, system, loss)
         members = [sample for group, _ in groups for sample in group]
         judged = list(zip(members, robust.outliers.tolist(), strict=True))
         self._added = [sample for sample, gross in judged if not gross]

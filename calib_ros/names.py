@@ -10,7 +10,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.errors import InputError
 from calib_ros.messages import JointReadings, MessageError
 from calib_ros.se3 import FloatArray
 
@@ -96,27 +95,17 @@ class FrameNames:
                 raise MessageError(f'in one of more than {MOST_NAMES} frames')
             known.append(frame_id)
 
-    def refuse_different(self) -> None:
-        """Refuse what one device measured in different frames.
-
-        Raises
-        ------
-        InputError
-            When there is such a device.
-
-        """
+    @property
+    def different(self) -> str:
+        """Return in words that one device measured in different frames; empty when none did."""
         for names in self._known.values():
             if len(names) > 1:
-                raise InputError(
+                return (
                     f'poses came in different frames ({", ".join(sorted(names))}), one is '
                     'needed: set frame_id (--frame-id) to the one to use, or give each source a '
                     'device of its own; then clear and measure again'
                 )
-
-    @property
-    def world(self) -> str:
-        """Return the frame of the device that was heard first; empty before."""
-        return next((names[0] for names in self._known.values()), '')
+        return ''
 
 
 def _picker(index: Sequence[int]) -> Picker:

@@ -281,8 +281,8 @@ class CalibrationNode(Node):
 
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)
-        self.session.clear()
         old = self._archive.begin_anew()
+        self.session.clear()
         kept = f'; they stay in {old}' if old else ''
         return True, f'{count} samples cleared{kept}; the calibration stays'
 
@@ -304,8 +304,8 @@ class CalibrationNode(Node):
     # Topics out
 
     def _on_tick(self) -> None:
-        self._take_messages()
-        self._keeper.publish_pose()
+        self._diagnostics.tried('taking messages', self._take_messages)
+        self._diagnostics.tried('the corrected pose', self._keeper.publish_pose)
 
     def _on_second(self) -> None:
         """Do what is due once a second; a part that fails does not keep the others from it."""

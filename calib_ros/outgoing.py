@@ -23,7 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from calib_ros.chain import DH_KINDS, Chain
 from calib_ros.identification import Identification, residuals
 from calib_ros.observations import Observations
-from calib_ros.se3 import FloatArray, to_quat
+from calib_ros.se3 import FloatArray, invert, to_quat
 
 MOST_ARROWS = 1000
 
@@ -98,16 +98,19 @@ def residual_markers(
     lines.header.frame_id = result.world_frame
     lines.pose.orientation.w = 1.0
     lines.scale.x = 0.002
+    base = result.chain.frame('base').matrix
     for each in sets:
         if each.distances is not None:
             continue
         left = residuals(result.chain, each).position
         size = np.linalg.norm(left, axis=1)
         share = np.clip(size / max(3.0 * float(np.sqrt(np.mean(size**2))), 1e-12), 0.0, 1.0)
-        ends = each.positions - scale * left
+        world = base @ invert(result.chain.frame(each.base).matrix)
+        begins = each.positions @ world[:3, :3].T + world[:3, 3]
+        ends = begins - scale * left @ world[:3, :3].T
         for k in range(max(0, len(each) - MOST_ARROWS), len(each)):
             color = ColorRGBA(r=float(share[k]), g=float(1.0 - share[k]), b=0.0, a=1.0)
-            for x, y, z in (each.positions[k].tolist(), ends[k].tolist()):
+            for x, y, z in (begins[k].tolist(), ends[k].tolist()):
                 lines.points.append(Point(x=x, y=y, z=z))
                 lines.colors.append(color)
     return MarkerArray(markers=[lines])

@@ -123,6 +123,14 @@ class Frames:
         return f'_{plain(label[1]) or number + 1}' if number else ''
 
 
+def named(samples: Iterable[Sample]) -> Frames:
+    """Return the names of the frames of samples, in the order in which these were taken."""
+    frames = Frames()
+    for sample in samples:
+        frames.of(sample)
+    return frames
+
+
 def plain(name: str) -> str:
     """Return a name as part of a frame's, which holds no dots."""
     return name.replace('.', '-')

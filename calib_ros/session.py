@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
@@ -26,7 +26,7 @@ from calib_ros.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.names import FrameNames, JointNames
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
-from calib_ros.samples import Sample, collect
+from calib_ros.samples import Sample, collect, named
 from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.sources import Source
@@ -354,15 +354,20 @@ class CalibrationSession:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what an engineer should know about the measurements."""
+        return tuple(filter(None, (self._frames.different, self._disagreement)))
+
+    @property
+    def _disagreement(self) -> str:
+        """Return in words that the clocks do not agree; empty when they do."""
         if self.delay is None or self.settings.mode == 'continuous':
-            return ()  # there it is a parameter of the fit
+            return ''  # there it is a parameter of the fit
         left = self.delay.seconds - self.settings.delay
         if -EARLY <= left <= self.settings.settle:
-            return ()  # no stop is spoilt by it
+            return ''  # no stop is spoilt by it
         words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
         return (
             f'measurements are stamped {words} than the joint states of their time: '
-            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree',
+            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree'
         )
 
     @property
@@ -406,7 +411,8 @@ class CalibrationSession:
         self._look_for_delay(None)
         self._collector.flush()
         self._take()
-        self._frames.refuse_different()
+        if self._frames.different:
+            raise InputError(self._frames.different)
         return self.problem_of(self.samples)
 
     def problem_of(self, samples: Sequence[Sample]) -> Problem:
@@ -427,7 +433,7 @@ class CalibrationSession:
             fitted[0],
             held_out,
             more=fitted[1:],
-            world_frame=self._frames.world,
+            world_frame=samples[0].frame_id,  # it is the frame of `base`
             **settings.for_problem(),
         )
 
@@ -441,7 +447,7 @@ class CalibrationSession:
         self.adopt(result, self.samples)
         return result
 
-    def adopt(self, result: Identification, samples: Iterable[Sample]) -> None:
+    def adopt(self, result: Identification, samples: Sequence[Sample]) -> None:
         """Keep a result as the calibration if it is accepted, else the last good one stays.
 
         `samples` are those there were when the identification began.
@@ -452,6 +458,7 @@ class CalibrationSession:
                 *(result.chain, result.before, result.world_frame, after.rms_mm),
                 known=frozenset(samples),
                 result=result,
+                frames=named(samples),
             )
 
     def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:

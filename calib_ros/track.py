@@ -240,12 +240,26 @@ class Track:
     def standing(self, still: float, window: float) -> Stamps:
         """Return (K, 2) from when to when all joints stood, after `sort`.
 
-        A joint stands where its value [rad or m] has stayed within `still` during a window [s].
+        A joint stands where its value [rad or m] has stayed within `still` during a window [s]. Of
+        several publishers that name it one must show that, and none that is heard the contrary.
         """
+        stands = {
+            columns: _standing(
+                rows.stamps,
+                _continuous(rows.values, self._revolute[list(columns)]),
+                still,
+                round(window * 1e9),
+                self._max_gap_ns,
+            )
+            for columns, rows in self._parts.items()
+        }
         common: Stamps | None = None
-        for columns, rows in self._parts.items():
-            values = _continuous(rows.values, self._revolute[list(columns)])
-            found = _standing(rows.stamps, values, still, round(window * 1e9), self._max_gap_ns)
+        named = [tuple(c for c in stands if k in c) for k in range(len(self._revolute))]
+        for several in dict.fromkeys(filter(None, named)):
+            found = _union([stands[columns] for columns in several])
+            for columns in several if len(several) > 1 else ():
+                unheard = _unheard(self._parts[columns].stamps, self._max_gap_ns)
+                found = _intersection(found, _union([stands[columns], unheard]))
             common = found if common is None else _intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
 
@@ -440,6 +454,28 @@ def _standing(
     found = np.stack([stamps[back[starts]], stamps[ends]], axis=1)
     found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch parts two stands
     return np.asarray(found[found[:, 0] < found[:, 1]], dtype=np.int64)
+
+
+def _unheard(stamps: Stamps, max_gap_ns: int) -> Stamps:
+    """Return (K, 2) when a publisher was not heard; what it shows before and after overlaps."""
+    limits = np.iinfo(np.int64)
+    gaps = np.flatnonzero(np.diff(stamps) > max_gap_ns)
+    begins = np.concatenate([[limits.min], stamps[gaps] - 1, stamps[-1:] - 1])
+    ends = np.concatenate([stamps[:1] + 1, stamps[gaps + 1] + 1, [limits.max]])
+    return np.stack([begins, ends], axis=1)
+
+
+def _union(several: Sequence[Stamps]) -> Stamps:
+    """Return (K, 2) the intervals of sorted lists, those that overlap as one."""
+    if len(several) == 1:
+        return several[0]
+    found = np.concatenate(several)
+    found = found[np.argsort(found[:, 0], kind='stable')]
+    ends = np.maximum.accumulate(found[:, 1])
+    apart = found[1:, 0] >= ends[:-1]
+    firsts = np.concatenate([np.ones(len(found[:1]), dtype=bool), apart])
+    lasts = np.concatenate([apart, np.ones(len(found[:1]), dtype=bool)])
+    return np.stack([found[firsts, 0], ends[lasts]], axis=1)
 
 
 def _intersection(first: Stamps, second: Stamps) -> Stamps:

@@ -151,14 +151,17 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert stamps(tmp_path) == [1, 3, 5, 6, 7]
 
 
-def test_what_waits_for_room_is_not_written_after_a_clear(tmp_path):
+def test_what_waits_for_room_is_not_lost_by_a_clear(tmp_path):
     archive = open_archive(tmp_path)
     archive.add(sample(1))
     with full_disk(archive.journal.stat().st_size):
         archive.add(sample(2))
-        archive.begin_anew()
+        with pytest.raises(InputError, match='in memory only and would be lost'):
+            archive.begin_anew()
     archive.add(sample(3))
-    assert stamps(tmp_path) == [3]
+    assert stamps(tmp_path) == [1, 2, 3]
+    assert archive.begin_anew() is not None
+    assert stamps(tmp_path) == []
 
 
 def test_no_calibration_is_overwritten(tmp_path):
@@ -171,3 +174,14 @@ def test_no_calibration_is_overwritten(tmp_path):
     assert path.read_text() == 'first'
     assert path.with_suffix('.settings.yaml').read_text() == 'settings: a\n'
     assert not list(tmp_path.glob('*Z.yaml'))
+
+
+def test_an_export_is_whole_or_absent(tmp_path):
+    archive = open_archive(tmp_path / 'data')
+    files = {'a.csv': 'short', 'b.csv': 'too long for the disk'}
+    with full_disk(10), pytest.raises(OSError, match='File too large'):
+        archive.export(files)
+    assert list((tmp_path / 'data').iterdir()) == []
+    folder = archive.export(files)
+    assert list((tmp_path / 'data').iterdir()) == [folder]
+    assert {path.name: path.read_text() for path in folder.iterdir()} == files

@@ -540,3 +540,21 @@ def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identi
     joints[elbow] = replace(joints[elbow], sign=-1)
     with pytest.raises(ConfigError, match='the sign of elbow_joint'):
         parse_calibration(far, 'c.yaml', replace(nominal, joints=tuple(joints)))
+
+
+@pytest.mark.parametrize(
+    ('key', 'value'),
+    [
+        ('rms_mm_after', float('nan')),
+        ('rms_mm_after', 'small'),
+        ('rms_mm_after', -0.1),
+        ('world_frame', 5),
+        ('world_frame', None),
+    ],
+)
+def test_a_record_by_which_nothing_can_be_judged_is_refused(key, value):
+    nominal = load_chain('ur10e')
+    record = {'nominal': nominal_record(nominal), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
+    parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    with pytest.raises(ConfigError, match=f'c.yaml: calibration.{key} must be'):
+        parse_calibration(calibrated_text(nominal, record | {key: value}), 'c.yaml', nominal)

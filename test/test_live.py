@@ -152,6 +152,18 @@ def test_gross_errors_among_the_first_samples_are_found_later(oriented, places, 
     assert apart(said[-1].chain, batch.chain, rng) < 0.05 * NOISE[0]
 
 
+def test_with_many_parameters_it_begins_with_the_shorter_fit(rng, monkeypatch):
+    """It finds the same gross errors, for which the thorough one would take seconds."""
+    monkeypatch.setattr(live_module, 'MOST_THOROUGH', 20)
+    monkeypatch.setattr(live_module, 'thorough_fit', lambda *arguments: pytest.fail('too long'))
+    samples = seen(faulty(UR10E, Cell(), rng), 50, rng)
+    wrong = rng.choice(50, 5, replace=False).tolist()
+    for k in wrong:
+        samples[k] = replace(samples[k], position=samples[k].position + 5e-3)
+    live, _ = growing(samples)
+    assert set(live.suspicious) == {samples[k] for k in wrong}
+
+
 def test_samples_that_early_ones_speak_against_come_back(rng):
     """The target was knocked after twenty samples; forty more, and those of before are wrong."""
     true = faulty(UR10E, Cell(), rng)

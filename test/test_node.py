@@ -556,9 +556,28 @@ def test_residual_markers_are_well_formed(cell, recording):
     begins = np.array([[p.x, p.y, p.z] for p in lines.points[::2]])
     ends = np.array([[p.x, p.y, p.z] for p in lines.points[1::2]])
     measured = cell.node.session.problem().observations
-    np.testing.assert_array_equal(begins, measured.positions)
+    np.testing.assert_allclose(begins, measured.positions, atol=1e-12)
     predicted = cell.node.session.calibration.chain.forward(measured.joints)[:, :3, 3]
     np.testing.assert_allclose(ends - begins, 200.0 * (predicted - measured.positions), atol=1e-9)
+
+
+def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, truth):
+    there = replace(truth, base=random_frame(np.random.default_rng(8), 2.0))
+    joints = recording.poses.joints
+    other = measure(there, joints, np.random.default_rng(9), 2e-5, 1e-4).at(
+        recording.poses.stamps_ns
+    )
+    sources = ['measured_pose', 'other device=B']
+    with Cell(chain='ur10e', data_dir=str(tmp_path), sources=sources) as cell:
+        some = pose_messages(other, frame_id='elsewhere')
+        cell.play(topics(recording, other=some))
+        assert cell.call('identify').success
+        heard = cell.listen(MarkerArray, 'calibration_node/residuals')
+        cell.spin_until(lambda: heard)
+        (lines,) = heard[0].markers
+        assert lines.header.frame_id == 'tracker'
+        ends = np.array([[p.x, p.y, p.z] for p in lines.points[::2]]).reshape(2, STOPS, 3)
+        np.testing.assert_allclose(ends[1], ends[0], atol=5e-4)
 
 
 # Parameters

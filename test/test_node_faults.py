@@ -39,6 +39,7 @@ from calib_ros.config import load_chain
 from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import ConfigError
 from calib_ros.guide import Guide
+from calib_ros.keeper import Keeper
 from calib_ros.session import CalibrationSession
 from calib_ros.tables import read_journal
 
@@ -249,6 +250,9 @@ def test_a_full_disk(tmp_path, recording):
         level(DiagnosticStatus.ERROR, 'samples are in memory only')
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
+        answer = cell.call('clear')
+        assert not answer.success
+        assert 'samples are in memory only and would be lost' in answer.message
         answer = cell.call('identify')
         assert answer.success, answer.message
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
@@ -271,6 +275,7 @@ def test_a_full_disk(tmp_path, recording):
 
 BROKEN = {
     'taking messages': (node_module, 'feed'),
+    'the corrected pose': (Keeper, 'publish_pose'),
     'the journal': (Archive, 'write'),
     'the status': (CalibrationSession, 'status'),
     'the next pose': (Guide, 'advise'),
@@ -412,7 +417,9 @@ def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
 def test_poses_in_different_frames_are_refused(cell, recording):
     some = pose_messages(recording.poses)
     some[40].header.frame_id = 'camera'
+    words = cell.listen(String, 'calibration_node/status')
     cell.play(topics(recording, measured_pose=some))
+    cell.spin_until(lambda: words and 'different frames (camera, tracker)' in words[-1].data)
     answer = cell.call('identify')
     assert not answer.success
     assert 'different frames (camera, tracker)' in answer.message

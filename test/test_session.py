@@ -208,6 +208,28 @@ def test_the_frames_of_two_devices_may_differ():
         same.problem()
 
 
+def test_the_world_is_the_frame_of_the_base():
+    """Of two devices the one whose sample came first, and not the one that was heard first."""
+    source, kind, seen = tracker()
+    other = Source('a', device='A')
+
+    def elsewhere(stamp, row):
+        message = seen(stamp, row)
+        message.header.frame_id = 'other'
+        return message
+
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    two = [(other, kind, elsewhere), (source, kind, seen)]
+    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), two)
+    problem = made.problem()
+    assert [(each.device, each.frame_id) for each in made.samples[:2]] == [
+        ('', 'tracker'),
+        ('A', 'other'),
+    ]
+    assert [each.base for each in problem.sets] == ['base', 'base_A']
+    assert problem.world_frame == 'tracker'
+
+
 # Judging
 
 
@@ -226,6 +248,25 @@ def test_new_samples_judge_the_calibration():
     drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker()])
     now, nominal = made.validate()
     assert now.count == 8
+    assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
+    assert made.calibration.chain is result.chain
+
+
+@pytest.mark.parametrize('first', [0, 1])
+def test_samples_after_a_clear_are_judged_in_the_frames_of_their_targets(first):
+    """Whichever target is seen first, or alone."""
+    rng = np.random.default_rng(5)
+    ball = replace(TRUE, tool=random_frame(rng, 0.2))
+    sources = [tracker(), (Source('ball', target='ball'), *tracker(ball)[1:])]
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    drive(made, UR5E.random_joints(30, rng), sources)
+    result = made.identify()
+    made.clear()
+    drive(made, UR5E.random_joints(5, rng), sources[first : first + 1])
+    assert made.validate()[0].rms_mm < 0.15
+    drive(made, UR5E.random_joints(5, rng), sources)
+    now, nominal = made.validate()
+    assert now.count > 5
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
     assert made.calibration.chain is result.chain
 

@@ -358,6 +358,36 @@ def test_all_publishers_must_stand():
     assert abs(end - 700 * MS) <= 20 * MS
 
 
+@pytest.mark.parametrize('times', [[300], [100, 700], range(0, 1000, 250), range(300, 340, 10)])
+def test_a_publisher_that_is_heard_now_and_then_does_not_part_a_stop(times):
+    made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
+    for ms in times:
+        made.add((1,), ms * MS, np.array([0.0]))
+    made.sort()
+    assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
+
+
+def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
+    """As one that repeats what others published, some time later."""
+    made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
+    for ms in range(200, 800, 10):
+        made.add((1,), ms * MS, np.array([max(0.0, 1e-4 * (ms - 500))]))
+    made.sort()
+    (begin, first), (second, end) = (np.array(made.standing(5e-4, 0.1)) // MS).tolist()
+    assert (begin, end) == (0, 990)
+    assert 500 <= first <= 510
+    assert 780 <= second <= 790
+
+
+def test_a_joint_that_nobody_shows_to_stand_does_not():
+    made = filled([(0, (0.0, 0.0)), (500, (0.0, 0.0))])
+    made.add((1,), 250 * MS, np.array([0.0]))
+    for ms in range(0, 600, 10):
+        made.add((0,), ms * MS, np.array([0.0]))
+    made.sort()
+    assert made.standing(5e-4, 0.1).tolist() == []
+
+
 def test_a_joint_that_stands_at_half_a_turn_stands(rng):
     """A driver that counts within one turn reports it now as pi, now as -pi."""
     angles = np.pi + rng.normal(scale=1e-5, size=100)
