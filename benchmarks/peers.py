@@ -171,8 +171,8 @@ def compare(options):
                     before = last.get(name, (1, 0.0))
                     if before is None or before[1] * count / before[0] > 2.0 * options.limit:
                         continue
-                    peer = name in PEERS or (name == 'one by one' and count > 500)
-                    times = 1 if peer else 5 if count <= 5000 else 2
+                    peer = name in PEERS or (name == 'one by one' and count > 50)
+                    times = 1 if peer else 20 if count <= 500 else 5 if count <= 5000 else 2
                     figures = run(python, name, folder, times, options.limit)
                     took = 'too long' if figures is None else f'{figures["seconds"]:.3g} s'
                     print(f'{kind}, {count} poses, {name}: {took}', file=sys.stderr, flush=True)

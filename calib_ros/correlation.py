@@ -120,7 +120,7 @@ class _Stops:
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     """Return which neighbours share errors, and the noise that follows."""
     kinds = tuple(LENGTHS)
-    total = sum(len(np.unique(stops(samples.observations.joints))) for samples in system.sets)
+    total = sum(int(stops(samples.observations.joints)[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // MOST))
     few = _gather(fit.chain, names, system, share, RUN)
     correlations = dict.fromkeys(kinds, 0.0)

@@ -321,7 +321,7 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
     for each, kind in zip(problem.sets, problem.kinds, strict=True):
         if not len(each):
             raise InputError(f'there are no pairs to fit between {each.base} and {each.tool}')
-        count = len(np.unique(each.configurations))
+        count = int(each.configurations.max()) + 1
         rows += count * kind.rows
         configurations += count
     if rows < len(names):

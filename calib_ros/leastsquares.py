@@ -196,19 +196,28 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
 
     Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
     """
-    came = None if observations.approach is None else np.ascontiguousarray(observations.approach.T)
     delay = chain.frame(observations.base).delay
     then = observations if delay is None else observations.earlier(delay)
-    joints = chain.effective(np.ascontiguousarray(then.joints.T), came)
-    axes, origin = chain.trace(joints, base=observations.base, tool=observations.tool)
-    if observations.distances is not None:
-        length = np.linalg.norm(origin, axis=0)
-        nothing = np.full((len(observations), 3), np.nan)
-        return (observations.distances - length)[:, np.newaxis], nothing
-    measured = np.ascontiguousarray(observations.rotations.transpose(2, 1, 0))
-    orientation = orientation_error(measured, axes).T
-    orientation[~observations.oriented] = np.nan
-    return observations.positions - origin.T, orientation
+    distances = observations.distances
+    position = np.empty((len(then), 3 if distances is None else 1))
+    orientation = np.full((len(then), 3), np.nan)
+    oriented = observations.oriented & (distances is None)
+    for start in range(0, len(then), BLOCK):
+        part = slice(start, start + BLOCK)
+        q = np.ascontiguousarray(then.joints[part].T)
+        came = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
+        axes, origin = chain.trace(
+            chain.effective(q, came), base=observations.base, tool=observations.tool
+        )
+        if distances is not None:
+            position[part, 0] = distances[part] - np.linalg.norm(origin, axis=0)
+            continue
+        position[part] = observations.positions[part] - origin.T
+        if oriented[part].any():
+            measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
+            orientation[part] = orientation_error(measured, axes).T
+    orientation[~oriented] = np.nan
+    return position, orientation
 
 
 def _along(origin: FloatArray, shift: FloatArray, distances: FloatArray) -> FloatArray:

@@ -115,8 +115,7 @@ def _squares(
             sums[k] += weights[known] @ (part[known] ** 2).sum(axis=1)
             counts[k] += part.shape[1] * weights[known].sum()
             groups = samples.observations.configurations[known]
-            together = np.zeros((int(groups.max(initial=-1)) + 1, part.shape[1]))
-            np.add.at(together, groups, np.sqrt(weights[known])[:, np.newaxis] * part[known])
-            joint_sums[k] += (together**2).sum()
-            joint_counts[k] += part.shape[1] * len(np.unique(groups))
+            weighted = np.sqrt(weights[known]) * part[known].T
+            joint_sums[k] += sum((np.bincount(groups, row) ** 2).sum() for row in weighted)
+            joint_counts[k] += part.shape[1] * np.count_nonzero(np.bincount(groups))
     return sums, counts, joint_sums, joint_counts
