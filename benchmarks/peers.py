@@ -242,14 +242,15 @@ def draw(found, path):
 
     figure, axes = pyplot.subplots(1, len(found), figsize=(5.0 * len(found), 4.0), squeeze=False)
     for place, (kind, by_name) in zip(axes[0], found.items(), strict=True):
-        for name, by_count in by_name.items():
+        for k, name in enumerate((*OURS, *PEERS)):
+            by_count = by_name.get(name, {})
             mine = name in ('calib_ros', 'fit', 'streamed')
             times = [each['seconds'] for each in by_count.values()]
-            style = 'o-' if mine else 's--'
+            style = f'C{k}o-' if mine else f'C{k}s--'
             place.loglog(list(by_count), times, style, ms=4, lw=2.0 if mine else 1.0, label=name)
         place.set(xlabel='poses', ylabel='wall time [s]', title=kind)
         place.grid(alpha=0.3)
-    axes[0, -1].legend(fontsize=8)
+    axes[0, -1].legend(fontsize=8, loc='center left', bbox_to_anchor=(1.0, 0.5))
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 
