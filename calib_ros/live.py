@@ -253,9 +253,14 @@ class LiveEstimate:
                 (self.suspicious if far else good).append(sample)
         return good
 
-    def _step(self) -> FloatArray:
+    def _scaled(self) -> tuple[FloatArray, FloatArray]:
+        """Return scales (P,), and the information matrix with a diagonal of one by them."""
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
         matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        return scale, matrix
+
+    def _step(self) -> FloatArray:
+        scale, matrix = self._scaled()
         return np.asarray(scale * linalg.solve(matrix, scale * self._vector, assume_a='pos'))
 
     def _estimate(self) -> Chain:
@@ -267,8 +272,7 @@ class LiveEstimate:
         left = max(self._cost - float(self._step() @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
         noise = max(left / freedom, LEAST_NOISE**2) if freedom > 0 else 1.0
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
-        matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        scale, matrix = self._scaled()
         return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
 
     def _result(self) -> Estimate:

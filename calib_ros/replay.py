@@ -28,11 +28,9 @@ from calib_ros.session import CalibrationSession
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
-STORAGE_ATTRIBUTES = ('chunks', 'connections', 'messages_scan', 'path')
-CHUNK_ATTRIBUTES = (
-    *('message_start_time', 'message_end_time', 'channel_count'),
-    *('chunk_start_offset', 'chunk_length'),
-)
+STORAGE = ('chunks', 'connections', 'messages_scan', 'path')
+TIMES = ('message_start_time', 'message_end_time')
+CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length')
 """What the library does not promise: without them, it is asked for the messages itself."""
 BATCH = 2000
 """Messages that are decoded at once."""
@@ -186,9 +184,9 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
 
 def _is_consecutive(storage: Any) -> bool:
     """Return whether it is an mcap file of which each chunk ends before the next one begins."""
-    if not all(hasattr(storage, name) for name in STORAGE_ATTRIBUTES):
+    if not all(hasattr(storage, name) for name in STORAGE):
         return False
-    if not all(hasattr(each, name) for each in storage.chunks for name in CHUNK_ATTRIBUTES):
+    if not all(hasattr(each, name) for each in storage.chunks for name in CHUNK):
         return False
     pairs = itertools.pairwise(storage.chunks)
     return all(a.message_end_time <= b.message_start_time for a, b in pairs)

@@ -17,8 +17,8 @@ from calib_ros.intake import Stream
 from calib_ros.mcap import DATA_END, MAGIC, records
 from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.replay import (
-    CHUNK_ATTRIBUTES,
-    STORAGE_ATTRIBUTES,
+    CHUNK,
+    STORAGE,
     STORAGES,
     Recording,
     read,
@@ -729,10 +729,10 @@ def test_chunks_without_an_index_of_their_messages_are_read(tmp_path):
     assert len(expected) == 280
 
 
-@pytest.mark.parametrize('missing', ['storage', *STORAGE_ATTRIBUTES, *CHUNK_ATTRIBUTES])
+@pytest.mark.parametrize('missing', ['storage', *STORAGE, *CHUNK])
 def test_a_library_with_other_attributes_is_asked_itself(missing):
-    chunk = SimpleNamespace(**dict.fromkeys(CHUNK_ATTRIBUTES, 1))
-    storage = SimpleNamespace(**dict.fromkeys(STORAGE_ATTRIBUTES), storages=None)
+    chunk = SimpleNamespace(**dict.fromkeys(CHUNK, 1))
+    storage = SimpleNamespace(**dict.fromkeys(STORAGE), storages=None)
     storage.chunks, storage.storages = [chunk], [storage]
     pose = SimpleNamespace(topic='/pose', msgtype=STREAMS['/pose'].type)
     reader = SimpleNamespace(
