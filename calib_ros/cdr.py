@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.messages import (
     JOINT_STATE,
     LARGEST,
@@ -30,6 +29,7 @@ from calib_ros.messages import (
 )
 from calib_ros.se3 import FloatArray
 from calib_ros.track import Stamps
+from calib_ros.values import QUATERNION_TOLERANCE
 
 LITTLE_ENDIAN = b'\x00\x01'
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp

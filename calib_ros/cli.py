@@ -286,13 +286,7 @@ def _export(options: argparse.Namespace) -> int:
 def _chain(options: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from calib_ros.config import (
-        URDF_SUFFIXES,
-        chain_document,
-        dump_chain,
-        load_chain,
-        read_urdf,
-    )
+    from calib_ros.config import URDF_SUFFIXES, chain_document, dump_chain, load_chain, read_urdf
     from calib_ros.files import write_file
 
     names = ('base_link', 'tip_link', 'convention')
@@ -319,9 +313,10 @@ def _chain(options: argparse.Namespace) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     from calib_ros import report
-    from calib_ros.config import Settings, load_chain
+    from calib_ros.config import load_chain
     from calib_ros.replay import replay
     from calib_ros.session import CalibrationSession
+    from calib_ros.settings import Settings
 
     refuse_overwriting(options, RESULT_FILES)
     options.bag = options.out / 'bag'

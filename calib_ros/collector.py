@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from calib_ros import se3
 from calib_ros.chain import Chain
-from calib_ros.config import Settings
 from calib_ros.delays import Delay, find_delay
 from calib_ros.dwells import Mean, RestlessError, average
 from calib_ros.messages import Reading
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
+from calib_ros.settings import Settings
 from calib_ros.track import CAUSES, Motion, Rows, Stamps, Track, unwrapped
 
 WINDOW = 0.1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings, and chain files: YAML to chain and back.
+"""Chain files and calibrations: YAML to chain and back.
 
 One schema for nominal and corrected chains, so that an output is an input. `docs/formats.md`
 describes it. A URDF is read as a nominal chain.
@@ -12,7 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,10 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
-from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
-from calib_ros.se3 import FloatArray
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.settings import Settings
 from calib_ros.urdf import chain_from_urdf
+from calib_ros.values import QUATERNION_TOLERANCE, parse_number, parse_numbers
 
 CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
@@ -30,132 +31,9 @@ CHAIN_KEYS = (
 )
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
-MODES = ('dwell', 'continuous', 'triggered')
-"""How samples are taken."""
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
-QUATERNION_TOLERANCE = 1e-3
-"""A quaternion whose length differs from 1 by more is refused as not being one."""
 SAME = 1e-9
 """Numbers [m, rad] of two nominal chains that differ by less are the same."""
-
-
-STARTUP = (
-    *('max_gap', 'joint_buffer', 'pose_buffer', 'mode', 'lateness', 'delay', 'sources'),
-    *('joint_topics', 'joint_names'),
-)
-"""Settings that a running node cannot change."""
-
-
-def _setting(default: Any, text: str, lower: float | None = None) -> Any:
-    """Declare a setting with what a node parameter and a command line option need to know."""
-    if isinstance(default, tuple):
-        return field(default=default, metadata={'text': text})
-    return field(default=default, metadata={'text': text, 'lower': lower})
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Everything that can be set besides the chain; same names in the node and the CLI."""
-
-    sigma_position: float = _setting(
-        1e-4, 'standard deviation of a measured position without its own covariance [m]', 1e-9
-    )
-    sigma_orientation: float = _setting(
-        1e-4 / 0.3,
-        'standard deviation of a measured orientation without its own covariance [rad]',
-        1e-9,
-    )
-    max_gap: float = _setting(
-        0.1, 'longest time between the two joint samples that bracket a pose [s]', 0.0
-    )
-    joint_buffer: int = _setting(
-        200_000, 'joint samples that may wait; the older half is let go when it is full', 2
-    )
-    pose_buffer: int = _setting(
-        50_000, 'measurements that may wait, and samples kept, of each source', 1
-    )
-    mode: str = _setting(
-        'dwell',
-        'dwell (each stop of the arm becomes a sample), continuous (each measurement does, moving '
-        'or not) or triggered (one by each call of ~/capture)',
-    )
-    still: float = _setting(
-        5e-4, 'the arm stands while no joint leaves its value by more [rad or m]', 0.0
-    )
-    settle: float = _setting(
-        0.1, 'time after a stop in which it is not measured yet: vibration [s]', 0.0
-    )
-    shortest_stop: float = _setting(0.2, 'a shorter stop is no sample [s]', 0.0)
-    longest_stop: float = _setting(5.0, 'of a longer stop only the beginning is used [s]', 0.0)
-    lateness: float = _setting(
-        1.0, 'how much later than joint states of the same stamp measurements may come [s]', 0.0
-    )
-    delay: float = _setting(
-        0.0,
-        'how much later than those of the joints the stamps of measurements are known to be [s]',
-        -10.0,
-    )
-    sources: tuple[str, ...] = _setting(
-        (),
-        'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
-        'target, eye_in_hand, validation',
-    )
-    joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
-    wanted_accuracy: float = _setting(
-        1e-4, 'standard deviation of predicted positions that is enough [m]', 1e-9
-    )
-    frame_id: str = _setting('', 'frame that measurements must be in; default: any one')
-    folds: int = _setting(5, 'parts of the cross-validation', 2)
-    largest_length: float = _setting(
-        0.05, 'a corrected length further from nominal is not accepted: wrong robot? [m]', 0.0
-    )
-    largest_angle: float = _setting(
-        0.1, 'a corrected angle further from nominal is not accepted: wrong robot? [rad]', 0.0
-    )
-    largest_error: float = _setting(
-        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 0.0
-    )
-    loss: str = _setting(
-        'redescending', 'how gross errors are kept from the fit: redescending, huber or none'
-    )
-    priors: tuple[str, ...] = _setting(
-        (), 'standard deviations about nominal as NAME=SIGMA [m, rad], for example *.a=0.001'
-    )
-    model: str = _setting(
-        'geometric',
-        'errors to fit: geometric; auto (adds the non-geometric effects that pay for themselves); '
-        'or groups of effects joined by +, for example ratio+eccentricity',
-    )
-    joint_names: tuple[str, ...] = _setting(
-        (), "names of the chain's joints in JointState, in its order; default: those of the chain"
-    )
-    fixed: tuple[str, ...] = _setting(
-        (), 'parameters held at their nominal values, for example joint_2.a or *.alpha'
-    )
-
-    def for_problem(self) -> dict[str, Any]:
-        """Return what an identification needs to know, by the names of `Problem`."""
-        priors = {}
-        for text in self.priors:
-            name, _, sigma = text.partition('=')
-            priors[name] = parse_number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
-        names = ['sigma_position', 'sigma_orientation', 'fixed', 'folds', 'largest_length']
-        names += ['largest_angle', 'largest_error', 'loss']
-        named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
-        chosen = {name: getattr(self, name) for name in names}
-        return chosen | {'priors': priors, 'effects': named}
-
-    def __post_init__(self) -> None:
-        """Refuse values out of range."""
-        if self.mode not in MODES:
-            raise UnknownNameError('mode', self.mode, MODES)
-        for item in fields(self):
-            lower = item.metadata.get('lower')
-            value = getattr(self, item.name)
-            if lower is not None and not math.isfinite(value):
-                raise ConfigError(f'{item.name} must be a finite number, not {value}')
-            if lower is not None and value < lower:
-                raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
 
 
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
@@ -458,26 +336,6 @@ def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]
         if key not in keys:
             raise UnknownNameError(f'key in {where}', str(key), keys)
     return value
-
-
-def parse_number(value: object, where: str, error: type[CalibrationError] = ConfigError) -> float:
-    """Return a finite number from YAML or a table; `where` names it in the error."""
-    try:  # YAML 1.1 reads 1e-3, without a dot, as a string
-        number = float(value) if isinstance(value, int | float | str) else math.nan
-    except (ValueError, OverflowError):
-        number = math.nan
-    if isinstance(value, bool) or not math.isfinite(number):
-        raise error(f'{where} must be a finite number, not {value!r}')
-    return number
-
-
-def parse_numbers(
-    value: object, count: int, where: str, error: type[CalibrationError] = ConfigError
-) -> FloatArray:
-    """Return so many finite numbers (count,) from YAML; `where` names them in the error."""
-    if not isinstance(value, list) or len(value) != count:
-        raise error(f'{where} must be a list of {count} numbers, not {value!r}')
-    return np.array([parse_number(item, where, error) for item in value])
 
 
 def _dictionary(value: object, where: str) -> dict[str, Any]:

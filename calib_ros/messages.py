@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
+from calib_ros.values import QUATERNION_TOLERANCE
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 LARGEST = 1e6

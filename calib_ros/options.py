@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
-    from calib_ros.config import Settings
+    from calib_ros.settings import Settings
 
 NOT_ACCEPTED = 3
 """Exit status when the input was used, but what came out does not do."""
@@ -27,7 +27,7 @@ def add_chain(parser: argparse.ArgumentParser) -> None:
 
 def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
     """Add options for the settings of some names, or for all."""
-    from calib_ros.config import Settings
+    from calib_ros.settings import Settings
 
     for item in fields(Settings):
         if names and item.name not in names:
@@ -44,7 +44,7 @@ def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> 
 
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings that are among the options, the others by default."""
-    from calib_ros.config import Settings
+    from calib_ros.settings import Settings
 
     given: dict[str, Any] = {
         f.name: getattr(options, f.name) for f in fields(Settings) if hasattr(options, f.name)

@@ -19,8 +19,9 @@ from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
 from calib_ros.chain import Chain
-from calib_ros.config import STARTUP, URDF_SUFFIXES, Settings, load_chain, read_text
+from calib_ros.config import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.settings import STARTUP, Settings
 from calib_ros.urdf import chain_from_urdf
 
 DESCRIPTION_WAIT = 10.0

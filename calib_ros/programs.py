@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from calib_ros.compensation import Program
-from calib_ros.config import parse_number, parse_numbers
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
+from calib_ros.values import parse_number, parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
 """What a point of a JointTrajectory holds that a correction changes."""

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from calib_ros.config import Settings
 from calib_ros.errors import InputError
 from calib_ros.intake import Stream, feed
 from calib_ros.mcap import logged
@@ -25,6 +24,7 @@ from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}

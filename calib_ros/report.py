@@ -16,8 +16,9 @@ import calib_ros
 from calib_ros import effects
 from calib_ros.calibration import Calibration
 from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
-from calib_ros.config import Settings, dump_chain, dump_yaml, nominal_record
+from calib_ros.config import dump_chain, dump_yaml, nominal_record
 from calib_ros.identification import Identification, Noise
+from calib_ros.settings import Settings
 from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
 HOLDS = 1.5

@@ -18,7 +18,6 @@ from calib_ros.account import Account
 from calib_ros.calibration import Calibration
 from calib_ros.chain import Chain
 from calib_ros.collector import Collector, StreamKey
-from calib_ros.config import Settings
 from calib_ros.delays import Delay, Watch
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
@@ -29,6 +28,7 @@ from calib_ros.problem import Problem
 from calib_ros.samples import Sample, collect, named
 from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
+from calib_ros.settings import Settings
 from calib_ros.sources import Source
 from calib_ros.track import Stamps
 from calib_ros.validation import ErrorFigures

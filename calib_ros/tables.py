@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,11 +20,11 @@ from typing import TypeAlias
 import numpy as np
 
 from calib_ros import se3
-from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.observations import Observations
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
+from calib_ros.values import QUATERNION_TOLERANCE, cell_number
 
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
@@ -321,18 +320,6 @@ def _in_words(lines: Sequence[int]) -> str:
     shown = ', '.join(map(str, lines[:MOST_LINES]))
     more = f' and {len(lines) - MOST_LINES} more' if len(lines) > MOST_LINES else ''
     return f'line{"s" if len(lines) > 1 else ""} {shown}{more}'
-
-
-def cell_number(text: str | None, where: str) -> float:
-    """Return the number in a cell of a table; None where the row ends before it."""
-    try:
-        number = float(text or 'blank')
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        found = 'the row ends before it' if text is None else f'not {text!r}'
-        raise InputError(f'{where} must be a number, {found}')
-    return number
 
 
 def _read(

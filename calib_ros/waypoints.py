@@ -16,11 +16,10 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.chain import Chain
-from calib_ros.config import QUATERNION_TOLERANCE
 from calib_ros.errors import InputError
 from calib_ros.inverse import limits
 from calib_ros.se3 import FloatArray
-from calib_ros.tables import cell_number
+from calib_ros.values import QUATERNION_TOLERANCE, cell_number
 
 BEYOND = 1e-3
 """How far [rad or m] an arm may stand beyond a limit."""

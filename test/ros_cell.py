@@ -44,10 +44,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from calib_ros import node as node_module
 from calib_ros import se3
-from calib_ros.config import Settings, load_chain
+from calib_ros.config import load_chain
 from calib_ros.node import CalibrationNode
 from calib_ros.replay import Recording
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell as SimulatedCell
 from calib_ros.simulation import drive, faulty, measure
 from calib_ros.sources import STANDARD

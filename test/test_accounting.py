@@ -19,9 +19,9 @@ from streams import (
 )
 
 from calib_ros.chain import Chain, Joint
-from calib_ros.config import MODES, Settings
 from calib_ros.errors import InputError
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import MODES, Settings
 from calib_ros.sources import Source
 
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4), Joint('c')))

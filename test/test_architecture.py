@@ -15,8 +15,8 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 ORDER = [
     {'errors'},
     {'se3', 'files', 'mcap'},
-    {'effects', 'description'},
-    {'chain'},
+    {'effects', 'description', 'values'},
+    {'chain', 'settings'},
     {'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},

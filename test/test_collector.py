@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
 from calib_ros.collector import MOST_STREAMS, TOO_MANY, Collector, StreamKey
-from calib_ros.config import Settings
 from calib_ros.messages import Reading
 from calib_ros.samples import Sample
+from calib_ros.settings import Settings
 
 POSE = StreamKey('', '', False, False, False)
 JUDGE = StreamKey('', '', True, False, False)

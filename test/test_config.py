@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from calib_ros import se3
 from calib_ros.chain import Chain, Frame, Joint
 from calib_ros.config import (
-    Settings,
     chain_document,
     dump_chain,
     load_calibration,
@@ -23,6 +22,7 @@ from calib_ros.config import (
     shipped_robots,
 )
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.settings import Settings
 
 GOLDEN = yaml.safe_load(Path(__file__).with_name('golden_fk.yaml').read_text())
 HALF = np.pi / 2

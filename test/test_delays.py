@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from streams import POINT, POSE, START, TRACKER, joint_state, point, pose, stamps, stops, sweep
 
-from calib_ros.config import Settings, load_chain
+from calib_ros.config import load_chain
 from calib_ros.delays import LEAST_MOTION, find_delay
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, faulty, measure
 
 UR10E = load_chain('ur10e')

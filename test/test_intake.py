@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.config import Settings, load_chain
+from calib_ros.config import load_chain
 from calib_ros.intake import Stream, feed
 from calib_ros.messages import JOINT_STATE
 from calib_ros.se3 import to_quat
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, drive, faulty, measure
 from calib_ros.sources import Source
 

@@ -7,11 +7,12 @@ import pytest
 
 from calib_ros import live as live_module
 from calib_ros.chain import Chain, Joint
-from calib_ros.config import Settings, load_chain
+from calib_ros.config import load_chain
 from calib_ros.identification import identify
 from calib_ros.live import START, LiveEstimate, barely_moved
 from calib_ros.samples import Sample
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
 UR10E = load_chain('ur10e')

@@ -47,11 +47,12 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
-from calib_ros.config import Settings, calibration_record, load_chain, parse_chain
+from calib_ros.config import calibration_record, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
 from calib_ros.replay import replay, write_bag
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell as SimulatedCell
 from calib_ros.simulation import faulty, measure, random_frame
 from calib_ros.sources import STANDARD

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 import calib_ros
-from calib_ros.config import Settings
+from calib_ros.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz')

@@ -11,7 +11,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from calib_ros import simulation
 from calib_ros.chain import Chain, Joint
-from calib_ros.config import Settings
 from calib_ros.errors import InputError
 from calib_ros.intake import Stream
 from calib_ros.mcap import DATA_END, MAGIC, records
@@ -26,6 +25,7 @@ from calib_ros.replay import (
     write_bag,
 )
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 
 MS = 1_000_000
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from calib_ros import effects, se3
-from calib_ros.config import Settings, load_chain
+from calib_ros.config import load_chain
 from calib_ros.effects import group_of
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification import Problem, identify
 from calib_ros.observations import Observations
 from calib_ros.selection import identify_model
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
 UR10E = load_chain('ur10e')

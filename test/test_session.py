@@ -17,10 +17,11 @@ from streams import (
     transform,
 )
 
-from calib_ros.config import Settings, load_chain
+from calib_ros.config import load_chain
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.samples import Sample
 from calib_ros.session import CalibrationSession
+from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 from calib_ros.sources import Source
 

@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Everything that can be set besides the chain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.values import parse_number
+
+MODES = ('dwell', 'continuous', 'triggered')
+"""How samples are taken."""
+STARTUP = (
+    *('max_gap', 'joint_buffer', 'pose_buffer', 'mode', 'lateness', 'delay', 'sources'),
+    *('joint_topics', 'joint_names'),
+)
+"""Settings that a running node cannot change."""
+
+
+def _setting(default: Any, text: str, lower: float | None = None) -> Any:
+    """Declare a setting with what a node parameter and a command line option need to know."""
+    if isinstance(default, tuple):
+        return field(default=default, metadata={'text': text})
+    return field(default=default, metadata={'text': text, 'lower': lower})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that can be set besides the chain; same names in the node and the CLI."""
+
+    sigma_position: float = _setting(
+        1e-4, 'standard deviation of a measured position without its own covariance [m]', 1e-9
+    )
+    sigma_orientation: float = _setting(
+        1e-4 / 0.3,
+        'standard deviation of a measured orientation without its own covariance [rad]',
+        1e-9,
+    )
+    max_gap: float = _setting(
+        0.1, 'longest time between the two joint samples that bracket a pose [s]', 0.0
+    )
+    joint_buffer: int = _setting(
+        200_000, 'joint samples that may wait; the older half is let go when it is full', 2
+    )
+    pose_buffer: int = _setting(
+        50_000, 'measurements that may wait, and samples kept, of each source', 1
+    )
+    mode: str = _setting(
+        'dwell',
+        'dwell (each stop of the arm becomes a sample), continuous (each measurement does, moving '
+        'or not) or triggered (one by each call of ~/capture)',
+    )
+    still: float = _setting(
+        5e-4, 'the arm stands while no joint leaves its value by more [rad or m]', 0.0
+    )
+    settle: float = _setting(
+        0.1, 'time after a stop in which it is not measured yet: vibration [s]', 0.0
+    )
+    shortest_stop: float = _setting(0.2, 'a shorter stop is no sample [s]', 0.0)
+    longest_stop: float = _setting(5.0, 'of a longer stop only the beginning is used [s]', 0.0)
+    lateness: float = _setting(
+        1.0, 'how much later than joint states of the same stamp measurements may come [s]', 0.0
+    )
+    delay: float = _setting(
+        0.0,
+        'how much later than those of the joints the stamps of measurements are known to be [s]',
+        -10.0,
+    )
+    sources: tuple[str, ...] = _setting(
+        (),
+        'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
+        'target, eye_in_hand, validation',
+    )
+    joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
+    wanted_accuracy: float = _setting(
+        1e-4, 'standard deviation of predicted positions that is enough [m]', 1e-9
+    )
+    frame_id: str = _setting('', 'frame that measurements must be in; default: any one')
+    folds: int = _setting(5, 'parts of the cross-validation', 2)
+    largest_length: float = _setting(
+        0.05, 'a corrected length further from nominal is not accepted: wrong robot? [m]', 0.0
+    )
+    largest_angle: float = _setting(
+        0.1, 'a corrected angle further from nominal is not accepted: wrong robot? [rad]', 0.0
+    )
+    largest_error: float = _setting(
+        0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 0.0
+    )
+    loss: str = _setting(
+        'redescending', 'how gross errors are kept from the fit: redescending, huber or none'
+    )
+    priors: tuple[str, ...] = _setting(
+        (), 'standard deviations about nominal as NAME=SIGMA [m, rad], for example *.a=0.001'
+    )
+    model: str = _setting(
+        'geometric',
+        'errors to fit: geometric; auto (adds the non-geometric effects that pay for themselves); '
+        'or groups of effects joined by +, for example ratio+eccentricity',
+    )
+    joint_names: tuple[str, ...] = _setting(
+        (), "names of the chain's joints in JointState, in its order; default: those of the chain"
+    )
+    fixed: tuple[str, ...] = _setting(
+        (), 'parameters held at their nominal values, for example joint_2.a or *.alpha'
+    )
+
+    def for_problem(self) -> dict[str, Any]:
+        """Return what an identification needs to know, by the names of `Problem`."""
+        priors = {}
+        for text in self.priors:
+            name, _, sigma = text.partition('=')
+            priors[name] = parse_number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
+        names = ['sigma_position', 'sigma_orientation', 'fixed', 'folds', 'largest_length']
+        names += ['largest_angle', 'largest_error', 'loss']
+        named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
+        chosen = {name: getattr(self, name) for name in names}
+        return chosen | {'priors': priors, 'effects': named}
+
+    def __post_init__(self) -> None:
+        """Refuse values out of range."""
+        if self.mode not in MODES:
+            raise UnknownNameError('mode', self.mode, MODES)
+        for item in fields(self):
+            lower = item.metadata.get('lower')
+            value = getattr(self, item.name)
+            if lower is not None and not math.isfinite(value):
+                raise ConfigError(f'{item.name} must be a finite number, not {value}')
+            if lower is not None and value < lower:
+                raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
