@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Is the estimator at the statistical limit, and are its uncertainties honest?
 
-    python benchmarks/monte_carlo.py [--runs 500] [--quick] [--json]
+    python benchmarks/monte_carlo.py [--runs 1000] [--quick] [--json]
 
 Simulated UR10e with errors of 0.5 mm and 1 mrad, 40 full poses or 60 positions a run, default
 settings. `mse_over_crlb` is the mean squared error of the fitted parameters over the Cramer-Rao
