@@ -10,7 +10,7 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,11 +21,13 @@ from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.evidence import Posterior, posterior_of
 from calib_ros.frames import start_frames
-from calib_ros.leastsquares import minimise, triangular_factor
+from calib_ros.leastsquares import System, minimise, triangular_factor
 from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
-from calib_ros.problem import Problem
+from calib_ros.problem import Learned, Problem
+from calib_ros.region import Region, region_of
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
 from calib_ros.validation import (
@@ -42,6 +44,8 @@ __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residua
 
 SOME = 500
 """Pairs that are enough for a first fit."""
+HELD = 0.05
+"""Share of a parameter's variance that is its prior's from which on the prior is fitted with."""
 
 
 @dataclass(frozen=True)
@@ -88,9 +92,13 @@ class Identification:
         tracker, would let the arm's parameters explain as much. None for a target in sockets.
     refusals : tuple of str
         Rules of acceptance that failed, in words; none when the result is accepted.
+    sizes : mapping of str to float
+        Size of the errors [m or rad] of this arm by group of parameters (`evidence.py`).
+    region : Region or None
+        Where the calibration may be used; None where it may not be used anywhere.
     weak : tuple of str
-        Parameters that the poses hardly determine, held near their nominal values by priors of a
-        third of `largest_length` or `largest_angle`.
+        Parameters that the poses hardly determine, held near their nominal values by a prior of
+        the size that this arm's errors have.
     verdicts : tuple of Verdict
         Where the model was chosen: what paid for itself and what did not.
 
@@ -115,6 +123,8 @@ class Identification:
     converged: bool
     chance: float | None
     refusals: tuple[str, ...]
+    sizes: Mapping[str, float]
+    region: Region | None
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
 
@@ -205,29 +215,26 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     )
     wanted = [n for n in problem.free if n in structural or n in priors]
     few = problem.system([_some(each) for each in problem.sets])
-    names = identifiability.independent(triangular_factor(start, wanted, few), wanted)
+    factor = triangular_factor(start, wanted, few)
+    names = identifiability.independent(factor, wanted)
     if len(names) < len(wanted):  # more samples may determine more
         names = identifiability.independent(triangular_factor(start, wanted, system), wanted)
+    problem = _guarded(problem, names, triangular_factor(start, names, few), simpler)
     rough = start
-    if few.count < system.count // 2:
-        rough = minimise(start, names, few, tolerance=1e-2).chain
-    if simpler is None:
-        robust = thorough_fit(rough, names, system, problem.loss)
-    else:
+    if simpler is not None:
         rough = simpler.chain.with_effects([name for name, _ in model.effects])
-        robust = reweighted(rough, names, system, problem.loss, simpler.distances)
+    elif few.count < system.count // 2:
+        few = problem.system([_some(each) for each in problem.sets])
+        rough = minimise(start, names, few, tolerance=1e-2).chain
+    fitted = _fit(problem, rough, names, simpler)
+    posterior = fitted.posterior
+    if _matter(problem, names, posterior):
+        priors = {name: posterior.priors[name] for name in names if not model.owns_frame(name)}
+        problem = replace(problem, learned=Learned(priors, fitted.noise.size))
+        fitted = _fit(problem, fitted.robust.fit.chain, names, simpler, fitted)
+    robust, noise, uncertainty = fitted.robust, fitted.noise, fitted.uncertainty
     fit = robust.fit
-    before = minimise(start, [n for n in names if model.owns_frame(n)], system)
-    factor = fit.normal.factor()
-    if factor is None:
-        factor = triangular_factor(fit.chain, names, system)
-    noise, uncertainty = noise_of(fit, names, system, factor)
-    weak = _weak(problem, names, uncertainty.covariance)
-    if weak:
-        return replace(
-            identify(replace(problem, priors=weak | dict(problem.priors)), simpler),
-            weak=tuple(weak),
-        )
+    before = minimise(start, [n for n in names if model.owns_frame(n)], fitted.system)
     explained = (
         None if simpler is None or simpler.validation is None else simpler.validation.judged
     )
@@ -235,6 +242,8 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
+    freedom = max(1.0, float(system.rows - len(names)))
+    region = region_of(fitted.posterior, problem.sets, freedom)
     return Identification(
         chain=fit.chain,
         before=before.chain,
@@ -248,14 +257,82 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         distances=robust.distances,
         outliers=_outliers(problem, robust),
         gauges=_gauges(problem, fit.chain, names),
-        observability=identifiability.observability(factor, system.count),
-        priors={} if system.prior is None else dict(system.prior.sigmas),
+        observability=identifiability.observability(fitted.factor, system.count),
+        priors=dict(problem.prior_sigmas),
         world_frame=problem.world_frame,
         iterations=robust.iterations,
         converged=converged,
         chance=chance,
-        refusals=refusals(problem, converged, parameters, validation, chance),
+        refusals=refusals(problem, converged, parameters, validation, chance, region),
+        sizes=fitted.posterior.sizes,
+        region=region,
+        weak=_weak(problem, parameters),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """A robust fit with what follows from its residuals."""
+
+    system: System
+    robust: Robust
+    factor: FloatArray
+    noise: Noise
+    uncertainty: identifiability.Uncertainty
+    posterior: Posterior
+
+
+def _fit(
+    problem: Problem,
+    chain: Chain,
+    names: Sequence[str],
+    simpler: Identification | None,
+    rough: _Fitted | None = None,
+) -> _Fitted:
+    """Fit the named parameters from a chain that is near; once more after a `rough` fit."""
+    system = problem.system(problem.sets)
+    if simpler is None and rough is None:
+        robust = thorough_fit(chain, names, system, problem.loss)
+    else:
+        distances = None if simpler is None else simpler.distances
+        robust = reweighted(chain, names, system, problem.loss, distances)
+    fit = robust.fit
+    factor = fit.normal.factor()
+    if factor is None:
+        factor = triangular_factor(fit.chain, names, system)
+    noise, uncertainty = noise_of(fit, names, system, factor)
+    size = noise.size if rough is None else rough.noise.size
+    sizes = None if rough is None else rough.posterior.sizes
+    posterior = posterior_of(fit.chain, problem.model, names, system, size, problem.given, sizes)
+    return _Fitted(system, robust, factor, noise, uncertainty, posterior)
+
+
+def _guarded(
+    problem: Problem, names: Sequence[str], factor: FloatArray, simpler: Identification | None
+) -> Problem:
+    """Return the problem with priors that keep a first fit from going astray.
+
+    `factor` (P, P) is that of some samples at the start. DH parameters that they tell no better
+    than common sense does get a third of what no faulty robot exceeds as a prior.
+    """
+    known = problem.prior_sigmas
+    stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
+    guards = {
+        name: problem.common_sense(name)
+        for name, std in zip(names, stds, strict=True)
+        if name not in known
+        and not problem.model.owns_frame(name)
+        and std > problem.common_sense(name)
+    }
+    noise = 1.0 if simpler is None else simpler.noise.size
+    return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
+
+
+def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
+    """Tell whether priors that the data have told would change a fit without them."""
+    if problem.learned is not None or problem.model.effects:
+        return True
+    return any(posterior.held(name) > HELD for name in names)
 
 
 def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
@@ -275,19 +352,19 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     return chance_of_gain(before, frames, arm, problem.system(sets))
 
 
-def _weak(problem: Problem, names: Sequence[str], covariance: FloatArray) -> dict[str, float]:
-    """Return priors for parameters that the poses tell no better than common sense does.
-
-    Those are DH parameters without a prior that are uncertain by more than a third of what no
-    faulty robot exceeds: its three standard deviations are the limit then.
-    """
-    known = problem.prior_sigmas
-    found = {}
-    for name, std in zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True):
-        third = problem.common_sense(name)
-        if std > third > 0.0 and name not in known and not problem.model.owns_frame(name):
-            found[name] = third
-    return found
+def _weak(problem: Problem, parameters: Sequence[Parameter]) -> tuple[str, ...]:
+    """Return the DH parameters that the poses tell less of than what is known of other arms."""
+    if problem.learned is None:
+        return ()
+    known, learned = dict(problem.model.effects), problem.learned.priors
+    return tuple(
+        p.name
+        for p in parameters
+        if p.std is not None
+        and p.name in learned
+        and p.name not in {*known, *problem.given}
+        and p.std**2 > 0.5 * learned[p.name] ** 2
+    )
 
 
 def _some(observations: Observations) -> Observations:

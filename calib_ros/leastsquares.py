@@ -247,14 +247,21 @@ def _whitening(
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian priors: standard deviations [m or rad] of parameters about the nominal chain."""
+    """Gaussian priors: standard deviations [m or rad] of parameters about the nominal chain.
+
+    `noise` is the size of the noise in the sigmas that weigh the data: where these are too small,
+    priors count for more.
+    """
 
     nominal: Chain
     sigmas: Mapping[str, float] = field(default_factory=dict)
+    noise: float = 1.0
 
     def rows(self, chain: Chain, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return 1 / sigma (P,), zero without a prior, and the residual in sigma (P,)."""
-        inverse = np.array([1.0 / self.sigmas[n] if n in self.sigmas else 0.0 for n in names])
+        """Return noise / sigma (P,), zero without a prior, and the weighted residual (P,)."""
+        inverse = np.array(
+            [self.noise / self.sigmas[n] if n in self.sigmas else 0.0 for n in names]
+        )
         offsets = np.array(
             [chain.offset(n, self.nominal) if n in self.sigmas else 0.0 for n in names]
         )

@@ -33,7 +33,8 @@ class Noise:
     `successive` and `near` are the correlations of the residuals of configurations that follow
     each other and that are near each other in joint space; `shared` names which of them a test
     finds to share errors (`correlation.py`), and `widened` by what factor that makes the standard
-    deviations larger (median).
+    deviations larger (median). `size` is that by which they are larger than the sigmas given
+    would make them, in all.
     """
 
     position: float
@@ -43,6 +44,7 @@ class Noise:
     near: float
     shared: tuple[str, ...]
     widened: float = 1.0
+    size: float = 1.0
 
 
 def noise_of(
@@ -80,6 +82,8 @@ def noise_of(
     sizes = np.where(together > SHARED, together, 1.0) * (1.0 if consistent else variances)
     middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
     extra, _ = system.extra_rows(fit.chain, names)
+    if system.prior is not None:
+        extra[: len(names)] *= system.prior.noise
     alike = neighbours.middles
     estimated = np.array([not consistent or sizes[k] != 1.0 or k in alike for k in (0, 1)])
     freedom = np.maximum(np.minimum(counts, joint_counts) - taken, 1.0)
@@ -96,7 +100,8 @@ def noise_of(
         alone = np.diag(covariances(middles).sum(axis=0))
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
-    return noise, Uncertainty(covariance, freedom)
+    size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))
+    return replace(noise, size=size), Uncertainty(covariance, freedom)
 
 
 def _squares(

@@ -19,6 +19,17 @@ from calib_ros.observations import Observations
 from calib_ros.robust import LOSSES
 
 
+@dataclass(frozen=True)
+class Learned:
+    """What a first fit has told: sizes of errors [m, rad] by parameter, and that of the noise.
+
+    The latter in units of the sigmas given.
+    """
+
+    priors: Mapping[str, float]
+    noise: float = 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """What is known before an identification.
@@ -59,6 +70,8 @@ class Problem:
         accepted.
     largest_error : float
         RMS position error [m] on held-out poses beyond which nothing is accepted.
+    learned : Learned, optional
+        Priors that the data themselves have told, for parameters without one (`evidence.py`).
 
     """
 
@@ -78,6 +91,7 @@ class Problem:
     more: Sequence[Observations] = ()
     world_frame: str = ''
     separations: Sequence[tuple[str, str, float]] = ()
+    learned: Learned | None = None
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
@@ -182,14 +196,21 @@ class Problem:
 
         Frames have none; effects always have one.
         """
-        model = self.model
+        sigmas = (
+            dict(self.given) if self.learned is None else {**self.learned.priors, **self.given}
+        )
+        for name, _ in self.model.effects:
+            sigmas.setdefault(name, effects.expected(name))
+        return sigmas
+
+    @cached_property
+    def given(self) -> Mapping[str, float]:
+        """Return the standard deviations [m, rad] of the priors that were given, by name."""
         sigmas: dict[str, float] = {}
         for name in self.free:
             for pattern, sigma in self.priors.items():
-                if fnmatch.fnmatchcase(name, pattern) and not model.owns_frame(name):
+                if fnmatch.fnmatchcase(name, pattern) and not self.model.owns_frame(name):
                     sigmas.setdefault(name, sigma)
-        for name, _ in model.effects:
-            sigmas.setdefault(name, effects.expected(name))
         return sigmas
 
     @cached_property
@@ -198,7 +219,7 @@ class Problem:
         known = dict(self.model.effects)
         return frozenset(
             name
-            for name, sigma in self.prior_sigmas.items()
+            for name, sigma in self.given.items()
             if name not in known and sigma < self.common_sense(name)
         )
 
@@ -209,7 +230,8 @@ class Problem:
     def system(self, sets: Sequence[Observations]) -> System:
         """Return sets of observations, and the priors, as the solver takes them."""
         sigmas = self.prior_sigmas
-        prior = Prior(self.model, sigmas) if sigmas else None
+        noise = 1.0 if self.learned is None else self.learned.noise
+        prior = Prior(self.model, sigmas, noise) if sigmas else None
         samples = [Samples(each, self.sigma_position, self.sigma_orientation) for each in sets]
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)

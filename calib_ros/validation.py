@@ -15,6 +15,7 @@ from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
+from calib_ros.region import Region
 from calib_ros.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.se3 import FloatArray
 
@@ -314,6 +315,7 @@ def refusals(
     parameters: Sequence[Parameter],
     validation: Comparison | None,
     chance: float | None,
+    region: Region | None,
 ) -> tuple[str, ...]:
     """Return the rules of acceptance that fail, in words.
 
@@ -328,6 +330,7 @@ def refusals(
        `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
        another robot, not a faulty one.
     6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
+    7. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
     """
     failed = []
     if not converged:
@@ -380,6 +383,12 @@ def refusals(
             'the gain may be that of a drift, as of the tracker: moved in time against the joint '
             f'values, residuals are explained as well in {100.0 * chance:.0f} % of the shifts; '
             'measure the poses in random order, further apart, or more of them'
+        )
+    elif region is None:
+        failed.append(
+            'too little is known of the arm for the correction to help: what it removes is not '
+            'larger than its own uncertainty, even at the poses measured; measure more poses, '
+            'spread further'
         )
     if after.rms_mrad is not None:
         gain, limit = log_gain(
