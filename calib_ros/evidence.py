@@ -14,7 +14,9 @@ with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1. L is the no
 the given sigmas, t the factor by which the noise is larger, shared errors included. gamma counts
 the parameters that the data determine. Where these are few, a hyperprior holds: a size is about
 TYPICAL, within a factor of SPREAD. Parameters that the data determine keep their values, and the
-others shrink to nominal.
+others shrink to nominal. One error may be far larger than the others, as of a motor that was put
+in wrongly: the prior has the tails of Student's t with TAILS degrees of freedom, as a normal one
+with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 + V_ii) / s^2).
 
 Effects that a model leaves out are *considered*: they are columns of the same posterior with sizes
 of their own, so that the arm as it may be, effects included, can be held against the one that was
@@ -25,11 +27,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy import linalg
 
 from calib_ros import effects
 from calib_ros.chain import DH_KINDS, Chain, is_length
+from calib_ros.differential import ErrorModel
 from calib_ros.leastsquares import Samples, System, normal_equations
 from calib_ros.se3 import FloatArray
 
@@ -37,16 +42,23 @@ TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'bending': 3e-4}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation)."""
+TAILS = 3.0
+"""Degrees of freedom of the prior."""
+SURE = 2.0
+"""Standard deviations by which an offset that stands out is larger at first."""
 BENDING = ('gravity', 'compliance', 'backlash')
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, whether they are fitted or not."""
+SHOWN, REFUTED = 1.35, 3.0
+"""Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
+which those of usual size are refuted."""
 MOST = 2000
 """Samples from which the sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
 ROUNDS = 60
-SINGULAR = 1e-13
-"""Eigenvalue of the scaled precision from which a direction counts."""
+ROUNDING = 1e-12
+"""Added to the scaled precision, so that rounding cannot make it singular."""
 LEAST = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
@@ -91,6 +103,19 @@ class Posterior:
     priors: Mapping[str, float]
     sizes: Mapping[str, float]
 
+    @cached_property
+    def square(self) -> FloatArray:
+        """Return the expected squares (P, P) of the fitted parameters' errors."""
+        return np.asarray(self.covariance + np.outer(self.shift, self.shift))
+
+    def expected(self, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> FloatArray:
+        """Return the expected squares (N, 6, 6) of errors of predicted poses [m, rad].
+
+        At joint values (N, n); position and rotation in world axes. What is not modelled counts.
+        """
+        rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
+        return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
+
     def held(self, name: str) -> float:
         """Return which share of a parameter's variance is that of its prior: 1 if untold."""
         variance = float(self.covariance[self.names.index(name), self.names.index(name)])
@@ -110,7 +135,7 @@ def posterior_of(
     system: System,
     noise: float,
     known: Mapping[str, float],
-    sizes: Mapping[str, float] | None = None,
+    more: Sequence[str] = (),
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
@@ -126,29 +151,27 @@ def posterior_of(
         Size of the noise [sigma given].
     known : mapping of str to float
         Priors [m or rad] that were given.
-    sizes : mapping of str to float, optional
-        Sizes of the errors by group; found from the data when None.
+    more : sequence of str
+        Effects to consider.
 
     """
-    more = considered(chain, names)
     chain = chain.with_effects(more)
     every = (*names, *more)
     few, share = _few(system)
     normal = normal_equations(chain, every, few)
     matrix, gradient = (share / noise**2 * part for part in (normal.matrix, normal.gradient))
-    groups = [None if name in known else group_of(chain, name) for name in every]
     offsets = np.zeros(len(every))
     for k, name in enumerate(names):
         if not chain.owns_frame(name):
             offsets[k] = chain.offset(name, nominal)
-    given = np.array([1.0 / known[name] ** 2 if name in known else 0.0 for name in every])
     vector = matrix @ offsets + gradient
-    if sizes is None:
-        sizes = _sizes(matrix, vector, given, groups)
-    found = {n: sizes[group] for n, group in zip(every, groups, strict=True) if group is not None}
-    precision = given + np.array([found[n] ** -2 if n in found else 0.0 for n in every])
-    mean, covariance = _solved(matrix, vector, precision)
-    return Posterior(chain, every, offsets, mean - offsets, covariance, found | dict(known), sizes)
+    groups = [None if name in known else group_of(chain, name) for name in every]
+    given = np.array([known.get(name, np.inf) for name in every]) ** -2
+    evidence = _Evidence(matrix, vector, given, groups)
+    stds, sizes = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    priors = {name: std for name, std in zip(every, stds.tolist(), strict=True) if std < np.inf}
+    mean, root, _ = _solved(matrix, vector, stds**-2)
+    return Posterior(chain, every, offsets, mean - offsets, root @ root.T, priors, sizes)
 
 
 def _few(system: System) -> tuple[System, int]:
@@ -158,39 +181,90 @@ def _few(system: System) -> tuple[System, int]:
     for samples in system.sets:
         few = samples
         if share > 1:
-            few = Samples(samples.observations.select(np.arange(0, samples.count, share)), *samples.sigmas)
-            few.weights = None if samples.weights is None else samples.weights[::share]
+            chosen = np.arange(0, samples.count, share)
+            few = Samples(samples.observations.select(chosen), *samples.sigmas)
+            few.weights = None if samples.weights is None else samples.weights[chosen]
         sets.append(few)
     return System(tuple(sets), None, system.separations), share
 
 
 def _solved(
     matrix: FloatArray, vector: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean (P,) and covariance (P, P); directions without any information stay at zero."""
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return mean (P,), a root (P, P) of the covariance, and its log determinant."""
     whole = matrix + np.diag(precision)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    sizes, directions = np.linalg.eigh(whole * np.outer(scale, scale))
-    good = sizes > SINGULAR
-    root = scale[:, np.newaxis] * directions[:, good] / np.sqrt(sizes[good])
-    return root @ (root.T @ vector), np.asarray(root @ root.T)
+    scaled = whole * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+    factor = linalg.cholesky(scaled, lower=True, check_finite=False)
+    inverse = linalg.solve_triangular(factor, np.diag(scale), lower=True, check_finite=False)
+    volume = 2.0 * float(np.log(scale).sum() - np.log(np.diag(factor)).sum())
+    return inverse.T @ (inverse @ vector), np.ascontiguousarray(inverse.T), volume
 
 
-def _sizes(
-    matrix: FloatArray, vector: FloatArray, given: FloatArray, groups: Sequence[str | None]
-) -> dict[str, float]:
-    """Return the size of each group that makes the data most probable, with the hyperprior."""
-    names = list(dict.fromkeys(group for group in groups if group is not None))
-    member = np.array([[group == name for group in groups] for name in names], dtype=float)
-    typical = np.log([TYPICAL[name] for name in names])
-    size, width = typical.copy(), np.log(SPREAD) ** -2
-    for _ in range(ROUNDS):
-        weight = member * np.exp(-2.0 * size)[:, np.newaxis]
-        mean, covariance = _solved(matrix, vector, given + weight.sum(axis=0))
-        told = (member - weight * np.diag(covariance)).sum(axis=1)
-        slope = weight @ mean**2 - told - width * (size - typical)
-        step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
-        size = np.clip(size + step, typical + np.log(LEAST), typical - np.log(LEAST))
-        if np.abs(step).max() < SETTLED:
-            break
-    return dict(zip(names, np.exp(size).tolist(), strict=True))
+class _Evidence:
+    """How probable sizes of the errors make the data."""
+
+    def __init__(
+        self,
+        matrix: FloatArray,
+        vector: FloatArray,
+        given: FloatArray,
+        groups: Sequence[str | None],
+    ) -> None:
+        self._matrix, self._vector, self._given = matrix, vector, given
+        self._names = [*dict.fromkeys(group for group in groups if group is not None)]
+        rows = [[group == name for group in groups] for name in self._names]
+        self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
+        self._typical = np.log([TYPICAL[name] for name in self._names])
+        self._tails = np.ones(len(groups))
+
+    def told(self, considered: set[str | None]) -> tuple[FloatArray, dict[str, float]]:
+        """Return the standard deviation (P,) of each parameter, and the size of each group.
+
+        Effects that are only considered are of no size where the data would show the usual ones,
+        and do not show any.
+        """
+        size, width = self._typical.copy(), np.log(SPREAD) ** -2
+        free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
+        mean, root, _ = _solved(self._matrix, self._vector, free)
+        surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
+        self._tails = (TAILS + 1.0) / (
+            TAILS + 1.0 + surely**2 * (self._member.T @ np.exp(-2.0 * size))
+        )
+        for _ in range(ROUNDS):
+            weight = self._weight(size)
+            mean, root, _ = _solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
+            variance = (root**2).sum(axis=1)
+            told = (self._member - weight * variance).sum(axis=1)
+            slope = weight @ mean**2 - told - width * (size - self._typical)
+            step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
+            reach = -np.log(LEAST)
+            size = np.clip(size + step, self._typical - reach, self._typical + reach)
+            far = (mean**2 + variance) * (self._member.T @ np.exp(-2.0 * size))
+            self._tails = (TAILS + 1.0) / (TAILS + far)
+            if np.abs(step).max(initial=0.0) < SETTLED:
+                break
+        for k, name in enumerate(self._names):
+            none, usual = (
+                np.where(np.arange(len(size)) == k, self._typical[k] + change, size)
+                for change in (np.log(LEAST), 0.0)
+            )
+            without = self._of(none)
+            shown = self._of(size) - without > SHOWN
+            if name in considered and not shown and without - self._of(usual) > REFUTED:
+                size = none
+        precision = self._given + self._weight(size).sum(axis=0)
+        with np.errstate(divide='ignore'):
+            stds = 1.0 / np.sqrt(precision)
+        return stds, dict(zip(self._names, np.exp(size).tolist(), strict=True))
+
+    def _weight(self, size: FloatArray) -> FloatArray:
+        """Return (G, P) the inverse variances of the parameters of each group."""
+        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
+
+    def _of(self, size: FloatArray) -> float:
+        """Return the logarithm of the evidence of sizes (G,), given by their logarithms."""
+        precision = self._given + self._weight(size).sum(axis=0)
+        mean, _, volume = _solved(self._matrix, self._vector, precision)
+        fit = float(self._vector @ mean) + volume
+        return 0.5 * fit - float(self._member.sum(axis=1) @ size)

@@ -10,7 +10,7 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +21,7 @@ from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, TooFewObservationsError
-from calib_ros.evidence import Posterior, posterior_of
+from calib_ros.evidence import Posterior, considered, posterior_of
 from calib_ros.frames import start_frames
 from calib_ros.leastsquares import System, minimise, triangular_factor
 from calib_ros.noise import Noise, noise_of
@@ -92,8 +92,8 @@ class Identification:
         tracker, would let the arm's parameters explain as much. None for a target in sockets.
     refusals : tuple of str
         Rules of acceptance that failed, in words; none when the result is accepted.
-    sizes : mapping of str to float
-        Size of the errors [m or rad] of this arm by group of parameters (`evidence.py`).
+    posterior : Posterior
+        What is known of the arm, effects that the model leaves out included.
     region : Region or None
         Where the calibration may be used; None where it may not be used anywhere.
     weak : tuple of str
@@ -123,7 +123,7 @@ class Identification:
     converged: bool
     chance: float | None
     refusals: tuple[str, ...]
-    sizes: Mapping[str, float]
+    posterior: Posterior
     region: Region | None
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
@@ -149,12 +149,12 @@ class Identification:
         return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))
 
     def pose_covariance(self, q: FloatArray) -> FloatArray:
-        """Return the covariance (N, 6, 6) [m, rad] of the predicted pose at q (N, n).
+        """Return the expected squares (N, 6, 6) [m, rad] of errors of the pose at q (N, n).
 
-        From the uncertainty of the parameters alone; position and rotation in world axes.
+        From the uncertainty of the parameters, and of effects that the model leaves out; position
+        and rotation in world axes.
         """
-        jacobian = ErrorModel(self.chain, self.names).jacobian(q)
-        return np.asarray(jacobian @ self.covariance @ np.swapaxes(jacobian, 1, 2))
+        return self.posterior.expected(q)
 
     def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
@@ -227,11 +227,12 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         few = problem.system([_some(each) for each in problem.sets])
         rough = minimise(start, names, few, tolerance=1e-2).chain
     fitted = _fit(problem, rough, names, simpler)
-    posterior = fitted.posterior
-    if _matter(problem, names, posterior):
-        priors = {name: posterior.priors[name] for name in names if not model.owns_frame(name)}
-        problem = replace(problem, learned=Learned(priors, fitted.noise.size))
-        fitted = _fit(problem, fitted.robust.fit.chain, names, simpler, fitted)
+    size = fitted.noise.size / float(np.sqrt(fitted.noise.widened))
+    told = _posterior(problem, fitted, names, size)
+    if _matter(problem, names, told):
+        priors = {name: told.priors[name] for name in names if not model.owns_frame(name)}
+        problem = replace(problem, learned=Learned(priors, size))
+        fitted = _fit(problem, fitted.robust.fit.chain, names, simpler, again=True)
     robust, noise, uncertainty = fitted.robust, fitted.noise, fitted.uncertainty
     fit = robust.fit
     before = minimise(start, [n for n in names if model.owns_frame(n)], fitted.system)
@@ -243,7 +244,8 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
     freedom = max(1.0, float(system.rows - len(names)))
-    region = region_of(fitted.posterior, problem.sets, freedom)
+    posterior = _posterior(problem, fitted, names, size, considered(fit.chain, names))
+    region = region_of(posterior, problem.sets, freedom)
     return Identification(
         chain=fit.chain,
         before=before.chain,
@@ -264,7 +266,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         converged=converged,
         chance=chance,
         refusals=refusals(problem, converged, parameters, validation, chance, region),
-        sizes=fitted.posterior.sizes,
+        posterior=posterior,
         region=region,
         weak=_weak(problem, parameters),
     )
@@ -279,7 +281,6 @@ class _Fitted:
     factor: FloatArray
     noise: Noise
     uncertainty: identifiability.Uncertainty
-    posterior: Posterior
 
 
 def _fit(
@@ -287,11 +288,11 @@ def _fit(
     chain: Chain,
     names: Sequence[str],
     simpler: Identification | None,
-    rough: _Fitted | None = None,
+    again: bool = False,
 ) -> _Fitted:
-    """Fit the named parameters from a chain that is near; once more after a `rough` fit."""
+    """Fit the named parameters from a chain that is near, or `again` from one that was fitted."""
     system = problem.system(problem.sets)
-    if simpler is None and rough is None:
+    if simpler is None and not again:
         robust = thorough_fit(chain, names, system, problem.loss)
     else:
         distances = None if simpler is None else simpler.distances
@@ -301,10 +302,19 @@ def _fit(
     if factor is None:
         factor = triangular_factor(fit.chain, names, system)
     noise, uncertainty = noise_of(fit, names, system, factor)
-    size = noise.size if rough is None else rough.noise.size
-    sizes = None if rough is None else rough.posterior.sizes
-    posterior = posterior_of(fit.chain, problem.model, names, system, size, problem.given, sizes)
-    return _Fitted(system, robust, factor, noise, uncertainty, posterior)
+    return _Fitted(system, robust, factor, noise, uncertainty)
+
+
+def _posterior(
+    problem: Problem,
+    fitted: _Fitted,
+    names: Sequence[str],
+    noise: float,
+    more: Sequence[str] = (),
+) -> Posterior:
+    """Return what the data of a fit tell, with `more` effects considered."""
+    chain, system = fitted.robust.fit.chain, fitted.system
+    return posterior_of(chain, problem.model, names, system, noise, problem.given, more)
 
 
 def _guarded(

@@ -16,13 +16,13 @@ standard deviation of the predicted position, as far as the risk in each shell i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.chain import FRAME_KINDS, Chain
+from calib_ros.chain import FRAME_KINDS
 from calib_ros.differential import ErrorModel
 from calib_ros.evidence import Posterior
 from calib_ros.observations import Observations
@@ -44,13 +44,8 @@ class Region:
 
     Attributes
     ----------
-    chain : Chain
-        The calibrated arm, with the effects considered.
-    names : tuple of str
-        Parameters, (P,) in all.
-    shift : (P,)
-        By how much the arm is expected to be off the calibrated one.
-    covariance : (P, P)
+    posterior : Posterior
+        What is known of the arm.
     limit : float
         Standard deviation [m] of predicted positions up to which the calibration is used;
         infinite where it is used over the whole range of the joints.
@@ -61,24 +56,17 @@ class Region:
 
     """
 
-    chain: Chain
-    names: tuple[str, ...]
-    shift: FloatArray
-    covariance: FloatArray
+    posterior: Posterior
     limit: float
     share: float
     base: str = 'base'
     tool: str = 'tool'
 
     def sigma(self, joints: FloatArray) -> FloatArray:
-        """Return the expected error (N,) [m] of positions predicted at joint values (N, n).
-
-        The root of the expected square, unmodelled effects included.
-        """
-        rows = ErrorModel(self.chain, self.names, self.base, self.tool).jacobian(joints)[:, :3]
-        squares = np.einsum('ncp,pq,ncq->n', rows, self.covariance, rows, optimize=True)
-        squares += ((rows @ self.shift) ** 2).sum(axis=1)
-        return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+        """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
+        known = self.posterior
+        rows = ErrorModel(known.chain, known.names, self.base, self.tool).jacobian(joints)[:, :3]
+        return _length(rows, known.square)
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
         """Tell (N,) at which joint values (N, n) the calibration may be used."""
@@ -92,29 +80,32 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
 
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
-    first = sets[0]
-    chain, names = posterior.chain, posterior.names
-    whole = Region(
-        chain, names, posterior.shift, posterior.covariance, np.inf, 1.0, first.base, first.tool
-    )
+    ends = sets[0]
     measured = np.concatenate([_spread(each) for each in sets])
-    drawn = chain.random_joints(DRAWN, np.random.default_rng(0))
-    near, far = whole.sigma(measured), whole.sigma(drawn)
+    drawn = posterior.chain.random_joints(DRAWN, np.random.default_rng(0))
+    judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
+    near, far = np.split(judge.sigma, [len(measured)])
     limit = float(near.max())
     order = np.argsort(far)
-    inner = int(np.searchsorted(far[order], limit))
-    judge = _Judge(posterior, np.concatenate([measured, drawn[order]]), first, freedom)
-    within = len(measured) + inner
-    if not judge.risk(0, within) < RISK:
+    inner = [*range(len(measured)), *(len(measured) + order[far[order] <= limit]).tolist()]
+    if not judge.risk(inner, inner) < RISK:
         return None
-    while within < len(measured) + DRAWN:
-        further = min(within + SHELL, len(measured) + DRAWN)
-        if not judge.risk(within, further) < RISK:
+    shells = len(measured) + order[far[order] > limit]
+    for first in range(0, len(shells), SHELL):
+        shell = shells[first : first + SHELL].tolist()
+        if not judge.risk(shell, inner + shell) < RISK:
             break
-        within = further
-        limit = max(limit, float(far[order[within - len(measured) - 1]]))
-    share = (within - len(measured)) / DRAWN
-    return replace(whole, limit=np.inf if share == 1.0 else limit, share=share)
+        inner += shell
+        limit = float(judge.sigma[shell[-1]])
+    share = float(np.mean(far <= limit))
+    return Region(posterior, np.inf if share == 1.0 else limit, share, ends.base, ends.tool)
+
+
+def _length(rows: FloatArray, square: FloatArray) -> FloatArray:
+    """Return the roots (N,) of the expected squared lengths of J x, J (N, 3, P)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    squares = ((flat @ square) * flat).sum(axis=1).reshape(-1, 3).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 def _spread(observations: Observations) -> FloatArray:
@@ -128,24 +119,27 @@ class _Judge:
     def __init__(
         self, posterior: Posterior, joints: FloatArray, ends: Observations, freedom: float
     ) -> None:
-        chain = posterior.chain
-        own = [k for k, name in enumerate(posterior.names) if not chain.owns_frame(name)]
+        chain, names = posterior.chain, posterior.names
         frames = [f'{ends.base}.{kind}' for kind in FRAME_KINDS]
         frames += [f'{ends.tool}.{kind}' for kind in FRAME_KINDS[:3]]
-        every = (*frames, *(posterior.names[k] for k in own))
+        every = list(dict.fromkeys([*frames, *names]))
         rows = ErrorModel(chain, every, ends.base, ends.tool).jacobian(joints)[:, :3]
-        self._frames, self._rows = rows[:, :, : len(frames)], rows[:, :, len(frames) :]
+        column = {name: k for k, name in enumerate(every)}
+        own = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        self.sigma = _length(rows[:, :, [column[name] for name in names]], posterior.square)
+        self._frames = rows[:, :, : len(frames)]
+        self._rows = rows[:, :, [column[names[k]] for k in own]]
         self._offsets = posterior.offsets[own]
         self._mean = self._offsets + posterior.shift[own]
         self._covariance = posterior.covariance[np.ix_(own, own)]
         self._freedom = freedom
 
-    def risk(self, first: int, last: int) -> float:
-        """Return it for the poses from `first` to `last`, in frames fitted to all up to there."""
-        frames, rows = self._frames[:last], self._rows[:last]
+    def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
+        """Return it for some poses, in frames fitted to those around."""
+        frames, rows = self._frames[around], self._rows[around]
         known = frames.reshape(-1, frames.shape[2])
         taken = np.linalg.lstsq(known, rows.reshape(len(known), -1), rcond=1e-9)[0]
-        left = (rows[first:] - frames[first:] @ taken).reshape(-1, rows.shape[2])
+        left = (self._rows[which] - self._frames[which] @ taken).reshape(-1, rows.shape[2])
         gain = left @ self._offsets
         slope = left.T @ gain
         margin = float(slope @ self._mean) - 0.5 * float(gain @ gain)

@@ -24,9 +24,10 @@ from scipy import linalg
 from calib_ros import effects
 from calib_ros.chance import Columns, Shifts, chance
 from calib_ros.effects import Verdict
+from calib_ros.evidence import ROUNDING, group_of
 from calib_ros.identifiability import RANK_TOLERANCE
 from calib_ros.identification import Identification, identify
-from calib_ros.problem import Problem
+from calib_ros.problem import Learned, Problem
 from calib_ros.se3 import FloatArray
 from calib_ros.validation import log_gain
 
@@ -110,7 +111,11 @@ class _Linear:
     def __init__(self, problem: Problem, geometric: Identification) -> None:
         self._chain = geometric.chain
         self._names = geometric.names
-        self._problem = problem
+        posterior = geometric.posterior
+        priors = {n: s for n, s in posterior.priors.items() if n in self._names}
+        learned = Learned(priors, geometric.noise.size)
+        problem = replace(problem, learned=learned)
+        self._problem, self._sizes = problem, posterior.sizes
         judged = np.split(
             geometric.fitted.judged, np.cumsum([len(each) for each in problem.sets])[:-1]
         )
@@ -225,8 +230,9 @@ class _Linear:
             inside = folds == fold
             part = columns[inside]
             matrix = whole - part.T @ part
-            scale = 1.0 / np.sqrt(np.diag(matrix))
-            factor = linalg.cho_factor(matrix * np.outer(scale, scale))
+            scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+            scaled = matrix * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+            factor = linalg.cho_factor(scaled)
             right = gradient - part.T @ self._residual[inside]
             weights = scale * linalg.cho_solve(factor, scale * right)
             errors[inside] = self._residual[inside] - part @ weights
@@ -237,18 +243,23 @@ class _Linear:
     def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""
         extra, offset = self._system.extra_rows(self._chain, self._names)
-        wide = np.diag([1.0 / effects.expected(name) for name in chosen])
+        wide = np.diag(self._priors(chosen))
         return linalg.block_diag(extra, wide), np.append(offset, np.zeros(len(chosen)))
 
     def _priors(self, names: Sequence[str]) -> FloatArray:
-        """Return 1 / sigma (P,) of the priors; zero without one."""
+        """Return noise / sigma (P,) of the priors; zero without one.
+
+        Effects may be as large as usual, or as large as the data show.
+        """
+        prior = self._system.prior
+        assert prior is not None
         found = np.zeros(len(names))
-        known = {} if self._system.prior is None else self._system.prior.sigmas
         for k, name in enumerate(names):
-            if name in known:
-                found[k] = 1.0 / known[name]
-            elif name not in self._names:
-                found[k] = 1.0 / effects.expected(name)
+            size = prior.sigmas.get(name, 0.0)
+            if name not in self._names:
+                group = str(group_of(self._chain, name))
+                size = max(effects.expected(name), self._sizes.get(group, 0.0))
+            found[k] = prior.noise / size if size else 0.0
         return found
 
 
