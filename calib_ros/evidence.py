@@ -216,6 +216,7 @@ class _Evidence:
         rows = [[group == name for group in groups] for name in self._names]
         self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
         self._typical = np.log([TYPICAL[name] for name in self._names])
+        self._own = np.array([group in ('length', 'angle') for group in groups])
         self._tails = np.ones(len(groups))
 
     def told(self, considered: set[str | None]) -> tuple[FloatArray, dict[str, float]]:
@@ -225,12 +226,11 @@ class _Evidence:
         and do not show any.
         """
         size, width = self._typical.copy(), np.log(SPREAD) ** -2
-        free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
-        mean, root, _ = _solved(self._matrix, self._vector, free)
-        surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
-        self._tails = (TAILS + 1.0) / (
-            TAILS + 1.0 + surely**2 * (self._member.T @ np.exp(-2.0 * size))
-        )
+        if self._own.sum() == self._member.sum():
+            free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
+            mean, root, _ = _solved(self._matrix, self._vector, free)
+            surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
+            self._lengthen(surely**2, 1.0, size)
         for _ in range(ROUNDS):
             weight = self._weight(size)
             mean, root, _ = _solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
@@ -240,8 +240,7 @@ class _Evidence:
             step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
             reach = -np.log(LEAST)
             size = np.clip(size + step, self._typical - reach, self._typical + reach)
-            far = (mean**2 + variance) * (self._member.T @ np.exp(-2.0 * size))
-            self._tails = (TAILS + 1.0) / (TAILS + far)
+            self._lengthen(mean**2 + variance, 0.0, size)
             if np.abs(step).max(initial=0.0) < SETTLED:
                 break
         for k, name in enumerate(self._names):
@@ -257,6 +256,14 @@ class _Evidence:
         with np.errstate(divide='ignore'):
             stds = 1.0 / np.sqrt(precision)
         return stds, dict(zip(self._names, np.exp(size).tolist(), strict=True))
+
+    def _lengthen(self, squares: FloatArray, more: float, size: FloatArray) -> None:
+        """Give offsets of expected squares (P,), larger by `more` sizes, the tails of the prior.
+
+        Effects have none: what a drive does is a matter of its make.
+        """
+        far = self._member.T @ np.exp(-2.0 * size) * squares + more
+        self._tails = np.where(self._own, (TAILS + 1.0) / (TAILS + far), 1.0)
 
     def _weight(self, size: FloatArray) -> FloatArray:
         """Return (G, P) the inverse variances of the parameters of each group."""
