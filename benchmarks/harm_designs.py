@@ -16,6 +16,7 @@ NOISE = (5e-5, 2e-4)
 GOOD = 1e-4
 SIX = ('ur10', 'puma560', 'staubli_tx90l')
 SEVEN = ('kuka_iiwa14', 'franka_panda')
+LINES = ('ur10', 'puma560', 'kuka_iiwa14')
 ERRORS = {  # lengths [m], angles [rad]
     'none': (0.0, 0.0),
     'good': (5e-4, 1e-3),  # then scaled to pose errors of 0.1 to 0.2 mm
@@ -52,7 +53,10 @@ DESIGNS = (
         Design(f'a joint within {size} mrad', 40, errors=SIZES, what='still', size=1e-3 * size)
         for size in (0, 0.3, 1, 3, 10)
     ),
-    Design('five of seven joints still', 40, what='still five', robots=SEVEN),
+    *(
+        Design(f'five of seven within {size}', 30, what='still five', size=size, robots=SEVEN)
+        for size in (0.0, 3e-4)
+    ),
     Design(
         *('grid in succession', 80, ('succession',), ('none', 'small', 'usual')),
         bends=('', 'soft', 'wavy'),
@@ -77,7 +81,10 @@ DESIGNS = (
     Design('test rows repeat', 40, what='test repeats', bends=('ripple',)),
     Design('repeats within 2 mrad', 40, what='repeats', bends=('ripple',)),
     Design('two or three targets', 60, ORDERS, what='targets', bends=('', 'ripple')),
-    Design('one orientation', 40, ('lines',), robots=('ur10', 'puma560', 'kuka_iiwa14')),
+    *(
+        Design(f'one orientation, {size}', 30, ('lines',), what='wobble', size=size, robots=LINES)
+        for size in (0.0, 1e-3)
+    ),
     Design('scale of 500 ppm', 40, what='scale', size=5e-4),
     Design('scale of 1 %', 40, what='scale', size=1e-2),
     Design('auto', 40, ORDERS, model='auto'),
@@ -122,6 +129,8 @@ def session(design, number):
         still = rng.permutation(q.shape[1])[: 5 if design.what == 'still five' else 1]
         home = nominal.draw(1, rng)[0]
         q[:, still] = home[still] + rng.uniform(-1.0, 1.0, (len(q), len(still))) * design.size
+    if design.what == 'wobble':
+        q = q + rng.normal(scale=design.size, size=q.shape)
     measured, problem = measured_by(design, arm, q, rng)
     chain = load_chain(robot)
     healthy = errors == 'none' and bend in ('', 'ripple') and design.what != 'slip'
