@@ -54,8 +54,8 @@ DESIGNS = (
         for size in (0, 0.3, 1, 3, 10)
     ),
     *(
-        Design(f'five of seven within {size}', 30, what='still five', size=size, robots=SEVEN)
-        for size in (0.0, 3e-4)
+        Design(f'five of 7 joints {how}', 30, what='still five', size=size, robots=SEVEN)
+        for how, size in (('still', 0.0), ('in 0.3 mrad', 3e-4))
     ),
     Design(
         *('grid in succession', 80, ('succession',), ('none', 'small', 'usual')),
@@ -82,8 +82,8 @@ DESIGNS = (
     Design('repeats within 2 mrad', 40, what='repeats', bends=('ripple',)),
     Design('two or three targets', 60, ORDERS, what='targets', bends=('', 'ripple')),
     *(
-        Design(f'one orientation, {size}', 30, ('lines',), what='wobble', size=size, robots=LINES)
-        for size in (0.0, 1e-3)
+        Design(f'one orientation{how}', 30, ('lines',), what='wobble', size=size, robots=LINES)
+        for how, size in (('', 0.0), (', to 1 mrad', 1e-3))
     ),
     Design('scale of 500 ppm', 40, what='scale', size=5e-4),
     Design('scale of 1 %', 40, what='scale', size=1e-2),
