@@ -73,7 +73,7 @@ DESIGNS = (
         for what, size in (('tool', 0.3), ('tool', 1), ('tool', 4), ('base', 1), ('base', 4))
     ),
     *(
-        Design(f'slip of {size} degrees', 72, ORDERS, what='slip', size=np.radians(size))
+        Design(f'slip of {size} degrees', 72, ORDERS, what='slip', size=size * np.pi / 180.0)
         for size in (0.02, 0.1, 0.5)
     ),
     Design('drifting tracker', 80, ('path',), what='drift', size=3e-4),
