@@ -205,9 +205,9 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     )
     wanted = [n for n in problem.free if n in structural or n in priors]
     few = problem.system([_some(each) for each in problem.sets])
-    names = identifiability.independent(triangular_factor(start, wanted, few), wanted)
+    names = identifiability.excited(triangular_factor(start, wanted, few), wanted)
     if len(names) < len(wanted):  # more samples may determine more
-        names = identifiability.independent(triangular_factor(start, wanted, system), wanted)
+        names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
     rough = start
     if few.count < system.count // 2:
         rough = minimise(start, names, few, tolerance=1e-2).chain
