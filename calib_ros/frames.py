@@ -8,8 +8,8 @@ Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading
 of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013).
 Positions: a point set registration of the flange positions (Umeyama 1991) that leaves the tool
 out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row.
-Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation is
-the shortest one, the base takes the rest, and rotations come from the registration.
+Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
+is the shortest one, the base takes the rest, and rotations come from the registration.
 Distances: their squares are linear in the base's position and its square, solved for the better
 half of the samples. Every start is polished by least squares on the frames
 alone; the best one counts. Where none fits (few or degenerate poses), the 24 rotations of a cube
