@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from calib_ros import effects, identifiability
+from calib_ros import effects, identifiability, suspicions
 from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
@@ -93,6 +93,8 @@ class Identification:
         third of `largest_length` or `largest_angle`.
     verdicts : tuple of Verdict
         Where the model was chosen: what paid for itself and what did not.
+    remarks : tuple of str
+        What is suspicious though the figures are good, and what to do (`suspicions.py`).
 
     """
 
@@ -117,6 +119,7 @@ class Identification:
     refusals: tuple[str, ...]
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -235,7 +238,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
-    return Identification(
+    result = Identification(
         chain=fit.chain,
         before=before.chain,
         parameters=parameters,
@@ -256,6 +259,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         chance=chance,
         refusals=refusals(problem, converged, parameters, validation, chance),
     )
+    return suspicions.remarked(problem, result)
 
 
 def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
