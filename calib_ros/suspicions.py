@@ -37,6 +37,7 @@ from calib_ros.differential import ErrorModel
 from calib_ros.identifiability import excited
 from calib_ros.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.problem import Problem
+from calib_ros.robust import SUSPICIOUS
 from calib_ros.se3 import FloatArray
 from calib_ros.simulation import measure
 
@@ -48,10 +49,11 @@ CHANCE = 1e-4
 LEAST_SCALE = 5e-5
 LARGEST_SCALE = 1e-3
 """Growth of an arm by 40 degrees, if all of it is of aluminium."""
-SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 61)])
+SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths that are tried."""
-POSES = 30
-"""Poses, spread evenly over those measured, that tell enough for a suspicion."""
+MANY = 300
+POSES = 24
+"""Poses, spread evenly over those measured, that tell enough: of gravity, of all else."""
 ANOTHER = (2e-3, 5e-3)
 """Least offset [m, rad] of an arm that may be another one than the nominal."""
 NEARER = 0.3
@@ -64,10 +66,11 @@ def remarked(problem: Problem, result: Identification) -> Identification:
     """Return the result with what is suspicious in it, refused where it cannot be right."""
     if any(each.socket for each in problem.sets):
         return result  # one place tells nothing of what follows
-    scale, certain = _scale(problem, result)
-    others = (_sister(problem, result), _gravity(problem, result), _coupling(problem, result))
+    sister = _sister(problem, result)
+    scale, certain = ('', False) if sister else _scale(problem, result)
     refusals = (*result.refusals, scale) if certain else result.refusals
-    said = tuple(each for each in (*result.remarks, scale, *others) if each)
+    found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
+    said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
 
 
@@ -189,8 +192,8 @@ def _gravity(problem: Problem, result: Identification) -> str:
     for k, words in enumerate('xyz'):  # the sign is the coefficients'
         x, y, z = (size * np.eye(3)[k]).tolist()
         chain = replace(straight, gravity=(x, y, z))
-        explained[words] = _explained(problem, chain, rest, bent)
-    given = _explained(problem, straight, rest, bent)
+        explained[words] = _explained(problem, chain, rest, bent, MANY)
+    given = _explained(problem, straight, rest, bent, MANY)
     words, best = max(explained.items(), key=lambda pair: pair[1])
     if not best - given > EXPLAINED * (1.0 - given):
         return ''
@@ -205,7 +208,7 @@ def _coupling(problem: Problem, result: Identification) -> str:
     """Return in words whether couplings of the wrist explain what is left."""
     known = [name for name, _ in result.chain.effects]
     names = [n for n in effects.members(problem.chain, 'coupling') if n not in known]
-    if not names:
+    if not names or result.noise.position < SUSPICIOUS:  # nothing is left to explain
         return ''
     chain = result.chain.with_effects([*known, *names])
     share = _explained(problem, chain, result.names, names)
@@ -218,11 +221,12 @@ def _coupling(problem: Problem, result: Identification) -> str:
 
 
 def _explained(
-    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
+    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str], poses: int = POSES
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""
     parts = []
-    for samples in problem.system([each.select(_few(len(each))) for each in problem.sets]).sets:
+    few = [each.select(_few(len(each), poses)) for each in problem.sets]
+    for samples in problem.system(few).sets:
         rows = samples.rows_of(chain, (*fitted, *added))
         parts.append(rows.reshape(-1, rows.shape[2]))
     rows = np.concatenate(parts)
@@ -243,5 +247,5 @@ def _explained(
     return 1.0 - left / total
 
 
-def _few(count: int) -> NDArray[np.intp]:
-    return np.arange(0, count, 1 + count // POSES)
+def _few(count: int, poses: int = POSES) -> NDArray[np.intp]:
+    return np.arange(0, count, 1 + count // poses)
