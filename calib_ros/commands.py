@@ -57,7 +57,7 @@ def add_commands(command: Command, given: Sequence[str]) -> None:
             'verify',
             _verify,
             _add_verify,
-            'judge a corrected arm on new measurements: PASS or FAIL',
+            'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
         ),
         (
             'compensate',
@@ -132,7 +132,12 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('measured', type=Path, help='table of new measurements: q1..qn as reported, x y z ...')
     add_chain(parser)
     _add_calibration(parser)
-    add('--tolerance', type=float, required=True, metavar='MM', help='wanted RMS position error')
+    add(
+        '--tolerance',
+        type=float,
+        metavar='MM',
+        help='wanted RMS position error; if not given, errors only, without a verdict',
+    )
     add(
         '--commanded',
         type=Path,
@@ -142,6 +147,7 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('--confidence', type=float, default=0.95, help='of the verdict')
     add('--session', help='session of the table')
     add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
+    add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
 
 
 def _add_compensate(parser: argparse.ArgumentParser) -> None:
@@ -369,15 +375,16 @@ def _verify(options: argparse.Namespace) -> int:
     found = verify(
         arm,
         (*table.fitted, *table.held_out),
-        1e-3 * options.tolerance,
+        None if options.tolerance is None else 1e-3 * options.tolerance,
         options.confidence,
         options.new_base,
         commanded,
+        options.new_tool,
     )
     for warning in table.warnings:
         print(f'warning: {warning}', file=sys.stderr)
     print(in_words(found))
-    return 0 if found.verdict == 'PASS' else NOT_ACCEPTED
+    return 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
 
 
 def _compensate(options: argparse.Namespace) -> int:

@@ -8,7 +8,8 @@ Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading
 of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013).
 Positions: a point set registration of the flange positions (Umeyama 1991) that leaves the tool
 out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row.
-Translations are linear once R_B is known.
+Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
+is the shortest one, the base takes the rest, and rotations come from the registration.
 Distances: their squares are linear in the base's position and its square, solved for the better
 half of the samples. Every start is polished by least squares on the frames
 alone; the best one counts. Where none fits (few or degenerate poses), the 24 rotations of a cube
@@ -25,7 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import se3
 from calib_ros.chain import FRAME_KINDS, Chain, Frame
-from calib_ros.leastsquares import Samples, System, minimise
+from calib_ros.identifiability import FRAME_TOLERANCE, excited
+from calib_ros.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.observations import Observations
 from calib_ros.robust import robust_fit
 from calib_ros.se3 import FloatArray
@@ -33,6 +35,8 @@ from calib_ros.se3 import FloatArray
 SUBSET = 200
 DRAWS, DRAWN = 500, 8
 """How many starts a place by distances has, and from how many samples, of 4 unknowns."""
+ONE_ORIENTATION = 0.9999
+"""Ratio of the leading singular values from which orientations are one, within 0.01 rad."""
 CONVINCING = 0.03
 """A start is taken without a search when its RMS error is below this share of the spread."""
 
@@ -96,16 +100,19 @@ def _start_one(
         return robust_fit(start, names, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     best, best_error = chain, np.inf
+    determined: tuple[str, ...] = ()
     for candidates in (_closed_form(chain, arm, subset), _search()):
         for rotation in candidates:
             start = _complete(chain, arm, subset, rotation)
-            fitted = minimise(start, names, system, tolerance=1e-3).chain
+            if not determined:
+                determined = excited(triangular_factor(start, names, system), names)
+            fitted = minimise(start, determined, system, tolerance=1e-3).chain
             error = _typical_error(fitted, subset)
             if error < best_error:
                 best, best_error = fitted, error
         if best_error <= CONVINCING * spread:
             break
-    return robust_fit(best, names, system, loss).fit.chain
+    return robust_fit(best, determined, system, loss).fit.chain
 
 
 def _in_socket(chain: Chain, observations: Observations) -> Chain:
@@ -117,11 +124,8 @@ def _in_socket(chain: Chain, observations: Observations) -> Chain:
     tool, base = chain.frame('tool'), chain.frame('base')
     tool_matrix, base_matrix = tool.matrix.copy(), np.eye(4)
     if not tool.fixed:
-        columns = np.concatenate(
-            [np.broadcast_to(np.eye(3), (len(arm), 3, 3)), arm[:, :3, :3]], axis=2
-        )
-        wanted = -arm[:, :3, 3].ravel()
-        tool_matrix[:3, 3] = np.linalg.lstsq(columns.reshape(-1, 6), wanted, rcond=None)[0][3:]
+        turned = arm[:, :3, :3]
+        tool_matrix[:3, 3] += _shortest(turned, -(arm @ tool.matrix)[:, :3, 3], True)
     base_matrix[:3, 3] = -(arm @ tool_matrix)[:, :3, 3].mean(axis=0)
     return replace(
         chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
@@ -179,12 +183,13 @@ def _closed_form(
                 np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
             )
         system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
-        _, _, right = np.linalg.svd(system)
+        _, sizes, right = np.linalg.svd(system)
         for sign in (1.0, -1.0):  # the singular vector's sign is open, its determinant is not
             matrix = sign * right[0].reshape(3, 3, order='F')
             if np.linalg.det(matrix) > 0.0:
                 yield se3.nearest_rotation(matrix)
-        return
+        if sizes[1] < ONE_ORIENTATION * sizes[0]:
+            return
     positions = observations.positions - observations.positions.mean(axis=0)
     tool_point = chain.frame('tool').matrix[:3, 3]
     reached = arm[:, :3, 3] + arm[:, :3, :3] @ tool_point
@@ -216,23 +221,27 @@ def _complete(
         )
     # p = R_B p_K + R_B R_K t + b, with b and t unknown unless their frame is fixed
     turned = rotation @ arm[:, :3, :3]
-    wanted = observations.positions - arm[:, :3, 3] @ rotation.T
-    unknown = []
-    if not base.fixed:
-        unknown.append(np.broadcast_to(np.eye(3), turned.shape))
-    else:
-        wanted = wanted - base_matrix[:3, 3]
+    wanted = observations.positions - arm[:, :3, 3] @ rotation.T - turned @ tool_matrix[:3, 3]
     if not tool.fixed:
-        unknown.append(turned)
-    else:
-        wanted = wanted - turned @ tool_matrix[:3, 3]
-    if unknown:
-        columns = np.concatenate(unknown, axis=2).reshape(-1, 3 * len(unknown))
-        solution = np.linalg.lstsq(columns, wanted.ravel(), rcond=1e-9)[0]
-        if not base.fixed:
-            base_matrix[:3, 3] = solution[:3]
-        if not tool.fixed:
-            tool_matrix[:3, 3] = solution[-3:]
+        left = wanted - base_matrix[:3, 3] if base.fixed else wanted
+        shift = _shortest(turned, left, not base.fixed)
+        tool_matrix[:3, 3] += shift
+        wanted -= turned @ shift
+    if not base.fixed:
+        base_matrix[:3, 3] = wanted.mean(axis=0)
     return replace(
         chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
     )
+
+
+def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
+    """Return the shortest t (3,) [m] with which R_i t + b comes near wanted (N, 3) [m].
+
+    Directions in which rotations (N, 3, 3) hardly vary stay zero. b is anywhere where it is
+    `free`, else zero.
+    """
+    if free:
+        turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
+    left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
+    known = sizes > FRAME_TOLERANCE * np.sqrt(len(turned))
+    return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))

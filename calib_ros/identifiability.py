@@ -14,15 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from calib_ros.chain import Chain
+from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.differential import ErrorModel
 from calib_ros.se3 import FloatArray
 
 RANK_TOLERANCE = 1e-8
 """A column is dependent when less than this share of it is left after the columns before it."""
+FRAME_TOLERANCE = 1e-3
+"""The same for base and tool frames. Orientations that vary by a milliradian vary by no more than
+an arm's own errors: a tool that follows from them would be anywhere, kilometres away as well."""
 
 
-def independent(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
+def independent(
+    factor: FloatArray, names: Sequence[str], frame_tolerance: float = RANK_TOLERANCE
+) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
     The order of the names is their priority: of the parameters that trade against each other,
@@ -34,6 +39,8 @@ def independent(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
         Upper triangular factor of the weighted Jacobian, columns in the order of the names.
     names : sequence of str
         Parameters, the most wanted first.
+    frame_tolerance : float
+        Least share of a frame's column; of other columns RANK_TOLERANCE.
 
     """
     basis = np.zeros((len(factor), 0))
@@ -42,10 +49,17 @@ def independent(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)  # once more: Gram-Schmidt loses orthogonality
         size = float(np.linalg.norm(rest))
-        if size > RANK_TOLERANCE * float(np.linalg.norm(column)) and size > 0.0:
+        placed = name.partition('.')[2] in FRAME_KINDS
+        least = (frame_tolerance if placed else RANK_TOLERANCE) * float(np.linalg.norm(column))
+        if size > least and size > 0.0:
             basis = np.column_stack([basis, rest / size])
             kept.append(name)
     return tuple(kept)
+
+
+def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the parameters that measured poses determine: frames by more than arms' errors."""
+    return independent(factor, names, FRAME_TOLERANCE)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from calib_ros import effects, identifiability
+from calib_ros import effects, identifiability, suspicions
 from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
@@ -101,6 +101,8 @@ class Identification:
         the size that this arm's errors have.
     verdicts : tuple of Verdict
         Where the model was chosen: what paid for itself and what did not.
+    remarks : tuple of str
+        What is suspicious though the figures are good, and what to do (`suspicions.py`).
 
     """
 
@@ -127,6 +129,7 @@ class Identification:
     region: Region | None
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -215,10 +218,9 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     )
     wanted = [n for n in problem.free if n in structural or n in priors]
     few = problem.system([_some(each) for each in problem.sets])
-    factor = triangular_factor(start, wanted, few)
-    names = identifiability.independent(factor, wanted)
+    names = identifiability.excited(triangular_factor(start, wanted, few), wanted)
     if len(names) < len(wanted):  # more samples may determine more
-        names = identifiability.independent(triangular_factor(start, wanted, system), wanted)
+        names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
     problem = _guarded(problem, names, triangular_factor(start, names, few), simpler)
     rough = start
     if simpler is not None:
@@ -247,7 +249,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     freedom = max(1.0, float(system.rows - len(names)))
     posterior = _posterior(problem, fitted, names, whole, considered(fit.chain, names))
     region = region_of(posterior, problem.sets, freedom)
-    return Identification(
+    result = Identification(
         chain=fit.chain,
         before=before.chain,
         parameters=parameters,
@@ -271,6 +273,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         region=region,
         weak=_weak(problem, parameters),
     )
+    return suspicions.remarked(problem, result)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,13 @@ BLOCK = 1024
 STEP_TOLERANCE = 1e-6
 """The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
 larger, in RMS residuals)."""
-MAX_ITERATIONS = 50
 PATIENCE = 3
+"""Steps in succession that may raise the cost before they are damped."""
+STALLED = 50
+"""Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
+LEAST_FALL = 1e-3
+DAMPED, UNDAMPED = 1e-6, 1e-12
+"""Damping, of columns of unit length, with which it begins and below which it ends."""
 WELL_CONDITIONED = 1e9
 """Condition of the scaled normal matrix up to which a covariance from it has 6 digits or more."""
 SEPARATION_SIGMA = 1e-5
@@ -398,40 +403,56 @@ def minimise(
     names: Sequence[str],
     system: System,
     tolerance: float = STEP_TOLERANCE,
-    iterations: int = MAX_ITERATIONS,
+    iterations: float = np.inf,
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 
     Gauss-Newton with columns scaled to unit length. A step may raise the cost for a moment, as
     it must to get through a curved valley (watchdog; Chamberlain et al. 1982); when PATIENCE
     steps have not brought it below the best, the fit goes back there and steps are damped
-    (Levenberg 1944, Marquardt 1963) until they lower it.
+    (Levenberg 1944, Marquardt 1963), by the ratio of the gain to the one foreseen (Nielsen 1999).
+    It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
+    It ends as well, not converged, where STALLED iterations bring no progress.
     """
     normal = normal_equations(chain, names, system)
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
-    damping = 0.0
+    damping, growth = 0.0, 2.0
     patience = PATIENCE
-    for iteration in range(1, iterations + 1):
-        step = _solve(normal, damping)
-        moved = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
-        settled = damping == 0.0 and moved < tolerance * max(1.0, normal.rms(system))
+    stalled, least_cost, least_left = 0, np.inf, np.inf
+    iteration = 0
+    while iteration < iterations and stalled < STALLED:
+        iteration += 1
+        step = _solve(normal, 0.0)
+        left = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
+        settled = left < tolerance * max(1.0, normal.rms(system))
+        if damping > 0.0 and not settled:
+            step = _solve(normal, damping)
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
             return Fit(chain, normal, iteration, True)
+        stalled += 1
+        if best.cost < (1.0 - LEAST_FALL) * least_cost or left < 0.5 * least_left:
+            stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
+        foreseen = float(step @ (2.0 * normal.gradient - normal.matrix @ step))
         normal = normal_equations(chain, names, system)
-        if normal.cost <= best.cost * (1.0 + 1e-12):
+        gain = best.cost - normal.cost
+        if gain >= -1e-12 * best.cost:
             best, best_chain = normal, chain
-            patience = PATIENCE if damping < 1e-9 else 0
-            damping = damping / 10.0 if patience == 0 else 0.0
+            growth = 2.0
+            if damping > UNDAMPED:
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
+            else:
+                damping, patience = 0.0, PATIENCE
         elif patience > 0 and np.isfinite(normal.cost):
             patience -= 1
         elif damping > 1e12:  # nothing lowers the cost
             break
         else:
             normal, chain = best, best_chain
-            damping = max(10.0 * damping, 1e-6)
+            patience = 0
+            damping, growth = max(growth * damping, DAMPED), 2.0 * growth
     return Fit(best_chain, best, iteration, False)
 
 

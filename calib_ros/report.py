@@ -50,6 +50,8 @@ def summary(result: Identification) -> str:
     weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
         text += f'; weakly determined: {", ".join(weak)}'
+    if result.remarks:
+        text += f'; note: {"; ".join(result.remarks)}'
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
@@ -137,6 +139,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'converged': result.converged,
         'accepted': result.accepted,
         'refusals': list(result.refusals),
+        'remarks': list(result.remarks),
         'iterations': result.iterations,
         'rank': result.rank,
         'unidentifiable': list(result.unidentifiable),

@@ -11,15 +11,23 @@ correction that did not arrive shows as well.
 The figure is the RMS position error over poses like those measured. Of K configurations with
 errors e_k the sum of squares is taken for theta / nu chi2(nu) (Satterthwaite 1946) with
 
-    S = mean of e_k e_k^T        nu = K (tr S)^2 / tr S^2
+    S = mean of e_k e_k^T        nu = K min((tr S)^2 / tr S^2, 2 / c^2)
 
-between K (all errors in one direction) and 3 K (in all directions alike): few configurations make
-nu too small rather than too large. Measurements of one configuration share its error and count for
-one. The limits of the RMS are one-sided, each at the confidence wanted:
+between K (all errors in one direction) and 3 K (in all directions alike), and fewer where the
+errors are larger at some places than at others, as compliance and eccentricities leave them: c^2
+is the variance of the squared errors over the square of their mean, taken together with that of
+POOLED errors in one direction (2), and larger by its own standard deviation. Few configurations
+make nu too small rather than too large. Measurements of one configuration share its error and
+count for one. The limits of the RMS are one-sided, each at the confidence wanted:
 
     PASS        the upper limit is within the tolerance
     FAIL        the lower limit is beyond it
     UNDECIDED   neither: more poses are needed
+
+Frames of the new measurements are fitted to both arms where that is asked for: the base where the
+device stands elsewhere, the tool where another target, or the same anew, is on the flange. A frame
+that is not fitted must be that of the calibration: else its change counts as the arm's error, and
+tells nothing about which of two calibrations is better.
 """
 
 from __future__ import annotations
@@ -33,22 +41,30 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros import se3
-from calib_ros.chain import Chain
+from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identifiability import excited
+from calib_ros.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.observations import Observations, configurations
 from calib_ros.se3 import FloatArray
 from calib_ros.validation import Comparison, compare
 from calib_ros.workspace import CalibratedArm
 
-Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED']
+Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
 LEAST = 5
 """Configurations from which a verdict is given, those of a fitted frame not counted."""
 MOST = 10_000
 """Configurations up to which it is said how many would decide."""
+POOLED = 2
+"""Configurations with errors in one direction that the scatter of the squares is pooled with."""
 BASE_SHARE = 2
 """Configurations whose errors a new base frame takes up: it has six freedoms, each has three."""
+TOOL_SHARE = 1
+"""The same of a new tool frame: its turn does not move the target."""
 FAR = 0.1
 """Distance [rad or m] from commanded joint values that no correction makes."""
+UNIT = (1e-3, 1e-3)
+"""Sigmas [m, rad] that weigh all samples alike."""
 MOST_LINES = 20
 """Configurations up to which each has a line in the report."""
 MOVED = 0.3
@@ -63,13 +79,15 @@ class Verification:
     ----------
     comparison : Comparison
         Residuals by the nominal and by the calibrated arm.
-    tolerance, confidence : float
-        Wanted RMS position error [m], and confidence of each limit.
+    tolerance : float or None
+        Wanted RMS position error [m].
+    confidence : float
+        Of each limit.
     group : (N,)
         The configuration that each measurement belongs to; `configurations` counts them.
     rms, lower, upper : float
         RMS position error [m] over poses like these, and its limits.
-    verdict : 'PASS', 'FAIL' or 'UNDECIDED'
+    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
         even MOST would not.
@@ -77,11 +95,13 @@ class Verification:
         Share of the RMS error that is left without one common shift and turn of all positions.
     by_program : bool
         Whether the poses wanted are those of the program before its correction.
+    fitted : tuple of str
+        Frames that were fitted to the new measurements.
 
     """
 
     comparison: Comparison
-    tolerance: float
+    tolerance: float | None
     confidence: float
     group: NDArray[np.intp]
     rms: float
@@ -91,6 +111,7 @@ class Verification:
     needed: int | None
     common: float
     by_program: bool
+    fitted: tuple[str, ...] = ()
 
     @property
     def configurations(self) -> int:
@@ -101,10 +122,11 @@ class Verification:
 def verify(
     arm: CalibratedArm,
     sets: Sequence[Observations],
-    tolerance: float,
+    tolerance: float | None,
     confidence: float = 0.95,
     new_base: bool = False,
     commanded: FloatArray | None = None,
+    new_tool: bool = False,
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
@@ -114,8 +136,8 @@ def verify(
         Before and after.
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
-    tolerance : float
-        Largest RMS position error [m] that will do.
+    tolerance : float, optional
+        Largest RMS position error [m] that will do; without one there is no verdict.
     confidence : float
         Of the verdict.
     new_base : bool
@@ -124,6 +146,9 @@ def verify(
     commanded : (M, n), optional
         Joint values [rad or m] of the program before its correction: the nominal arm means there
         what is wanted. The nearest belongs to a measurement.
+    new_tool : bool
+        Another target is on the flange than for the calibration, or the same was mounted anew: its
+        frame is fitted, which costs the freedom of one configuration.
 
     Raises
     ------
@@ -132,7 +157,7 @@ def verify(
         know, or measurements far from all that was commanded.
 
     """
-    if not 0.0 < tolerance < np.inf or not 0.5 < confidence < 1.0:
+    if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
         raise ConfigError(
             'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
             f'{tolerance} and {confidence}'
@@ -144,12 +169,14 @@ def verify(
     if commanded is not None:
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
-    if new_base:
-        before, after = _rebased(before, sets), _rebased(after, wanted)
+    before, after = (
+        _in_new_frames(chain, each, new_base, new_tool)
+        for chain, each in ((before, sets), (after, wanted))
+    )
     comparison = replace(compare(before, after, sets), after=compare(before, after, wanted).after)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = _moments(comparison.after.position, group)
-    lost = BASE_SHARE if new_base else 0
+    lost = BASE_SHARE * new_base + TOOL_SHARE * new_tool
     count = len(moments)
     if count - lost < LEAST:
         raise InputError(
@@ -157,7 +184,7 @@ def verify(
             'usual (calib_ros plan --iso9283)'
         )
     spread = moments.sum(axis=0) / (count - lost)
-    freedom = float(np.trace(spread) ** 2 / np.trace(spread @ spread))
+    freedom = _freedom(moments)
     rms = float(np.sqrt(np.trace(spread)))
 
     shaped = compare(before, _rebased(after, wanted), wanted).after
@@ -165,13 +192,14 @@ def verify(
     common = 1.0 if new_base else float(np.sqrt(left)) / rms
     numbers = np.unique(np.geomspace(count, MOST, 200).astype(int))
     lower, upper = rms_limits(rms, freedom * (numbers - lost), confidence)
-    decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
-    needed = int(numbers[decided[0]]) if decided.size else None
-    verdict: Verdict = 'UNDECIDED'
-    if upper[0] <= tolerance:
-        verdict = 'PASS'
-    elif lower[0] > tolerance:
-        verdict = 'FAIL'
+    verdict: Verdict = 'JUDGED'
+    needed = None
+    if tolerance is not None:
+        decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
+        needed = int(numbers[decided[0]]) if decided.size else None
+        verdict = 'PASS' if upper[0] <= tolerance else 'FAIL'
+        if lower[0] <= tolerance < upper[0]:
+            verdict = 'UNDECIDED'
     return Verification(
         comparison,
         tolerance,
@@ -184,6 +212,7 @@ def verify(
         needed,
         common,
         commanded is not None,
+        ('base',) * new_base + ('tool',) * new_tool,
     )
 
 
@@ -221,6 +250,41 @@ def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
     return np.asarray(commanded[away.argmin(axis=1)])
 
 
+def _in_new_frames(
+    chain: Chain, sets: Sequence[Observations], new_base: bool, new_tool: bool
+) -> Chain:
+    """Return the chain with base and tool frames, as asked, fitted to measured positions.
+
+    A new tool is turned as the orientations say, if any were measured. Where they hardly vary, the
+    tool keeps the translation that it had: the base takes up the same.
+    """
+    if new_base:
+        chain = _rebased(chain, sets)
+    if not new_tool:
+        return chain
+    names = [f'{each.tool}.{axis}' for each in sets for axis in 'xyz']
+    if new_base:
+        names = [f'{each.base}.{kind}' for each in sets for kind in FRAME_KINDS] + names
+    unoriented = [replace(each, oriented=np.zeros(len(each), bool)) for each in sets]
+    system = System(tuple(Samples(replace(each, covariance=None), *UNIT) for each in unoriented))
+    names = list(dict.fromkeys(names))
+    known = excited(triangular_factor(chain, names, system), names)
+    chain = minimise(chain, known, system).chain
+    for tool in dict.fromkeys(each.tool for each in sets):
+        turns = []
+        for each in sets:
+            if each.tool == tool and each.oriented.any():
+                now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]
+                measured = each.rotations[each.oriented]
+                turns.append(np.einsum('nji,njk->ik', now[:, :3, :3], measured))
+        if turns:
+            frame = chain.frame(tool)
+            matrix = frame.matrix.copy()
+            matrix[:3, :3] = matrix[:3, :3] @ se3.nearest_rotation(np.sum(turns, axis=0))
+            chain = chain.with_frame(tool, replace(frame, matrix=matrix))
+    return chain
+
+
 def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
     """Return the chain with the base frames that bring it closest to measured positions."""
     for base in dict.fromkeys(each.base for each in sets):
@@ -235,6 +299,16 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
         frame = chain.frame(base)
         chain = chain.with_frame(base, replace(frame, matrix=motion @ frame.matrix))
     return chain
+
+
+def _freedom(moments: FloatArray) -> float:
+    """Return the degrees of freedom of one of the configurations with moments (K, 3, 3)."""
+    spread, count = moments.mean(axis=0), len(moments)
+    squares = np.trace(moments, axis1=1, axis2=2)
+    scatter = squares.var(ddof=1) / squares.mean() ** 2
+    scatter = ((count - 1) * scatter + 2.0 * POOLED) / (count - 1 + POOLED)
+    scatter *= 1.0 + np.sqrt(scatter / count)
+    return float(min(np.trace(spread) ** 2 / np.trace(spread @ spread), 2.0 / scatter))
 
 
 def _moments(errors: FloatArray, group: NDArray[np.intp]) -> FloatArray:
@@ -261,10 +335,13 @@ def in_words(found: Verification) -> str:
             f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
         )
     lines += _by_configuration(found)
+    if found.fitted:
+        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
+    verdict = '' if found.tolerance is None else f'{found.verdict}: '
+    wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
     lines.append(
-        f'{found.verdict}: the RMS error over poses like these is below {1e3 * found.upper:.4f} '
-        f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm; wanted is '
-        f'{1e3 * found.tolerance:g} mm'
+        f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
+        f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
     )
     if not found.by_program:
         lines.append(
@@ -278,7 +355,7 @@ def in_words(found: Verification) -> str:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
             'the error would be left: was the measuring device moved? If it stands elsewhere on '
-            'purpose, --new-base fits its frame'
+            'purpose, --new-base fits its frame, and --new-tool that of another target'
         )
     return '\n'.join(lines)
 

@@ -25,7 +25,7 @@ ORDER = [
     {'compensation'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
-    {'chance', 'live', 'noise', 'validation'},
+    {'chance', 'live', 'noise', 'suspicions', 'validation'},
     {'identification'},
     {'calibration', 'design', 'salvage', 'selection', 'workspace'},
     {'candidates', 'placement', 'verification'},

@@ -8,15 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from calib_ros import se3
+from calib_ros import inverse, leastsquares, se3
 from calib_ros.chain import Chain, Frame, Joint
 from calib_ros.config import load_chain
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError
+from calib_ros.frames import _shortest, start_frames
+from calib_ros.identifiability import structurally_independent
 from calib_ros.identification import Problem, identify, residuals
 from calib_ros.leastsquares import (
     BLOCK,
     Samples,
     System,
+    minimise,
     normal_equations,
     triangular_factor,
 )
@@ -147,6 +150,92 @@ def test_the_minimum_is_that_of_an_independent_solver():
     other = least_squares(weighted, np.zeros(result.rank), x_scale='jac', xtol=1e-14, gtol=1e-14)
     left = weighted([result.chain.offset(name, result.before) for name in result.names])
     assert left @ left == pytest.approx(2.0 * other.cost, rel=1e-10)
+
+
+def still_joint(name, seed):
+    """Return a start and its system: a joint within 0.3 mrad, positions of 0.5 mm noise."""
+    nominal, rng = load_chain(name), np.random.default_rng(seed)
+    q = rng.uniform(-2.5, 2.5, (60, len(nominal.joints)))
+    q[:, 1] = 1.0 + rng.uniform(-3e-4, 3e-4, 60)
+    seen = measure(faulty(nominal, Cell(), rng), q, rng, 5e-4, oriented=False)
+    problem = Problem(nominal, seen)
+    start = start_frames(problem.model, problem.sets, 1e-4, 1e-4, 'none')
+    names = structurally_independent(problem.model, problem.free, problem.kinds)
+    return start, names, problem.system(problem.sets)
+
+
+def test_a_long_curved_valley_is_followed_to_its_end():
+    """Condition 3e4: the best parameters are far away, and steps must be short."""
+    start, names, system = still_joint('kuka_iiwa14', 1)
+    fit = minimise(start, names, system)
+    assert fit.converged
+    assert 50 < fit.iterations < 400
+    early = minimise(start, names, system, iterations=50)
+    assert not early.converged
+    assert fit.normal.cost < (1.0 - 1e-3) * early.normal.cost
+    again = normal_equations(fit.chain, names, system)
+    left = np.linalg.solve(again.matrix, again.gradient)
+    assert left @ again.gradient < 1e-9 * again.cost
+
+
+def test_a_fit_without_progress_ends_and_says_so(monkeypatch):
+    start, names, system = still_joint('ur10e', 0)
+    stuck = normal_equations(start, names, system)
+    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: stuck)
+    fit = minimise(start, names, system)
+    assert not fit.converged
+    assert fit.iterations < 200
+    worse = replace(stuck, cost=2.0 * stuck.cost)
+    costs = iter([stuck])
+    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: next(costs, worse))
+    fit = minimise(start, names, system)
+    assert not fit.converged
+    assert fit.iterations < 200
+    assert fit.chain is start
+
+
+@pytest.mark.parametrize('shape', ['line', 'circle', 'volume'])
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('jitter', [0.0, 1e-4])
+def test_one_orientation_leaves_the_tool_where_it_was(shape, oriented, jitter):
+    """Base and tool trade without bounds there: the shortest tool is taken, and is named."""
+    nominal, rng = load_chain('ur10e'), np.random.default_rng(0)
+    bare, t = replace(nominal, base=Frame(), tool=Frame()), np.linspace(-1.0, 1.0, 60)
+    q = np.array([0.3, -1.2, 1.5, -0.8, 1.2, 0.4])
+    shift = {
+        'line': np.outer(t, [1.0, 0.3, 0.2]),
+        'circle': np.column_stack([np.cos(3.0 * t), np.sin(3.0 * t), 0.0 * t]),
+        'volume': rng.uniform(-1.0, 1.0, (60, 3)),
+    }[shape]
+    poses = bare.forward(q[np.newaxis]).repeat(60, axis=0)
+    poses[:, :3, 3] += 0.15 * shift
+    found = inverse.solve(bare, poses, q[np.newaxis].repeat(60, axis=0))
+    assert found.converged.all()
+    joints = found.joints + rng.normal(scale=jitter, size=found.joints.shape)
+    true = faulty(nominal, Cell(), rng)
+    seen = measure(true, joints, rng, 5e-5, 2e-4, oriented=oriented)
+    result = identify(Problem(nominal, seen))
+    assert result.converged
+    assert {'tool.x', 'tool.y', 'tool.z'} <= set(result.not_excited)
+    assert not result.accepted
+    for chain in (result.before, result.chain):
+        assert np.linalg.norm(chain.frame('tool').matrix[:3, 3]) < 0.01
+        assert np.linalg.norm(chain.frame('base').matrix[:3, 3]) < 5.0
+    assert result.fitted.figures[0].rms_mm < 1.0
+    assert result.fitted.figures[1].rms_mm < 0.1
+
+
+def test_a_tool_that_is_given_stays_where_orientations_do_not_tell():
+    rng = np.random.default_rng(0)
+    turned = np.tile(np.eye(3), (20, 1, 1))
+    assert not _shortest(turned, rng.normal(size=(20, 3)), True).any()
+    axis = np.zeros((20, 3))
+    axis[:, 2] = np.linspace(0.0, 1.0, 20)  # turns about z tell of x and y alone
+    turned = se3.exp_rotation(axis)
+    wanted = turned @ np.array([0.1, 0.2, 0.3]) + np.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(_shortest(turned, wanted, True), [0.1, 0.2, 0.0], atol=1e-12)
+    still = _shortest(turned, wanted - [1.0, 2.0, 3.0], False)
+    np.testing.assert_allclose(still, [0.1, 0.2, 0.3], atol=1e-12)
 
 
 def test_standard_deviations_are_honest():

@@ -193,6 +193,69 @@ def test_a_device_that_stands_elsewhere(cell, arm):
     assert 'moved' not in in_words(same)
 
 
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_target_that_was_mounted_anew(cell, arm, oriented):
+    """Its change counts as the arm's error unless its frame is fitted as well."""
+    true, _ = cell
+    there, tool = (simulation.random_frame(np.random.default_rng(k), 0.3) for k in (9, 10))
+    moved = replace(true, base=there, tool=tool)
+    joints = UR.random_joints(40, np.random.default_rng(3))
+    seen = [simulation.measure(moved, joints, np.random.default_rng(1), *NOISE, oriented)]
+    assert verify(arm, seen, 3e-4, new_base=True).verdict == 'FAIL'
+    found = verify(arm, seen, 3e-4, new_base=True, new_tool=True)
+    same = verify(arm, [measured(true, joints, 1)], 3e-4)
+    assert found.verdict == 'PASS'
+    assert found.rms == pytest.approx(same.rms, rel=0.15)
+    assert found.fitted == ('base', 'tool')
+    before, after = found.comparison.figures
+    assert 0.5 < before.rms_mm < 5.0
+    assert after.rms_mrad is None or after.rms_mrad < 1.0
+    with pytest.raises(InputError, match='7 configurations were measured, at least 8'):
+        verify(arm, [seen[0].select(np.arange(7))], 3e-4, new_base=True, new_tool=True)
+
+
+def test_a_new_target_alone(cell, arm):
+    true, _ = cell
+    moved = replace(true, tool=simulation.random_frame(np.random.default_rng(10), 0.3))
+    joints = UR.random_joints(40, np.random.default_rng(3))
+    assert verify(arm, [measured(moved, joints)], 3e-4, new_tool=True).verdict == 'PASS'
+
+
+def test_the_better_calibration_wins_on_a_session_of_its_own(cell, arm):
+    """With a tool of an earlier session, the worse one may look better."""
+    true, result = cell
+    tool = result.chain.frame('tool').matrix.copy()
+    tool[:3, 3] += [2e-3, -1e-3, 1e-3]
+    moved = replace(true, tool=replace(true.tool, matrix=tool))
+    seen = [measured(moved, UR.random_joints(40, np.random.default_rng(3)))]
+    half = result.chain.with_offsets({'elbow_joint.theta': 5e-4, 'wrist_1_joint.a': 5e-4})
+    shifted = half.with_frame('tool', replace(half.frame('tool'), matrix=tool))
+    worse = CalibratedArm(arm.before, shifted)
+    wrong = [verify(each, seen, None, new_base=True).rms for each in (arm, worse)]
+    right = [verify(each, seen, None, new_base=True, new_tool=True).rms for each in (arm, worse)]
+    assert wrong[0] > wrong[1]
+    assert right[0] < 0.5 * right[1]
+
+
+def test_limits_hold_where_some_places_are_worse_than_others(arm):
+    """As compliance leaves them: squares that scatter more than those of Gaussian noise."""
+    rng = np.random.default_rng(0)
+    held = []
+    for _ in range(300):
+        size = 1e-4 * np.abs(rng.normal(size=(20, 1)))
+        found = verify(arm, [with_errors(arm, size * rng.normal(size=(20, 3)))], None)
+        held.append((found.lower <= 1e-4 * np.sqrt(3.0), 1e-4 * np.sqrt(3.0) <= found.upper))
+    assert (np.mean(held, axis=0) > stats.binom.ppf(1e-3, 300, 0.94) / 300).all()
+
+
+def test_a_session_is_judged_without_a_tolerance(arm, cell):
+    found = verify(arm, [measured(cell[0], UR.random_joints(10, np.random.default_rng(0)))], None)
+    assert (found.verdict, found.needed, found.tolerance) == ('JUDGED', None, None)
+    words = in_words(found)
+    assert 'wanted is' not in words
+    assert '\nthe RMS error over poses like these is below 0.' in words
+
+
 def test_the_fitted_frame_costs_its_freedom(arm):
     """Errors that are noise alone: their size is found, though a frame was fitted to them."""
     rng = np.random.default_rng(3)
@@ -253,6 +316,8 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
     judge = ['verify', 'measured.csv', '--commanded', 'tests.csv', '--chain', 'ur10e']
     judge.append('--calibration')
     for calibration in ('result', 'result/calibration.yaml'):
+        assert main([*judge, calibration, '--new-tool', '--new-base']) == 1
+        assert 'at least 8 are needed' in capsys.readouterr().err
         for tolerance, status, word in (('1', 0, 'PASS'), ('0.01', NOT_ACCEPTED, 'FAIL')):
             assert main([*judge, calibration, '--tolerance', tolerance]) == status
             out = capsys.readouterr().out
