@@ -28,12 +28,14 @@ from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.steps import Step, find_step
 from calib_ros.validation import (
     KNOWN,
     Comparison,
     Parameter,
     compare,
     refusals,
+    remarks,
     residuals,
     validate,
 )
@@ -93,6 +95,10 @@ class Identification:
         third of `largest_length` or `largest_angle`.
     verdicts : tuple of Verdict
         Where the model was chosen: what paid for itself and what did not.
+    step : Step or None
+        What moved while it was measured (`steps.py`).
+    remarks : tuple of str
+        What is suspicious, and what to do about it.
 
     """
 
@@ -117,6 +123,8 @@ class Identification:
     refusals: tuple[str, ...]
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
+    step: Step | None = None
+    remarks: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -235,6 +243,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
+    step = find_step(problem, names, robust)
     return Identification(
         chain=fit.chain,
         before=before.chain,
@@ -254,7 +263,9 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         iterations=robust.iterations,
         converged=converged,
         chance=chance,
-        refusals=refusals(problem, converged, parameters, validation, chance),
+        refusals=refusals(problem, converged, parameters, validation, chance, step),
+        step=step,
+        remarks=remarks(step),
     )
 
 

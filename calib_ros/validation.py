@@ -17,6 +17,7 @@ from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.se3 import FloatArray
+from calib_ros.steps import Step
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
@@ -314,6 +315,7 @@ def refusals(
     parameters: Sequence[Parameter],
     validation: Comparison | None,
     chance: float | None,
+    step: Step | None = None,
 ) -> tuple[str, ...]:
     """Return the rules of acceptance that fail, in words.
 
@@ -328,8 +330,12 @@ def refusals(
        `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
        another robot, not a faulty one.
     6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
+    7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains
+       more than half of the residuals (`steps.py`).
     """
     failed = []
+    if step is not None and step.harmful:
+        failed.append(str(step))
     if not converged:
         failed.append('the fit has not converged')
     not_excited = [p.name for p in parameters if p.status == 'not excited']
@@ -354,6 +360,7 @@ def refusals(
         return tuple(failed)
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
+        failed += [str(step)] if step is not None and not step.harmful else []
         failed.append(
             f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
             'and what is predicted do not belong together'
@@ -391,6 +398,11 @@ def refusals(
                 f'before, {after.rms_mrad:.3f} mrad after)'
             )
     return tuple(failed)
+
+
+def remarks(step: Step | None) -> tuple[str, ...]:
+    """Return what is suspicious about a result that is not refused for it."""
+    return () if step is None or step.harmful else (str(step),)
 
 
 def log_gain(
