@@ -13,7 +13,7 @@ from scipy import special
 
 from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
-from calib_ros.observations import Observations
+from calib_ros.observations import Observations, numbered
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.se3 import FloatArray
@@ -131,11 +131,7 @@ def residuals(chain: Chain, observations: Observations) -> Residuals:
 def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
     """Return the residuals of all sets, one after the other, by both chains."""
     parts = [(residuals(before, each), residuals(after, each)) for each in sets]
-    groups, first = [], 0
-    for part, _ in parts:
-        groups.append(part.configurations + first)
-        first += int(part.configurations.max(initial=-1)) + 1
-    numbers = np.concatenate(groups)
+    numbers = np.concatenate(numbered(sets))
     index = np.arange(len(numbers))
     return Comparison(
         _joined([first for first, _ in parts], numbers, index),
@@ -160,22 +156,27 @@ def validate(
     Configurations are dealt out to the folds one by one, so that none is on both sides.
     Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
     """
-    if problem.judging:
-        comparison = compare(before, after, problem.judging)
+    held_out, repeated = _elsewhere(problem)
+    note = f' ({repeated} more are left out, at configurations that were fitted)'
+    if held_out:
+        comparison = compare(before, after, held_out)
         if problem.loss != 'none':
-            distances = distances_of(after, names, problem.system(problem.judging))
+            distances = distances_of(after, names, problem.system(held_out))
             judged = np.concatenate(distances) <= OUTLIER
             if explained is not None:
                 judged |= explained
             comparison = replace(comparison, judged=judged)
-        return comparison, f'{len(comparison.judged)} held-out samples'
+        return comparison, f'{len(comparison.judged)} held-out samples{note if repeated else ""}'
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
-    groups = [each.configurations for each in problem.sets]
-    counts = [len(np.unique(group)) for group in groups]
-    rows = sum(count * kind.rows for count, kind in zip(counts, problem.kinds, strict=True))
-    folds = _folds(problem, names, counts, rows)
+    groups = problem.configurations
+    count = len(np.unique(np.concatenate(groups)))
+    rows = sum(
+        len(np.unique(group)) * kind.rows
+        for group, kind in zip(groups, problem.kinds, strict=True)
+    )
+    folds = _folds(problem, names, count, rows)
     if folds < 2:
         return None, 'nothing: too few configurations to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
@@ -206,15 +207,27 @@ def validate(
         )
     ]
     index = np.argsort(np.concatenate(order))
-    whole = compare(before, after, problem.sets).before.configurations
+    whole = np.concatenate(groups)
     return (
         Comparison(
             _joined([part.before for part in parts], whole, index),
             _joined([part.after for part in parts], whole, index),
             ~robust.outliers,
         ),
-        f'{folds}-fold cross-validation over {sum(counts)} distinct configurations',
+        f'{folds}-fold cross-validation over {count} distinct configurations'
+        + (f'; all {repeated} held-out samples are at such' if repeated else ''),
     )
+
+
+def _elsewhere(problem: Problem) -> tuple[list[Observations], int]:
+    """Return the held-out sets without what repeats fitted configurations, and how much did."""
+    if not problem.judging:
+        return [], 0
+    numbers = numbered((*problem.sets, *problem.judging))
+    fitted = np.concatenate(numbers[: len(problem.sets)])
+    new = [~np.isin(each, fitted) for each in numbers[len(problem.sets) :]]
+    sets = [each.select(which) for each, which in zip(problem.judging, new, strict=True)]
+    return [each for each in sets if len(each)], sum(int((~which).sum()) for which in new)
 
 
 def _weighted(
@@ -227,16 +240,16 @@ def _weighted(
     return system
 
 
-def _folds(problem: Problem, names: Sequence[str], counts: Sequence[int], rows: int) -> int:
+def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
     """Return into how many parts to deal the configurations; 0 where all are needed for the fit.
 
     The other parts must determine what is fitted, with some equations to spare. Where they do so
     by priors only, one configuration is left out at a time.
     """
-    folds = min(problem.folds, sum(counts))
+    folds = min(problem.folds, count)
     if folds > 1 and rows * (folds - 1) // folds >= len(names) + SPARE:
         return folds
-    folds = max(counts)
+    folds = count
     unknown = set(names) - problem.informed
     if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + SPARE:
         return 0
