@@ -23,6 +23,7 @@ from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.frames import start_frames
 from calib_ros.leastsquares import minimise, triangular_factor
+from calib_ros.misfits import arms_own
 from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
@@ -244,6 +245,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
     step = find_step(problem, names, robust)
+    own = arms_own(problem, robust) if step is None else None
     return Identification(
         chain=fit.chain,
         before=before.chain,
@@ -263,7 +265,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         iterations=robust.iterations,
         converged=converged,
         chance=chance,
-        refusals=refusals(problem, converged, parameters, validation, chance, step),
+        refusals=refusals(problem, converged, parameters, validation, chance, step, own),
         step=step,
         remarks=remarks(step),
     )

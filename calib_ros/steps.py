@@ -111,7 +111,7 @@ class Step:
         thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
         text += f'{thing} ({self.what}, {size})'
         if self.outside:
-            return f'{text}; what was measured on one side of it carries no weight'
+            text += '; what was measured on one side of it carries no weight'
         return (
             f'{text}. Fasten it and measure again, or fit what was measured before and after as '
             'two sessions: two names in the column session of the table or journal, and --session '

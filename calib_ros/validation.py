@@ -21,6 +21,8 @@ from calib_ros.steps import Step
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
+CERTAIN = 0.99
+"""The same to claim that the error with outliers got worse."""
 KNOWN = 1e9
 """Degrees of freedom that are as good as infinite."""
 SPARE = 6
@@ -96,12 +98,19 @@ class Comparison:
     """Residuals of the same poses before and after.
 
     Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's
-    and not the frames'. `judged` (N,) is False for outliers.
+    and not the frames'. `judged` (N,) is False for outliers; `repeated` (N,) is True for
+    held-out pairs at fitted configurations, which count in the figures and decide nothing.
     """
 
     before: Residuals
     after: Residuals
     judged: NDArray[np.bool_]
+    repeated: NDArray[np.bool_] | None = None
+
+    @property
+    def deciding(self) -> NDArray[np.bool_]:
+        """Return (N,) which pairs the rules of acceptance go by."""
+        return self.judged if self.repeated is None else self.judged & ~self.repeated
 
     @property
     def outliers(self) -> int:
@@ -156,17 +165,19 @@ def validate(
     Configurations are dealt out to the folds one by one, so that none is on both sides.
     Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
     """
-    held_out, repeated = _elsewhere(problem)
-    note = f' ({repeated} more are left out, at configurations that were fitted)'
-    if held_out:
-        comparison = compare(before, after, held_out)
+    repeated = _repeated(problem)
+    if problem.judging and not repeated.all():
+        comparison = replace(compare(before, after, problem.judging), repeated=repeated)
         if problem.loss != 'none':
-            distances = distances_of(after, names, problem.system(held_out))
+            distances = distances_of(after, names, problem.system(problem.judging))
             judged = np.concatenate(distances) <= OUTLIER
             if explained is not None:
                 judged |= explained
             comparison = replace(comparison, judged=judged)
-        return comparison, f'{len(comparison.judged)} held-out samples{note if repeated else ""}'
+        text = f'{len(comparison.judged)} held-out samples'
+        if repeated.any():
+            text += f', of which {repeated.sum()} at fitted configurations decide nothing'
+        return comparison, text
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
@@ -215,19 +226,17 @@ def validate(
             ~robust.outliers,
         ),
         f'{folds}-fold cross-validation over {count} distinct configurations'
-        + (f'; all {repeated} held-out samples are at such' if repeated else ''),
+        + (', because all held-out samples are at such' if len(repeated) else ''),
     )
 
 
-def _elsewhere(problem: Problem) -> tuple[list[Observations], int]:
-    """Return the held-out sets without what repeats fitted configurations, and how much did."""
+def _repeated(problem: Problem) -> NDArray[np.bool_]:
+    """Return (N,) which held-out pairs are at configurations that are fitted."""
     if not problem.judging:
-        return [], 0
+        return np.zeros(0, dtype=bool)
     numbers = numbered((*problem.sets, *problem.judging))
-    fitted = np.concatenate(numbers[: len(problem.sets)])
-    new = [~np.isin(each, fitted) for each in numbers[len(problem.sets) :]]
-    sets = [each.select(which) for each, which in zip(problem.judging, new, strict=True)]
-    return [each for each in sets if len(each)], sum(int((~which).sum()) for which in new)
+    count = len(problem.sets)
+    return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
 
 
 def _weighted(
@@ -329,6 +338,7 @@ def refusals(
     validation: Comparison | None,
     chance: float | None,
     step: Step | None = None,
+    own: str | None = None,
 ) -> tuple[str, ...]:
     """Return the rules of acceptance that fail, in words.
 
@@ -345,10 +355,14 @@ def refusals(
     6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
     7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains
        more than half of the residuals (`steps.py`).
+    8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not
+       get worse: neither its mean, nor certainly (99 %) its RMS.
     """
     failed = []
     if step is not None and step.harmful:
         failed.append(str(step))
+    if own is not None:
+        failed.append(own)
     if not converged:
         failed.append('the fit has not converged')
     not_excited = [p.name for p in parameters if p.status == 'not excited']
@@ -385,7 +399,7 @@ def refusals(
             f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
             f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?'
         )
-    judged = validation.judged
+    judged = validation.deciding
     groups = validation.after.configurations[judged]
     gain, limit = log_gain(
         validation.before.position[judged], validation.after.position[judged], groups
@@ -401,6 +415,16 @@ def refusals(
             f'values, residuals are explained as well in {100.0 * chance:.0f} % of the shifts; '
             'measure the poses in random order, further apart, or more of them'
         )
+    if validation.outliers:
+        first, second = validation.figures_of_all
+        pairs = (validation.before.position, validation.after.position)
+        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
+        if second.mean_mm > first.mean_mm or gain < -limit:
+            failed.append(
+                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
+                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
+                f'{second.mean_mm:.3f} mm)'
+            )
     if after.rms_mrad is not None:
         gain, limit = log_gain(
             validation.before.orientation[judged], validation.after.orientation[judged], groups
