@@ -28,6 +28,7 @@ from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
+from calib_ros.rounding import may_be_rounding, rounded
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
 from calib_ros.steps import Step, find_step
 from calib_ros.validation import (
@@ -246,6 +247,9 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     converged = before.converged and fit.converged and robust.settled
     step = find_step(problem, names, robust)
     own = arms_own(problem, robust) if step is None else None
+    coarse = rounded(problem)
+    good = [distances <= OUTLIER for distances in robust.distances]
+    unsure = bool(coarse) and may_be_rounding(problem, before.chain, names, coarse, good)
     return Identification(
         chain=fit.chain,
         before=before.chain,
@@ -265,9 +269,9 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         iterations=robust.iterations,
         converged=converged,
         chance=chance,
-        refusals=refusals(problem, converged, parameters, validation, chance, step, own),
+        refusals=refusals(problem, converged, parameters, validation, chance, step, own, unsure),
         step=step,
-        remarks=remarks(step),
+        remarks=remarks(problem, step, coarse),
     )
 
 

@@ -25,8 +25,10 @@ from calib_ros.se3 import FloatArray
 
 LEFT = 0.1
 """Share of a joint's range that is left without outliers, up to which only they move it."""
-BY_CHANCE = 0.02
+BY_CHANCE = 1e-3
 """Probability below which outliers of a device are not alike so much."""
+TOGETHER = 0.01
+"""Probability below which several targets are not off at the same stops."""
 FEWEST, LEAST_STOPS = 4, 50
 """Outliers and stops from which on they are compared with the values of joints."""
 ADVICE = (
@@ -48,7 +50,7 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
         if all_of_it > 10.0 * STILL and part < LEFT * all_of_it:
             return f'{name} moves only in samples that were taken for gross errors: {ADVICE}'
     shared, by_chance = _shared(problem, robust)
-    if shared > 1 and by_chance < BY_CHANCE:
+    if shared > 1 and by_chance < TOGETHER:
         return f'at {shared} stops all targets were taken for gross errors: {ADVICE}'
     order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
     joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
@@ -94,5 +96,8 @@ def _with_a_joint(
     spread = waves.std(axis=1, keepdims=True)
     waves = np.where(spread > STILL, waves / np.maximum(spread, STILL), 0.0)
     spectrum = np.conj(np.fft.rfft(waves, axis=1)) * np.fft.rfft(off)[:, np.newaxis]
-    shifted = (np.fft.irfft(spectrum, len(off), axis=1) ** 2).sum(axis=0).T  # (n, shifts)
-    return names[int(np.argmax(shifted[:, 0]))], chance(shifted.max(axis=0))
+    shifted = (np.fft.irfft(spectrum, len(off), axis=1) ** 2).sum(axis=0).T  # joint, shift
+    most = int(np.argmax(shifted[:, 0]))
+    variance = off.sum() * (1.0 - off.mean())  # of each wave, were they anywhere
+    anywhere = len(names) * float(np.exp(-0.5 * shifted[most, 0] / variance))
+    return names[most], max(anywhere, chance(shifted.max(axis=0)))

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -339,6 +339,7 @@ def refusals(
     chance: float | None,
     step: Step | None = None,
     own: str | None = None,
+    unsure: bool = False,
 ) -> tuple[str, ...]:
     """Return the rules of acceptance that fail, in words.
 
@@ -357,6 +358,7 @@ def refusals(
        more than half of the residuals (`steps.py`).
     8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not
        get worse: neither its mean, nor certainly (99 %) its RMS.
+    9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
     """
     failed = []
     if step is not None and step.harmful:
@@ -425,6 +427,11 @@ def refusals(
                 f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
                 f'{second.mean_mm:.3f} mm)'
             )
+    if unsure:
+        failed.append(
+            'the gain may be that of rounded joint values, which are alike in many poses: record '
+            'them with more digits'
+        )
     if after.rms_mrad is not None:
         gain, limit = log_gain(
             validation.before.orientation[judged], validation.after.orientation[judged], groups
@@ -437,9 +444,22 @@ def refusals(
     return tuple(failed)
 
 
-def remarks(step: Step | None) -> tuple[str, ...]:
-    """Return what is suspicious about a result that is not refused for it."""
-    return () if step is None or step.harmful else (str(step),)
+def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is suspicious about a result that is not refused for it.
+
+    `coarse` are the steps [rad or m] of rounded joint values.
+    """
+    found = [] if step is None or step.harmful else [str(step)]
+    if coarse:
+        kinds = {joint.name: joint.type for joint in problem.chain.joints}
+        steps = [
+            f'{name} ({1e3 * step:.3g} {"mrad" if kinds[name] == "revolute" else "mm"})'
+            for name, step in coarse.items()
+        ]
+        found.append(
+            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
+        )
+    return tuple(found)
 
 
 def log_gain(

@@ -26,7 +26,7 @@ ORDER = [
     {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
     {'chance', 'live', 'noise'},
-    {'misfits', 'steps'},
+    {'misfits', 'rounding', 'steps'},
     {'validation'},
     {'identification'},
     {'calibration', 'design', 'salvage', 'selection', 'workspace'},
