@@ -50,6 +50,7 @@ def summary(result: Identification) -> str:
     weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
         text += f'; weakly determined: {", ".join(weak)}'
+    text += ''.join(f'; {remark}' for remark in result.remarks)
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
