@@ -105,7 +105,7 @@ class Shifts:
             self._circles.append(np.fft.rfft(circle))
             length = len(begins)
             squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
-            slow = _correlation(_cosines(length)[:, np.newaxis], self._circles[-1], length)
+            slow = _correlation(slow_cosines(length)[:, np.newaxis], self._circles[-1], length)
             energy = squares[length : 3 * length] - squares[: 2 * length]
             self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
 
@@ -116,7 +116,7 @@ class Shifts:
         for begins, circle, column in zip(self._begins, self._circles, columns, strict=True):
             series = _by_stop(column, begins)
             whole = np.linalg.norm(series, axis=(0, 1))
-            slow = _cosines(len(begins))
+            slow = slow_cosines(len(begins))
             series -= np.tensordot(slow, np.tensordot(slow, series, axes=1), axes=(0, 0))
             series *= np.linalg.norm(series, axis=(0, 1)) > CONSTANT * whole
             moved = _correlation(series.transpose(2, 1, 0), circle, len(begins)).sum(axis=1)
@@ -130,13 +130,13 @@ class Shifts:
         By shift; each group is taken by itself.
         """
         matrix = before.matrix
-        root = _root(matrix, np.diag(matrix))
+        root = inverse_root(matrix, np.diag(matrix))
         known = root.T @ before.products
         found = []
         for group in groups:
             cross = root.T @ (before.rows.T @ group.rows)
             own = group.matrix
-            mine = _root(own - cross.T @ cross, np.diag(own))
+            mine = inverse_root(own - cross.T @ cross, np.diag(own))
             found.append(((mine.T @ (group.products - cross.T @ known)) ** 2).sum(axis=0))
         left = np.maximum(self._energy - (known**2).sum(axis=0), 1e-300)
         return np.asarray(np.array(found) / left)
@@ -153,7 +153,7 @@ def _by_stop(values: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
     return np.asarray(sums / np.sqrt(count).reshape(-1, *[1] * (values.ndim - 1)))
 
 
-def _cosines(length: int) -> FloatArray:
+def slow_cosines(length: int) -> FloatArray:
     """Return (K, length) orthonormal: the constant and the slowest cosines of a series."""
     order = np.arange(1 + min(SLOW, length // 10))
     waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
@@ -166,7 +166,7 @@ def _correlation(series: FloatArray, circle: NDArray[np.complex128], length: int
     return np.asarray(np.fft.irfft(spectrum, 2 * length))
 
 
-def _root(matrix: FloatArray, size: FloatArray) -> FloatArray:
+def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
     """Return T (P, k), T T^T being the inverse of (P, P) in the directions that count.
 
     Those are seen with columns scaled to squared lengths `size` (P,).

@@ -207,7 +207,7 @@ def _identify(options: argparse.Namespace) -> int:
         warnings = replay(options.bag, session)
         result = session.identify()
         samples = session.account().as_document()
-    for warning in warnings:
+    for warning in (*warnings, *result.remarks):
         print(f'warning: {warning}', file=sys.stderr)
     configuration = report.configuration_yaml(options.chain, settings)
     _write_result(options.out, result, samples, warnings, configuration)

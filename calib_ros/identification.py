@@ -24,18 +24,22 @@ from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.evidence import Posterior, considered, posterior_of
 from calib_ros.frames import start_frames
 from calib_ros.leastsquares import System, minimise, triangular_factor
+from calib_ros.misfits import arms_own
 from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
 from calib_ros.problem import Learned, Problem
 from calib_ros.region import Region, region_of
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
+from calib_ros.rounding import may_be_rounding, rounded
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.steps import Step, find_step
 from calib_ros.validation import (
     KNOWN,
     Comparison,
     Parameter,
     compare,
     refusals,
+    remarks,
     residuals,
     validate,
 )
@@ -101,6 +105,8 @@ class Identification:
         the size that this arm's errors have.
     verdicts : tuple of Verdict
         Where the model was chosen: what paid for itself and what did not.
+    step : Step or None
+        What moved while it was measured (`steps.py`).
     remarks : tuple of str
         What is suspicious though the figures are good, and what to do (`suspicions.py`).
 
@@ -129,6 +135,7 @@ class Identification:
     region: Region | None
     weak: tuple[str, ...] = ()
     verdicts: tuple[effects.Verdict, ...] = ()
+    step: Step | None = None
     remarks: tuple[str, ...] = ()
 
     @property
@@ -249,6 +256,14 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     freedom = max(1.0, float(system.rows - len(names)))
     posterior = _posterior(problem, fitted, names, whole, considered(fit.chain, names))
     region = region_of(posterior, problem.sets, freedom)
+    step = find_step(problem, names, robust)
+    own = arms_own(problem, robust) if step is None else None
+    coarse = rounded(problem)
+    good = [distances <= OUTLIER for distances in robust.distances]
+    unsure = bool(coarse) and may_be_rounding(problem, before.chain, names, coarse, good)
+    failed = refusals(
+        problem, converged, parameters, validation, chance, region, step, own, unsure
+    )
     result = Identification(
         chain=fit.chain,
         before=before.chain,
@@ -268,10 +283,12 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         iterations=robust.iterations,
         converged=converged,
         chance=chance,
-        refusals=refusals(problem, converged, parameters, validation, chance, region),
+        refusals=failed,
         posterior=posterior,
         region=region,
         weak=_weak(problem, parameters),
+        step=step,
+        remarks=remarks(problem, step, coarse),
     )
     return suspicions.remarked(problem, result)
 

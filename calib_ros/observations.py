@@ -4,13 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
 
 from calib_ros import se3
 from calib_ros.errors import InputError
@@ -20,6 +22,16 @@ _OPTIONAL = ('covariance', 'approach', 'distances', 'velocity', 'acceleration', 
 TURN = 2.0 * np.pi
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
+SCATTER = 0.02
+"""Distance [rad or m] up to which visits of one configuration may scatter."""
+GAP = 5.0
+"""Ratio of the distance of configurations to that of the visits of one."""
+WIDEST = 2.0
+"""Size of a configuration's visits in units of the longest step between them."""
+FEWEST = 8
+"""Configurations from which on their distances tell what a visit is."""
+NEIGHBOURS = 8
+"""Nearest values among which visits are looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,8 +216,8 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     """Return (N,) the number of the configuration that joint values (N, n) belong to.
 
     Values within STILL of each other are one configuration, whenever they were taken: a program
-    that runs in a loop visits it again, it does not measure another one. Angles count modulo a
-    full turn.
+    that runs in a loop visits it again, it does not measure another one. So are those that lie
+    as close together beside their distance from all others. Angles count modulo a full turn.
     """
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
@@ -213,7 +225,53 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     near = _near(standing)
     links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(standing),) * 2)
     _, label = connected_components(links, directed=False)
-    return np.asarray(label[stops(joints)], dtype=np.intp)
+    _, first = np.unique(label, return_index=True)
+    return np.asarray(_repeats(standing[first])[label[stops(joints)]], dtype=np.intp)
+
+
+def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
+    """Return the numbers (N,) of the configurations of each set, counted over all of them.
+
+    What several targets or sessions show of one configuration has its number in common.
+    """
+    if len(sets) == 1:
+        return (sets[0].configurations,)
+    numbers = configurations(np.concatenate([each.joints for each in sets]))
+    return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
+
+
+def _repeats(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) which joint values (N, n) are visits of one configuration that scatter.
+
+    Where the distances of nearest values leave a gap, from so much to GAP times as much, those
+    below it are visits, as long as each configuration is as small as they are.
+    """
+    count = len(joints)
+    apart = np.arange(count)
+    if count < FEWEST:
+        return apart
+    place = np.concatenate([np.cos(joints), np.sin(joints)], axis=1)
+    far, near = cKDTree(place).query(
+        place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
+    )
+    first, which = np.nonzero(np.isfinite(far))
+    if not (far < SCATTER).any():
+        return apart
+    graph = coo_array((far[first, which], (first, near[first, which])), shape=(count, count))
+    tree = minimum_spanning_tree(graph).tocoo()
+    lengths = np.append(np.sort(tree.data), GAP * SCATTER)
+    gaps = np.flatnonzero((lengths[1:] >= GAP * lengths[:-1]) & (lengths[:-1] <= SCATTER))
+    for reach in lengths[gaps[::-1]]:
+        close = tree.data <= reach
+        links = coo_array(
+            (tree.data[close], (tree.row[close], tree.col[close])), shape=(count, count)
+        )
+        number, label = connected_components(links, directed=False)
+        middle = np.stack([np.bincount(label, row) for row in place.T]) / np.bincount(label)
+        extent = np.linalg.norm(place - middle.T[label], axis=1).max()
+        if number >= FEWEST and extent <= WIDEST * reach:
+            return np.asarray(label, dtype=np.intp)
+    return apart
 
 
 def _near(joints: FloatArray) -> NDArray[np.intp]:

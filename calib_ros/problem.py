@@ -10,12 +10,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros import effects, identifiability
 from calib_ros.chain import Chain, is_length
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.leastsquares import Prior, Samples, System
-from calib_ros.observations import Observations
+from calib_ros.observations import Observations, numbered
 from calib_ros.robust import LOSSES
 
 
@@ -159,6 +160,11 @@ class Problem:
         held_out = self.held_out or ()
         sets = (held_out,) if isinstance(held_out, Observations) else tuple(held_out)
         return tuple(each for each in sets if len(each))
+
+    @cached_property
+    def configurations(self) -> tuple[NDArray[np.intp], ...]:
+        """Return the numbers (N,) of the configurations of each set to fit, over all of them."""
+        return numbered(self.sets)
 
     @cached_property
     def kinds(self) -> tuple[identifiability.Kind, ...]:

@@ -171,6 +171,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'priors': result.priors,
         'effects': dict(result.chain.effects),
         'verdicts': [asdict(verdict) for verdict in result.verdicts],
+        'step': None if result.step is None else asdict(result.step),
         'samples': samples,
         'robot': result.chain.name,
         'versions': {
@@ -197,7 +198,7 @@ def unit(name: str) -> str:
 def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]) -> str:
     """Return the report that is kept with a calibration."""
     lines = [f'# Calibration of {result.chain.name}', '', f'**{summary(result)}**', '']
-    lines += [f'- warning: {text}' for text in warnings]
+    lines += [f'- warning: {text}' for text in (*warnings, *result.remarks)]
     lines += [f'- {key}: {value}' for key, value in samples.items() if value not in (0, {}, None)]
     lines += [
         f'- converged: {"yes" if result.converged else "no"}, {result.iterations} iterations',

@@ -27,6 +27,7 @@ from calib_ros.effects import Verdict
 from calib_ros.evidence import ROUNDING, group_of
 from calib_ros.identifiability import RANK_TOLERANCE
 from calib_ros.identification import Identification, identify
+from calib_ros.observations import numbered
 from calib_ros.problem import Learned, Problem
 from calib_ros.se3 import FloatArray
 from calib_ros.validation import log_gain
@@ -125,15 +126,13 @@ class _Linear:
             for each, good in zip(problem.sets, judged, strict=True)
         ]
         self._system = problem.system(sets)
-        groups, blocks, first = [], [], 0
-        for each in sets:
-            own = each.configurations
-            count = int(own.max(initial=-1)) + 1
-            groups.append(own + first)
-            blocks.append(own * problem.folds // max(count, 1))  # every fold has some of each set
-            first += count
-        self._groups = np.concatenate(groups)
-        self._dealings = (self._groups % problem.folds, np.concatenate(blocks))
+        numbers = numbered(sets)
+        self._groups = np.concatenate(numbers)
+        blocks = np.full(int(self._groups.max(initial=-1)) + 1, -1)
+        for each in numbers:  # every fold has some of each set
+            new = np.unique(each[blocks[each] < 0])
+            blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
+        self._dealings = (self._groups % problem.folds, blocks[self._groups])
         rows = self._rows(self._names)
         self._base = _stacked(rows)[:, :-1]
         self._residual = _stacked(rows)[:, -1]

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,14 +13,19 @@ from scipy import special
 
 from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
-from calib_ros.observations import Observations
+from calib_ros.observations import Observations, numbered
 from calib_ros.problem import Problem
 from calib_ros.region import Region
 from calib_ros.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.se3 import FloatArray
+from calib_ros.steps import Step
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
+CERTAIN = 0.99
+"""The same to claim that the error with outliers got worse."""
+WORSE = 0.01
+"""Growth of that error that counts, of the RMS; less is how metres happen to lie."""
 KNOWN = 1e9
 """Degrees of freedom that are as good as infinite."""
 SPARE = 6
@@ -96,12 +101,19 @@ class Comparison:
     """Residuals of the same poses before and after.
 
     Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's
-    and not the frames'. `judged` (N,) is False for outliers.
+    and not the frames'. `judged` (N,) is False for outliers; `repeated` (N,) is True for
+    held-out pairs at fitted configurations, which count in the figures and decide nothing.
     """
 
     before: Residuals
     after: Residuals
     judged: NDArray[np.bool_]
+    repeated: NDArray[np.bool_] | None = None
+
+    @property
+    def deciding(self) -> NDArray[np.bool_]:
+        """Return (N,) which pairs the rules of acceptance go by."""
+        return self.judged if self.repeated is None else self.judged & ~self.repeated
 
     @property
     def outliers(self) -> int:
@@ -131,11 +143,7 @@ def residuals(chain: Chain, observations: Observations) -> Residuals:
 def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
     """Return the residuals of all sets, one after the other, by both chains."""
     parts = [(residuals(before, each), residuals(after, each)) for each in sets]
-    groups, first = [], 0
-    for part, _ in parts:
-        groups.append(part.configurations + first)
-        first += int(part.configurations.max(initial=-1)) + 1
-    numbers = np.concatenate(groups)
+    numbers = np.concatenate(numbered(sets))
     index = np.arange(len(numbers))
     return Comparison(
         _joined([first for first, _ in parts], numbers, index),
@@ -160,22 +168,29 @@ def validate(
     Configurations are dealt out to the folds one by one, so that none is on both sides.
     Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
     """
-    if problem.judging:
-        comparison = compare(before, after, problem.judging)
+    repeated = _repeated(problem)
+    if problem.judging and not repeated.all():
+        comparison = replace(compare(before, after, problem.judging), repeated=repeated)
         if problem.loss != 'none':
             distances = distances_of(after, names, problem.system(problem.judging))
             judged = np.concatenate(distances) <= OUTLIER
             if explained is not None:
                 judged |= explained
             comparison = replace(comparison, judged=judged)
-        return comparison, f'{len(comparison.judged)} held-out samples'
+        text = f'{len(comparison.judged)} held-out samples'
+        if repeated.any():
+            text += f', of which {repeated.sum()} at fitted configurations decide nothing'
+        return comparison, text
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
-    groups = [each.configurations for each in problem.sets]
-    counts = [len(np.unique(group)) for group in groups]
-    rows = sum(count * kind.rows for count, kind in zip(counts, problem.kinds, strict=True))
-    folds = _folds(problem, names, counts, rows)
+    groups = problem.configurations
+    count = len(np.unique(np.concatenate(groups)))
+    rows = sum(
+        len(np.unique(group)) * kind.rows
+        for group, kind in zip(groups, problem.kinds, strict=True)
+    )
+    folds = _folds(problem, names, count, rows)
     if folds < 2:
         return None, 'nothing: too few configurations to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
@@ -206,15 +221,25 @@ def validate(
         )
     ]
     index = np.argsort(np.concatenate(order))
-    whole = compare(before, after, problem.sets).before.configurations
+    whole = np.concatenate(groups)
     return (
         Comparison(
             _joined([part.before for part in parts], whole, index),
             _joined([part.after for part in parts], whole, index),
             ~robust.outliers,
         ),
-        f'{folds}-fold cross-validation over {sum(counts)} distinct configurations',
+        f'{folds}-fold cross-validation over {count} distinct configurations'
+        + (', because all held-out samples are at such' if len(repeated) else ''),
     )
+
+
+def _repeated(problem: Problem) -> NDArray[np.bool_]:
+    """Return (N,) which held-out pairs are at configurations that are fitted."""
+    if not problem.judging:
+        return np.zeros(0, dtype=bool)
+    numbers = numbered((*problem.sets, *problem.judging))
+    count = len(problem.sets)
+    return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
 
 
 def _weighted(
@@ -227,16 +252,16 @@ def _weighted(
     return system
 
 
-def _folds(problem: Problem, names: Sequence[str], counts: Sequence[int], rows: int) -> int:
+def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
     """Return into how many parts to deal the configurations; 0 where all are needed for the fit.
 
     The other parts must determine what is fitted, with some equations to spare. Where they do so
     by priors only, one configuration is left out at a time.
     """
-    folds = min(problem.folds, sum(counts))
+    folds = min(problem.folds, count)
     if folds > 1 and rows * (folds - 1) // folds >= len(names) + SPARE:
         return folds
-    folds = max(counts)
+    folds = count
     unknown = set(names) - problem.informed
     if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + SPARE:
         return 0
@@ -316,6 +341,9 @@ def refusals(
     validation: Comparison | None,
     chance: float | None,
     region: Region | None,
+    step: Step | None,
+    own: str | None,
+    unsure: bool,
 ) -> tuple[str, ...]:
     """Return the rules of acceptance that fail, in words.
 
@@ -330,9 +358,18 @@ def refusals(
        `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
        another robot, not a faulty one.
     6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
-    7. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
+    7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains
+       more than half of the residuals (`steps.py`).
+    8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not
+       get worse: neither its mean, nor certainly (99 %) its RMS.
+    9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
+    10. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
     """
     failed = []
+    if step is not None and step.harmful:
+        failed.append(str(step))
+    if own is not None:
+        failed.append(own)
     if not converged:
         failed.append('the fit has not converged')
     not_excited = [p.name for p in parameters if p.status == 'not excited']
@@ -357,6 +394,7 @@ def refusals(
         return tuple(failed)
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
+        failed += [str(step)] if step is not None and not step.harmful else []
         failed.append(
             f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
             'and what is predicted do not belong together'
@@ -368,7 +406,7 @@ def refusals(
             f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
             f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?'
         )
-    judged = validation.judged
+    judged = validation.deciding
     groups = validation.after.configurations[judged]
     gain, limit = log_gain(
         validation.before.position[judged], validation.after.position[judged], groups
@@ -390,6 +428,21 @@ def refusals(
             'larger than its own uncertainty, even at the poses measured; measure more poses, '
             'spread further'
         )
+    if validation.outliers:
+        first, second = validation.figures_of_all
+        pairs = (validation.before.position, validation.after.position)
+        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
+        if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
+            failed.append(
+                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
+                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
+                f'{second.mean_mm:.3f} mm)'
+            )
+    if unsure:
+        failed.append(
+            'the gain may be that of rounded joint values, which are alike in many poses: record '
+            'them with more digits'
+        )
     if after.rms_mrad is not None:
         gain, limit = log_gain(
             validation.before.orientation[judged], validation.after.orientation[judged], groups
@@ -400,6 +453,24 @@ def refusals(
                 f'before, {after.rms_mrad:.3f} mrad after)'
             )
     return tuple(failed)
+
+
+def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is suspicious about a result that is not refused for it.
+
+    `coarse` are the steps [rad or m] of rounded joint values.
+    """
+    found = [] if step is None or step.harmful else [str(step)]
+    if coarse:
+        kinds = {joint.name: joint.type for joint in problem.chain.joints}
+        steps = [
+            f'{name} ({1e3 * step:.3g} {"mrad" if kinds[name] == "revolute" else "mm"})'
+            for name, step in coarse.items()
+        ]
+        found.append(
+            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
+        )
+    return tuple(found)
 
 
 def log_gain(
