@@ -20,7 +20,9 @@ with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 + V_ii) / s^2).
 
 Effects that a model leaves out are *considered*: they are columns of the same posterior with sizes
 of their own, so that the arm as it may be, effects included, can be held against the one that was
-fitted (`region.py`; Schmidt 1966 has the idea).
+fitted (`region.py`; Schmidt 1966 has the idea). So is the scale of the measuring device, which
+makes all lengths grow alike: positions are linear in all lengths L, so its column is the sum of
+L dp/dL.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros import effects
-from calib_ros.chain import DH_KINDS, Chain, is_length
+from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.differential import ErrorModel
 from calib_ros.leastsquares import Samples, System, normal_equations
 from calib_ros.se3 import FloatArray
@@ -52,6 +54,8 @@ CONSIDERED = ('eccentricity', 'gravity')
 SHOWN, REFUTED = 1.35, 3.0
 """Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
 which those of usual size are refuted."""
+SCALE = 1e-4
+"""Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
 MOST = 2000
 """Samples from which the sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
@@ -92,6 +96,8 @@ class Posterior:
         Standard deviation [m or rad] of every parameter that has a prior.
     sizes : mapping of str to float
         Size of the errors by group.
+    doubted : (P,), (P, P)
+        Mean and covariance of the offsets if the device may have a scale of its own.
 
     """
 
@@ -102,6 +108,7 @@ class Posterior:
     covariance: FloatArray
     priors: Mapping[str, float]
     sizes: Mapping[str, float]
+    doubted: tuple[FloatArray, FloatArray]
 
     @cached_property
     def square(self) -> FloatArray:
@@ -158,20 +165,53 @@ def posterior_of(
     chain = chain.with_effects(more)
     every = (*names, *more)
     few, share = _few(system)
-    normal = normal_equations(chain, every, few)
-    matrix, gradient = (share / noise**2 * part for part in (normal.matrix, normal.gradient))
-    offsets = np.zeros(len(every))
+    lengths = _lengths(chain, system) if more else {}
+    columns = tuple(dict.fromkeys([*every, *lengths]))
+    normal = normal_equations(chain, columns, few)
+    mixing = np.eye(len(columns), len(every))
+    if lengths:
+        mixing = np.column_stack([mixing, [lengths.get(name, 0.0) for name in columns]])
+    matrix = share / noise**2 * (mixing.T @ normal.matrix @ mixing)
+    gradient = share / noise**2 * (mixing.T @ normal.gradient)
+    size = len(gradient)
+    offsets = np.zeros(size)
     for k, name in enumerate(names):
         if not chain.owns_frame(name):
             offsets[k] = chain.offset(name, nominal)
     vector = matrix @ offsets + gradient
     groups = [None if name in known else group_of(chain, name) for name in every]
-    given = np.array([known.get(name, np.inf) for name in every]) ** -2
+    groups += [None] * (size - len(every))
+    given = np.array([known.get(name, np.inf) for name in every] + [SCALE] * bool(lengths)) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
     stds, sizes = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
-    priors = {name: std for name, std in zip(every, stds.tolist(), strict=True) if std < np.inf}
-    mean, root, _ = _solved(matrix, vector, stds**-2)
-    return Posterior(chain, every, offsets, mean - offsets, root @ root.T, priors, sizes)
+    own = stds[: len(every)].tolist()
+    priors = {name: std for name, std in zip(every, own, strict=True) if std < np.inf}
+    arm = np.s_[: len(every)]
+    mean, root, _ = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
+    doubted, doubt, _ = _solved(matrix, vector, stds**-2)
+    return Posterior(
+        chain,
+        every,
+        offsets[arm],
+        mean - offsets[arm],
+        root @ root.T,
+        priors,
+        sizes,
+        (doubted[arm], doubt[arm] @ doubt[arm].T),
+    )
+
+
+def _lengths(chain: Chain, system: System) -> dict[str, float]:
+    """Return all lengths [m] that positions are made of; none where no device has a scale.
+
+    A ball in a socket is where it is, and a prismatic joint has a length of its own.
+    """
+    sockets = any(samples.observations.socket for samples in system.sets)
+    if sockets or any(joint.type == 'prismatic' for joint in chain.joints):
+        return {}
+    names = [f'{frame}.{kind}' for frame in chain.frame_names for kind in FRAME_KINDS[:3]]
+    names += [f'{joint.name}.{kind}' for joint in chain.joints for kind in ('a', 'd')]
+    return {name: chain.value(name) for name in names}
 
 
 def _few(system: System) -> tuple[System, int]:

@@ -130,8 +130,8 @@ class _Judge:
         self._frames = rows[:, :, : len(frames)]
         self._rows = rows[:, :, [column[names[k]] for k in own]]
         self._offsets = posterior.offsets[own]
-        self._mean = self._offsets + posterior.shift[own]
-        self._covariance = posterior.covariance[np.ix_(own, own)]
+        mean, covariance = posterior.doubted
+        self._mean, self._covariance = mean[own], covariance[np.ix_(own, own)]
         self._freedom = freedom
 
     def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
