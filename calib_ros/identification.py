@@ -28,13 +28,12 @@ from calib_ros.misfits import arms_own
 from calib_ros.noise import Noise, noise_of
 from calib_ros.observations import Observations
 from calib_ros.problem import Learned, Problem
-from calib_ros.region import Region, region_of
+from calib_ros.region import KNOWN, Region, region_of
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.rounding import may_be_rounding, rounded
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
 from calib_ros.steps import Step, find_step
 from calib_ros.validation import (
-    KNOWN,
     Comparison,
     Parameter,
     compare,
@@ -253,14 +252,14 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
-    freedom = max(1.0, float(system.rows - len(names)))
     posterior = _posterior(problem, fitted, names, whole, considered(fit.chain, names))
-    region = region_of(posterior, problem.sets, freedom)
+    region = region_of(posterior, problem.sets, float(uncertainty.freedom.min()))
     step = find_step(problem, names, robust)
     own = arms_own(problem, robust) if step is None else None
     coarse = rounded(problem)
     good = [distances <= OUTLIER for distances in robust.distances]
     unsure = bool(coarse) and may_be_rounding(problem, before.chain, names, coarse, good)
+    known = {name: problem.prior_sigmas[name] for name, _ in model.effects}
     failed = refusals(
         problem, converged, parameters, validation, chance, region, step, own, unsure
     )
@@ -278,7 +277,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         outliers=_outliers(problem, robust),
         gauges=_gauges(problem, fit.chain, names),
         observability=identifiability.observability(fitted.factor, system.count),
-        priors=dict(problem.prior_sigmas),
+        priors={**known, **problem.given},
         world_frame=problem.world_frame,
         iterations=robust.iterations,
         converged=converged,
@@ -373,7 +372,7 @@ def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> boo
     """Tell whether priors that the data have told would change a fit without them."""
     if problem.learned is not None or problem.model.effects:
         return True
-    return any(posterior.held(name) > HELD for name in names)
+    return any(posterior.held(name) > HELD for name in names if name not in problem.given)
 
 
 def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:

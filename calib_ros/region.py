@@ -34,6 +34,8 @@ DRAWN = 200
 """Random configurations that stand for the range of the joints."""
 MEASURED = 100
 """Measured configurations that stand for all of them."""
+KNOWN = 1e9
+"""Degrees of freedom that are as good as infinite."""
 SHELL = 10
 """Random configurations of a shell."""
 
@@ -146,4 +148,4 @@ class _Judge:
         spread = float(np.sqrt(max(float(slope @ self._covariance @ slope), 0.0)))
         if spread == 0.0:
             return 0.0 if margin > 0.0 else 1.0
-        return float(special.stdtr(self._freedom, -margin / spread))
+        return float(special.stdtr(min(self._freedom, KNOWN), -margin / spread))

@@ -123,6 +123,8 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     """Return the step that explains more than half of the residuals of a fit, if there is one."""
     scan = _Scan(problem, names, robust)
     places = np.arange(LEAST, scan.stops - LEAST + 1)
+    if not len(places):
+        return None
     coarse = places[:: 1 + (len(places) - 1) // PLACES]
     found = scan.best(coarse, SUSPECTED) if len(places) else None
     if found is None:

@@ -15,7 +15,7 @@ from calib_ros.chain import DH_KINDS, Chain, is_length
 from calib_ros.leastsquares import System, minimise, residual_arrays, without_each
 from calib_ros.observations import Observations, numbered
 from calib_ros.problem import Problem
-from calib_ros.region import Region
+from calib_ros.region import KNOWN, Region
 from calib_ros.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.se3 import FloatArray
 from calib_ros.steps import Step
@@ -26,8 +26,6 @@ CERTAIN = 0.99
 """The same to claim that the error with outliers got worse."""
 WORSE = 0.01
 """Growth of that error that counts, of the RMS; less is how metres happen to lie."""
-KNOWN = 1e9
-"""Degrees of freedom that are as good as infinite."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 MOST_OUTLIERS = 0.35
