@@ -170,18 +170,34 @@ def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
     return tuple(strings), _aligned(at + between, np.dtype(dtype).itemsize), dtype, count
 
 
+def points_in(blob: bytes) -> int:
+    """Return how many points a serialised JointTrajectory says that it has.
+
+    Zero where that cannot be read: such a message cannot be decoded either.
+    """
+    order = '<' if blob[:2] == LITTLE_ENDIAN else '>'
+    try:
+        at = _string(blob, _HEAD + _STAMP, order)[1]
+        names, at = _integer(blob, at, order)
+        for _ in range(names):
+            at = _string(blob, at, order)[1]
+        return _integer(blob, at, order)[0]
+    except (struct.error, UnicodeDecodeError):
+        return 0
+
+
 def _aligned(at: int, size: int) -> int:
     """Return the next place that is a multiple of a size after the encapsulation."""
     return at + (_HEAD - at) % size
 
 
-def _integer(blob: bytes, at: int) -> tuple[int, int]:
+def _integer(blob: bytes, at: int, order: str = '<') -> tuple[int, int]:
     at = _aligned(at, 4)
-    return int(struct.unpack_from('<I', blob, at)[0]), at + 4
+    return int(struct.unpack_from(f'{order}I', blob, at)[0]), at + 4
 
 
-def _string(blob: bytes, at: int) -> tuple[str, int]:
-    length, at = _integer(blob, at)
+def _string(blob: bytes, at: int, order: str = '<') -> tuple[str, int]:
+    length, at = _integer(blob, at, order)
     return blob[at : at + max(length - 1, 0)].decode(), at + length
 
 

@@ -31,6 +31,8 @@ CONVINCING = 0.8
 """Least correlation."""
 MOVING = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
+MOST_TIME = 300.0
+"""Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
 WATCH_NS = 15_000_000_000
 """Time over which a watch looks."""
 WATCHED = 20_000
@@ -146,6 +148,7 @@ def find_delay(
     end = min(joint_times[-1], times[-1] + LONGEST)
     if end - begin < LEAST_MOTION:
         return None
+    begin = max(begin, end - MOST_TIME)
     grid = np.arange(begin, end, STEP)
     coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
     nearest = np.unique(np.round(coarse).astype(int))

@@ -30,8 +30,10 @@ from calib_ros.calibration import Calibration
 from calib_ros.candidates import draw_candidates
 from calib_ros.compensation import Compensator, compensate_program, in_words
 from calib_ros.design import Design
+from calib_ros.cdr import points_in
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.identification import Identification
+from calib_ros.inputs import TRAJECTORY, deserialised
 from calib_ros.live import Estimate
 from calib_ros.observations import STILL
 from calib_ros.planning import next_pose
@@ -50,6 +52,8 @@ CLOUD = 10_000
 """Points of the cloud of errors."""
 MOST_POINTS = 50_000
 """Points of a trajectory; a longer one is refused."""
+MOST_BYTES = 20_000_000
+"""Size of a serialised trajectory; a larger one is refused before it is decoded."""
 MOST_WAITING = 10
 """Trajectories that may wait; those that come on top are refused."""
 MOST_REASONS = 3
@@ -95,7 +99,11 @@ class Guide:
             JointTrajectory, '~/compensated_joint_trajectory', 10
         )
         node.create_subscription(
-            JointTrajectory, '~/joint_trajectory', self._guarded(self._on_trajectory), 10
+            JointTrajectory,
+            '~/joint_trajectory',
+            self._guarded(self._on_trajectory),
+            10,
+            raw=True,  # one of a million points takes many seconds and much memory to decode
         )
 
     def join(self, timeout: float) -> bool:
@@ -117,7 +125,7 @@ class Guide:
         busy = self._advising is not None and not self._advising.done()
         if busy or self._session.settings.mode == 'continuous':
             return
-        samples = tuple(self._session.samples)
+        samples = tuple(self._session.usable)
         if samples == self._advised or all(sample.validation for sample in samples):
             return
         self._advised = samples
@@ -166,15 +174,20 @@ class Guide:
             )
         )
 
-    def _on_trajectory(self, message: Any) -> None:
+    def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_WAITING:
             self._refuse(f'{MOST_WAITING} others wait already, send them more slowly')
+        elif len(data) > MOST_BYTES:
+            self._refuse(f'{len(data)} bytes, at most {MOST_BYTES} are taken')
+        elif (count := points_in(data)) > MOST_POINTS:
+            self._refuse(f'{count} points, at most {MOST_POINTS} are taken')
         else:
-            self._start(self._correct, message, self._session.calibration)
+            self._start(self._correct, data, self._session.calibration)
 
-    def _correct(self, message: Any, calibration: Calibration | None) -> None:
+    def _correct(self, data: bytes, calibration: Calibration | None) -> None:
         """Publish a corrected trajectory, or nothing at all and log why."""
         try:
+            message = deserialised(data, TRAJECTORY)
             corrected, self._last_trajectory = self._corrected_by(message, calibration)
         except CalibrationError as err:
             self._refuse(str(err))
@@ -190,8 +203,6 @@ class Guide:
             raise InputError(
                 'there is no accepted calibration to correct it by: call ~/identify or ~/load'
             )
-        if len(message.points) > MOST_POINTS:
-            raise InputError(f'{len(message.points)} points, at most {MOST_POINTS} are taken')
         compensator = self._compensator_of(calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
         program = trajectory_program(

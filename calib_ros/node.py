@@ -90,7 +90,9 @@ class CalibrationNode(Node):
             len(chain.joints),
             self._configuration,
         )
-        self.session = CalibrationSession(chain, given.settings, self._on_sample)
+        self.session = CalibrationSession(
+            chain, given.settings, self._on_sample, self._archive.remove
+        )
         self._last = 'nothing identified yet'
         self._observability = ''
         self._status_text = ''
@@ -229,7 +231,7 @@ class CalibrationNode(Node):
         """Return the problem and all that goes with it, as they are now."""
         self._take_messages()
         problem = self.session.problem()
-        samples = tuple(self.session.samples)
+        samples = tuple(self.session.usable)
         origin = {
             'robot_serial': self._given.serial,
             'topics': self._inputs.topics,
@@ -273,7 +275,7 @@ class CalibrationNode(Node):
         return True, f'sample {len(self.session.samples)} taken ({words})'
 
     def _on_remove_last(self, request: Any) -> tuple[bool, str]:
-        self._archive.remove(self.session.remove_last())
+        self.session.remove_last()
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
@@ -317,12 +319,13 @@ class CalibrationNode(Node):
         self._diagnostics.publish(status)
 
     def _publish_status(self) -> str:
-        """Return the status, which is published when it has changed."""
-        text = self.session.status()
+        """Return how the session goes; the status is published when it has changed."""
+        words = self.session.status()
+        text = f'{self._archive.trouble}{words}'
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
-        return text
+        return words
 
     def _answers(self) -> dict[str, Any]:
         """Return for the diagnostics what came of calls and requests."""
