@@ -32,6 +32,8 @@ from calib_ros.track import Stamps
 from calib_ros.values import QUATERNION_TOLERANCE
 
 LITTLE_ENDIAN = b'\x00\x01'
+MOST_NAMES = 10_000
+"""Joints of a trajectory that are passed over on the way to its points."""
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
 
 # Of each type: strings before the numbers, bytes between, kind and count of the numbers.
@@ -170,20 +172,22 @@ def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
     return tuple(strings), _aligned(at + between, np.dtype(dtype).itemsize), dtype, count
 
 
-def points_in(blob: bytes) -> int:
-    """Return how many points a serialised JointTrajectory says that it has.
+def trajectory_size(blob: bytes) -> tuple[int, int]:
+    """Return how many joints and points a serialised JointTrajectory has.
 
-    Zero where that cannot be read: such a message cannot be decoded either.
+    Zero for what cannot be read: such a message cannot be decoded either.
     """
     order = '<' if blob[:2] == LITTLE_ENDIAN else '>'
+    names = 0
     try:
         at = _string(blob, _HEAD + _STAMP, order)[1]
         names, at = _integer(blob, at, order)
-        for _ in range(names):
+        for _ in range(min(names, MOST_NAMES)):
             at = _string(blob, at, order)[1]
-        return _integer(blob, at, order)[0]
+        points = _integer(blob, at, order)[0] if names <= MOST_NAMES else 0
     except (struct.error, UnicodeDecodeError):
-        return 0
+        return names, 0
+    return names, points
 
 
 def _aligned(at: int, size: int) -> int:

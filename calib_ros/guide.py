@@ -22,18 +22,18 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros import outgoing
 from calib_ros.calibration import Calibration
 from calib_ros.candidates import draw_candidates
+from calib_ros.cdr import trajectory_size
 from calib_ros.compensation import Compensator, compensate_program, in_words
 from calib_ros.design import Design
-from calib_ros.cdr import points_in
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.identification import Identification
-from calib_ros.inputs import TRAJECTORY, deserialised
 from calib_ros.live import Estimate
 from calib_ros.observations import STILL
 from calib_ros.planning import next_pose
@@ -52,8 +52,10 @@ CLOUD = 10_000
 """Points of the cloud of errors."""
 MOST_POINTS = 50_000
 """Points of a trajectory; a longer one is refused."""
+MOST_JOINTS = 1000
+"""Joints that a trajectory names; one of more is refused."""
 MOST_BYTES = 20_000_000
-"""Size of a serialised trajectory; a larger one is refused before it is decoded."""
+"""Size of a serialised trajectory; 50,000 points of ten joints with all rates take 18 MB."""
 MOST_WAITING = 10
 """Trajectories that may wait; those that come on top are refused."""
 MOST_REASONS = 3
@@ -103,7 +105,7 @@ class Guide:
             '~/joint_trajectory',
             self._guarded(self._on_trajectory),
             10,
-            raw=True,  # one of a million points takes many seconds and much memory to decode
+            raw=True,  # see `_too_large`
         )
 
     def join(self, timeout: float) -> bool:
@@ -177,17 +179,15 @@ class Guide:
     def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_WAITING:
             self._refuse(f'{MOST_WAITING} others wait already, send them more slowly')
-        elif len(data) > MOST_BYTES:
-            self._refuse(f'{len(data)} bytes, at most {MOST_BYTES} are taken')
-        elif (count := points_in(data)) > MOST_POINTS:
-            self._refuse(f'{count} points, at most {MOST_POINTS} are taken')
+        elif too_large := _too_large(data):
+            self._refuse(too_large)
         else:
             self._start(self._correct, data, self._session.calibration)
 
     def _correct(self, data: bytes, calibration: Calibration | None) -> None:
         """Publish a corrected trajectory, or nothing at all and log why."""
         try:
-            message = deserialised(data, TRAJECTORY)
+            message = deserialize_message(data, JointTrajectory)
             corrected, self._last_trajectory = self._corrected_by(message, calibration)
         except CalibrationError as err:
             self._refuse(str(err))
@@ -244,3 +244,19 @@ class Guide:
 
     def _now(self) -> Any:
         return self._node.get_clock().now().to_msg()
+
+
+def _too_large(data: bytes) -> str:
+    """Return in words what a serialised trajectory has too much of; empty when it can be decoded.
+
+    To decode a million points takes many seconds, and no other thread runs meanwhile.
+    """
+    names, points = trajectory_size(data)
+    for count, most, what in (
+        (len(data), MOST_BYTES, 'bytes'),
+        (names, MOST_JOINTS, 'joints'),
+        (points, MOST_POINTS, 'points'),
+    ):
+        if count > most:
+            return f'{count} {what}, at most {most} are taken'
+    return ''

@@ -42,8 +42,8 @@ LOOK_AGAIN_NS = 2_000_000_000
 SILENT_NS = 5_000_000_000
 """Time after which joints of which nothing is heard, while others are, count as silent."""
 LEAST_FAR = 1.0
-"""Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle what
-has not come yet; joint states up to `max_gap` apart belong together."""
+"""Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
+what has not come yet; joint states up to `max_gap` apart belong together."""
 EARLY = 0.03
 """Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
 delay. Of what then shows the arm leaving, most is left out as spikes; the rest moves the mean by
@@ -129,6 +129,7 @@ class CalibrationSession:
         self._frames = FrameNames()
         self._names = JointNames(self.joint_names)
         self._live = LiveEstimate(self.problem_of)
+        self._once: set[tuple[str, str]] = set()
 
     def change(self, settings: Settings) -> None:
         """Go on with other settings; the buffers and samples stay.
@@ -372,11 +373,23 @@ class CalibrationSession:
 
     @property
     def usable(self) -> list[Sample]:
-        """Return the samples in the frame of their device: `frame_id`, or the usual one."""
+        """Return the samples in the frame of their device, `frame_id` or the usual one.
+
+        Those of targets that were measured once are left out where others were more often: they
+        tell nothing about the arm, and hundreds of them would take minutes.
+        """
         wanted = self.settings.frame_id
-        if not wanted and not self._frames.several:
-            return self.samples
-        return [each for each in self.samples if self._frame_of(each, wanted) == each.frame_id]
+        found = self.samples
+        if wanted or self._frames.several:
+            found = [each for each in found if self._frame_of(each, wanted) == each.frame_id]
+        counts = Counter((each.device, each.target) for each in found if not each.validation)
+        once = {key for key, count in counts.items() if count == 1}
+        if once != self._once:  # the list does not only grow
+            self._once = once
+            self._live.restart()
+        if not once or len(once) == len(counts):
+            return found
+        return [each for each in found if (each.device, each.target) not in once]
 
     def _frame_of(self, sample: Sample, wanted: str = '') -> str:
         """Return in which frame a sample should be; some do not tell in which they are."""
@@ -419,10 +432,16 @@ class CalibrationSession:
     def account(self) -> Account:
         """Return what became of the messages so far."""
         fitted = [sample.joints for sample in self.samples if not sample.validation]
+        usable = self.usable
         distinct = len(fitted)
         if self.settings.mode != 'continuous' and fitted:
             distinct = len(np.unique(configurations(np.array(fitted))))
         collector = self._collector
+        notes = self._notes + collector.notes
+        if len(usable) < len(self.samples):
+            notes['samples left out, in another frame or of a target measured once'] += len(
+                self.samples
+            ) - len(usable)
         strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._gate.dropped.items()})
         dropped = self._dropped + collector.dropped + strays
         return Account(
@@ -434,7 +453,7 @@ class CalibrationSession:
             distinct,
             dict(sorted((self._unused + collector.unused).items())),
             dict(sorted(dropped.items())),
-            dict(sorted((self._notes + collector.notes).items())),
+            dict(sorted(notes.items())),
             self._names.foreign,
         )
 

@@ -72,8 +72,9 @@ class Gate(Generic[Item]):
             self._last[kind] = time_ns
             found = [*self._now_near(), given]
             self._last[kind] = time_ns
-            self.dropped[kind] += self.held(kind)
-            self._held = [each for each in self._held if each.kind != kind]
+            if strays := self.held(kind):
+                self.dropped[kind] += strays
+                self._held = [each for each in self._held if each.kind != kind]
             return found, False
         self._held.append(given)
         if self.held(kind) < JUMP:
