@@ -398,16 +398,22 @@ class CalibrationSession:
         ) or sample.frame_id
 
     def _leave_out_strange(self) -> None:
-        """Drop the samples in strange frames of which there are a few, the first ones say."""
-        if self.settings.frame_id or self._frames.different:
-            return
+        """Take back samples in strange frames, the first ones say, if there are only a few."""
         for sample in tuple(self.samples):
-            frame_id = self._frame_of(sample)
-            if sample.frame_id != frame_id:
+            if self._is_strange(sample):
                 self.samples.remove(sample)
-                self._dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
                 self._live.restart()
                 self.on_removed(sample)
+
+    def _is_strange(self, sample: Sample) -> bool:
+        """Tell whether a sample is one of a few in a frame of their own; count it if so."""
+        if self.settings.frame_id or not self._frames.several or self._frames.different:
+            return False
+        frame_id = self._frame_of(sample)
+        strays = sample.frame_id != frame_id
+        if strays:
+            self._dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
+        return strays
 
     @property
     def _different(self) -> str:
@@ -612,12 +618,10 @@ class CalibrationSession:
 
     def _take(self) -> None:
         """Keep the samples that the collector has made."""
-        fresh = self._collector.take()
-        for sample in fresh:
-            self.samples.append(sample)
-            self.on_sample(sample)
-        if any(self._frame_of(sample) != sample.frame_id for sample in fresh):
-            self._leave_out_strange()
+        for sample in self._collector.take():
+            if not self._is_strange(sample):
+                self.samples.append(sample)
+                self.on_sample(sample)
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
         """Note stamps that go backwards; samples go by stamps, so nothing is lost by it."""
