@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from calib_ros.errors import InputError
 from calib_ros.files import write_file
@@ -28,13 +29,18 @@ class Archive:
     Parameters
     ----------
     folder : Path
-        It is made when the first file is written.
+        It is made if there is none.
     robot : str
         Name of the robot, with its serial number if there are several.
     joints : int
         Number of joints.
     configuration : callable
         Returns the configuration to write beside a journal.
+
+    Raises
+    ------
+    InputError
+        When no file can be written in the folder.
 
     """
 
@@ -51,6 +57,20 @@ class Archive:
         self._waiting: list[tuple[Sample, bool]] = []
         self._path = self._new_path(JOURNAL)
         self._due = False
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=folder):
+                pass
+        except OSError as err:
+            raise InputError(
+                f'samples cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
+                'in which files can be written'
+            ) from err
+
+    @property
+    def trouble(self) -> str:
+        """Return in words that samples would be lost by now; empty while all are on the disk."""
+        return f'samples are in memory only: {self.error}; ' if self.error else ''
 
     @property
     def journal(self) -> Path | None:
@@ -74,6 +94,7 @@ class Archive:
         """Write what waits, as far as that is possible; `error` tells whether it was."""
         try:
             if self._journal is None and (self._waiting or self._due):
+                self.folder.mkdir(parents=True, exist_ok=True)
                 write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
                 self._journal = Journal(self._path, self._joints)
                 self._due = False

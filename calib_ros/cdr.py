@@ -32,6 +32,8 @@ from calib_ros.track import Stamps
 from calib_ros.values import QUATERNION_TOLERANCE
 
 LITTLE_ENDIAN = b'\x00\x01'
+MOST_NAMES = 10_000
+"""Joints of a trajectory that are passed over on the way to its points."""
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
 
 # Of each type: strings before the numbers, bytes between, kind and count of the numbers.
@@ -170,18 +172,36 @@ def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
     return tuple(strings), _aligned(at + between, np.dtype(dtype).itemsize), dtype, count
 
 
+def trajectory_size(blob: bytes) -> tuple[int, int]:
+    """Return how many joints and points a serialised JointTrajectory has.
+
+    Zero for what cannot be read: such a message cannot be decoded either.
+    """
+    order = '<' if blob[:2] == LITTLE_ENDIAN else '>'
+    names = 0
+    try:
+        at = _string(blob, _HEAD + _STAMP, order)[1]
+        names, at = _integer(blob, at, order)
+        for _ in range(min(names, MOST_NAMES)):
+            at = _string(blob, at, order)[1]
+        points = _integer(blob, at, order)[0] if names <= MOST_NAMES else 0
+    except (struct.error, UnicodeDecodeError):
+        return names, 0
+    return names, points
+
+
 def _aligned(at: int, size: int) -> int:
     """Return the next place that is a multiple of a size after the encapsulation."""
     return at + (_HEAD - at) % size
 
 
-def _integer(blob: bytes, at: int) -> tuple[int, int]:
+def _integer(blob: bytes, at: int, order: str = '<') -> tuple[int, int]:
     at = _aligned(at, 4)
-    return int(struct.unpack_from('<I', blob, at)[0]), at + 4
+    return int(struct.unpack_from(f'{order}I', blob, at)[0]), at + 4
 
 
-def _string(blob: bytes, at: int) -> tuple[str, int]:
-    length, at = _integer(blob, at)
+def _string(blob: bytes, at: int, order: str = '<') -> tuple[str, int]:
+    length, at = _integer(blob, at, order)
     return blob[at : at + max(length - 1, 0)].decode(), at + length
 
 

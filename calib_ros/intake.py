@@ -86,7 +86,9 @@ def feed(
         for group in window:
             if isinstance(group.readings, JointReadings):
                 quiet = session.uneventful(group.readings, among=stop - begin)
-                eventful[group.places - begin] = ~quiet
+            elif group.stream.source is not None:
+                quiet = session.uneventful_poses(group.stream.source, group.readings.stamps_ns)
+            eventful[group.places - begin] = ~quiet
         end = begin + int(eventful.argmax()) if eventful.any() else stop
         try:
             _keep(session, [group.between(begin, end) for group in window])
