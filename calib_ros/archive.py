@@ -8,13 +8,12 @@ Rows that cannot be written, because the disk is full say, wait in memory until 
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files import write_file
+from calib_ros.files import whole_folder, write_file, write_files
 from calib_ros.journal import Journal
 from calib_ros.samples import Sample
 from calib_ros.tables import read_journal
@@ -157,14 +156,8 @@ class Archive:
         Returns its path.
         """
         folder = self._new_path('')
-        partial = folder.with_name(f'.{folder.name}.partial')
-        try:
-            partial.mkdir(parents=True)
-            for name, content in files.items():
-                write_file(partial / name, content)
-            partial.rename(folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        with whole_folder(folder) as partial:
+            write_files(partial, files)
         return folder
 
     def close(self) -> None:

@@ -40,6 +40,12 @@ EXACT = 1e-9
 POSES = 1000
 FITTED = 200
 """Poses to which a table that cannot be exact is fitted; it is judged on all."""
+FILES = (
+    *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
+    *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
+)
+CORRECTED_URDF = '_corrected.urdf'
+"""End of the name of a corrected URDF beside these files."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)
 
 
