@@ -138,16 +138,19 @@ class Archive:
         Raises
         ------
         InputError
-            When the file is there already.
+            When one of the files is there already.
         OSError
             When it cannot be written.
 
         """
         path = path or self._new_path(CALIBRATION)
+        beside = path.with_suffix(SETTINGS)
+        if configuration and beside.exists():
+            raise InputError(f'{beside} exists already: move it or choose another name')
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, text)
         if configuration:
-            write_file(path.with_suffix(SETTINGS), configuration, overwrite=True)
+            write_file(beside, configuration)
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:

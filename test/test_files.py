@@ -409,7 +409,7 @@ def test_a_bag_on_a_full_disk_is_absent(tmp_path, storage, limit):
     def child():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
         with pytest.raises(OSError, match=r'cannot write .*bag: '):
-            write_bag(tmp_path / 'bag', dwells(10), storage, {tmp_path / 'truth': 'true'})
+            write_bag(tmp_path / 'bag', dwells(40), storage, {tmp_path / 'truth': 'true'})
 
     assert status_of(forked(child)) == 0
     assert list(tmp_path.iterdir()) == []
