@@ -331,7 +331,8 @@ def _demo(options: argparse.Namespace) -> int:
     from calib_ros.settings import Settings
 
     chain = load_chain(options.chain)
-    with results(options, (*RESULT_FILES, 'bag', 'bag_truth.yaml')) as folder:
+    own = (*RESULT_FILES, 'bag_truth.yaml', 'bag/bag.*', 'bag/metadata.yaml')
+    with results(options, own) as folder:
         folder.mkdir()
         bag = folder / 'bag'
         truth = _write_simulation(chain, options, bag)

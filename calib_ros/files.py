@@ -17,7 +17,6 @@ import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from calib_ros.errors import InputError
@@ -73,10 +72,10 @@ def whole_folder(
     path : Path
         The place of the folder. Missing parents are made.
     own : sequence of str, optional
-        Patterns of the names that belong to the folder. What an earlier folder holds besides is
+        Glob patterns of what belongs to the folder. What an earlier folder holds besides is
         kept. By default there must be no earlier one.
     overwrite : bool
-        Replace files of `own` names.
+        Replace what is there of `own`.
 
     Raises
     ------
@@ -213,16 +212,17 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
             f'{path} is the current folder or a mount point, which cannot be put in place as a '
             f'whole: choose a folder in it, such as {path / "result"}'
         )
-    there = _matching(sorted(os.listdir(place)), own)
+    there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
     if there and not overwrite:
         raise InputError(f'{path} holds {", ".join(there)} already: choose another or --force')
 
 
 def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
-    """Give a folder what is in another one, names of `own` left out and nothing replaced."""
+    """Give a folder what is in another one, `own` left out and nothing replaced."""
+    owned = _matching(source, own)
 
     def left_out(folder: str, names: list[str]) -> list[str]:
-        return _matching(names, own) if Path(folder) == source else []
+        return [name for name in names if Path(folder, name) in owned]
 
     def link(first: str, second: str) -> None:
         try:
@@ -237,8 +237,8 @@ def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
     )
 
 
-def _matching(names: Iterable[str], patterns: Sequence[str]) -> list[str]:
-    return [name for name in names if any(fnmatchcase(name, each) for each in patterns)]
+def _matching(folder: Path, patterns: Sequence[str]) -> set[Path]:
+    return {path for each in patterns for path in folder.glob(each)}
 
 
 def _sync(folder: Path, *, deep: bool = True) -> None:

@@ -61,7 +61,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
 def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Path]:
     """Yield where to make the folder --out; see `whole_folder`.
 
-    Names (patterns) of an earlier result are refused before any work is done, or replaced by
+    Files of these names (glob patterns) are refused before any work is done, or replaced by
     --force. Other files stay in the folder.
     """
     with whole_folder(options.out, names, overwrite=options.force) as folder:

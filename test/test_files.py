@@ -243,8 +243,10 @@ def test_names_in_the_way_are_kept_unless_overwritten(tmp_path):
     with pytest.raises(InputError, match='exists already'):
         make(path, 'B', own=None)
     assert tree(path) == expected('A') | NOTES
+    nested = {'mine/a.txt': 'not of ours', 'mine/deep/b.txt': 'nor this'}
+    write_files(path / 'mine', {'a.txt': 'not of ours', 'deep/b.txt': 'nor this'})
     make(path, 'B')
-    assert tree(path) == expected('B') | NOTES
+    assert tree(path) == expected('B') | NOTES | nested
     assert os.readlink(path / 'link') == 'nowhere'
     assert path.stat().st_mode & 0o777 == 0o750
 
