@@ -373,8 +373,10 @@ def dwells(count):
 def test_a_bag_whose_writing_is_killed_is_absent(tmp_path, monkeypatch, storage):
     path, truth = tmp_path / 'cells' / 'bag', tmp_path / 'cells' / 'truth.yaml'
 
+    recording = dwells(3)
+
     def write():
-        write_bag(path, dwells(3), storage, {truth: 'truth'})
+        write_bag(path, recording, storage, {truth: 'truth'})
 
     def check():
         if path.exists():
@@ -385,6 +387,8 @@ def test_a_bag_whose_writing_is_killed_is_absent(tmp_path, monkeypatch, storage)
             assert len(session.samples) == 3
             shutil.rmtree(path)
 
+    write()  # here first, so that no child has to load the message types
+    check()
     assert every_kill(tmp_path, write, check) > 10
     check()
     write_message = Writer.write
