@@ -5,8 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,12 +57,10 @@ def settings_of(options: argparse.Namespace) -> Settings:
     return Settings(**given)
 
 
-@contextmanager
-def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Path]:
-    """Yield where to make the folder --out; see `whole_folder`.
+def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContextManager[Path]:
+    """Return the folder --out to be made in a `with` block; see `whole_folder`.
 
     Files of these names (glob patterns) are refused before any work is done, or replaced by
     --force. Other files stay in the folder.
     """
-    with whole_folder(options.out, names, overwrite=options.force) as folder:
-        yield folder
+    return whole_folder(options.out, names, overwrite=options.force)
