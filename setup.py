@@ -40,6 +40,7 @@ setup(
         (SHARE, ['package.xml']),
         (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
+        (f'{SHARE}/security', glob('security/*.xml')),
         (f'{SHARE}/launch', glob('launch/*.launch.py')),
     ],
     zip_safe=True,

@@ -8,14 +8,13 @@ Rows that cannot be written, because the disk is full say, wait in memory until 
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile
 
 from calib_ros.errors import InputError
-from calib_ros.files import write_file
+from calib_ros.files import whole_folder, write_file, write_files
 from calib_ros.journal import Journal
 from calib_ros.samples import Sample
 from calib_ros.tables import read_journal
@@ -160,16 +159,19 @@ class Archive:
         Raises
         ------
         InputError
-            When the file is there already.
+            When one of the files is there already.
         OSError
             When it cannot be written.
 
         """
         path = path or self._new_path(CALIBRATION)
+        beside = path.with_suffix(SETTINGS)
+        if configuration and beside.exists():
+            raise InputError(f'{beside} exists already: move it or choose another name')
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, text)
         if configuration:
-            write_file(path.with_suffix(SETTINGS), configuration, overwrite=True)
+            write_file(beside, configuration)
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:
@@ -178,14 +180,8 @@ class Archive:
         Returns its path.
         """
         folder = self._new_path('')
-        partial = folder.with_name(f'.{folder.name}.partial')
-        try:
-            partial.mkdir(parents=True)
-            for name, content in files.items():
-                write_file(partial / name, content)
-            partial.rename(folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        with whole_folder(folder) as partial:
+            write_files(partial, files)
         return folder
 
     def close(self) -> None:

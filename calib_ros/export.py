@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,6 +31,7 @@ from calib_ros import se3
 from calib_ros.chain import DH_KINDS, Chain, Frame, Joint, JointType
 from calib_ros.config import dump_chain, dump_yaml, parse_chain
 from calib_ros.errors import CalibrationError
+from calib_ros.escapes import from_cell, to_cell
 from calib_ros.identifiability import structurally_independent
 from calib_ros.leastsquares import Samples, System, minimise
 from calib_ros.observations import Observations
@@ -40,6 +42,12 @@ EXACT = 1e-9
 POSES = 1000
 FITTED = 200
 """Poses to which a table that cannot be exact is fitted; it is judged on all."""
+FILES = (
+    *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
+    *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
+)
+CORRECTED_URDF = '_corrected.urdf'
+"""End of the name of a corrected URDF beside these files."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)
 
 
@@ -197,8 +205,9 @@ def _matrix(pose: Mapping[str, float]) -> FloatArray:
 
 
 def _head(chain: Chain, what: str, error: float) -> str:
+    name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
-    return f'# {chain.name}: {what}; metres and radians; {exact}\n'
+    return f'# {name}: {what}; metres and radians; {exact}\n'
 
 
 def _csv(chain: Chain, what: str, error: float) -> str:
@@ -209,17 +218,18 @@ def _csv(chain: Chain, what: str, error: float) -> str:
     writer.writerow(ROW)
     for joint in chain.joints:
         numbers = [repr(float(getattr(joint, kind))) for kind in DH_KINDS]
-        writer.writerow([joint.name, joint.type, joint.sign, *numbers])
+        writer.writerow([to_cell(joint.name), joint.type, joint.sign, *numbers])
     return text.getvalue()
 
 
 def _read_csv(text: str, form: Chain) -> Chain:
     """Return a chain with the rows of a table, in the frames of another one."""
     joints = []
-    for row in csv.DictReader(text.splitlines()[1:]):
+    for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
         kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'
         a, alpha, d, theta, beta = (float(row[name]) for name in DH_KINDS)
-        joints.append(Joint(row['joint'], kind, a, alpha, d, theta, beta, int(row['sign'])))
+        name = from_cell(row['joint'])
+        joints.append(Joint(name, kind, a, alpha, d, theta, beta, int(row['sign'])))
     return replace(form, joints=tuple(joints))
 
 

@@ -36,6 +36,7 @@ class Given:
     links: dict[str, str | None]
     serial: str
     data_dir: Path | None
+    allowed_folders: tuple[Path, ...]
     resume: bool
     candidates: Path | None
     settings: Settings
@@ -69,10 +70,16 @@ def declare_all(node: Node) -> Given:
     data_dir = _declare(
         node, 'data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'
     )
+    folders = _declare(
+        node,
+        'allowed_folders',
+        [''],
+        'folders in which ~/save and ~/load may use files besides data_dir; default: none',
+    )
     resume = _declare(node, 'resume', False, 'go on with the newest journal of this robot')
     for name, default, text in (
-        ('target_filename', '', 'file that ~/save writes; default: a new one in data_dir'),
-        ('calibration_filename', '', 'file that ~/load reads; default: the newest saved'),
+        ('target_filename', '', 'file in data_dir that ~/save writes; default: a new one'),
+        ('calibration_filename', '', 'file in data_dir that ~/load reads; default: the newest'),
         ('marker_scale', 200.0, 'residual vectors are drawn so many times as long'),
     ):
         _declare(node, name, default, text, read_only=False)
@@ -89,7 +96,10 @@ def declare_all(node: Node) -> Given:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    return Given(chain, links, serial, _path(data_dir), resume, _path(candidates), settings)
+    allowed = tuple(Path(name).expanduser() for name in _names(folders))
+    return Given(
+        chain, links, serial, _path(data_dir), allowed, resume, _path(candidates), settings
+    )
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:

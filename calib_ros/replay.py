@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import itertools
+import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from calib_ros.errors import InputError
+from calib_ros.files import whole_folder, write_file
 from calib_ros.intake import Stream, feed
 from calib_ros.mcap import logged
 from calib_ros.messages import DECODERS, JOINT_STATE
@@ -278,20 +280,35 @@ class Recording:
         )
 
 
-def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
-    """Write a recording as a rosbag2 folder, in the order of the stamps.
+def write_bag(
+    path: Path,
+    recording: Recording,
+    storage: str = 'mcap',
+    beside: Mapping[Path, str] | None = None,
+) -> None:
+    """Write a recording as a rosbag2 folder, in the order of the stamps, as a whole or not at all.
 
     Topics: /joint_states, and /measured_pose or /measured_point; /validation_pose or
-    /validation_point for held-out poses.
+    /validation_point for held-out poses. Files `beside` the bag are there before it is.
 
     Raises
     ------
     InputError
         When there is something at the path already.
+    OSError
+        When it cannot be written, because the disk is full say.
 
     """
-    if path.exists():
-        raise InputError(f'{path} exists already: remove it or choose another name')
+    with whole_folder(path) as folder:
+        try:
+            _write_bag(folder, recording, STORAGES[storage])
+        except (OSError, sqlite3.Error) as err:
+            raise OSError(f'cannot write {path}: {err}') from err
+        for file, text in (beside or {}).items():
+            write_file(file, text, overwrite=True)
+
+
+def _write_bag(path: Path, recording: Recording, storage: StoragePlugin) -> None:
     store = _typestore()
     types = store.types
     time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
@@ -316,7 +333,7 @@ def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
 
     stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
     names = list(recording.joint_names)
-    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
+    with Writer(path, version=9, storage_plugin=storage) as writer:
         joint_connection = writer.add_connection('/joint_states', JOINT_STATE, typestore=store)
         pose_connections = [
             writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)

@@ -21,6 +21,7 @@ import numpy as np
 
 from calib_ros import se3
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.escapes import from_cell, to_cell
 from calib_ros.observations import Observations
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
@@ -136,7 +137,8 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row.append('' if sample.distance is None else repr(sample.distance))
     covariance = sample.covariance
     row += numbers(None if covariance is None else covariance[tuple(np.transpose(UPPER))], 21)
-    row += [sample.device, sample.target, sample.frame_id, '1' if sample.eye_in_hand else '']
+    row += [to_cell(name) for name in (sample.device, sample.target, sample.frame_id)]
+    row.append('1' if sample.eye_in_hand else '')
     row += [repr(sample.delay), str(sample.count), repr(sample.spread), sample.session]
     return [*row, split or ('test' if sample.validation else 'train')]
 
@@ -227,9 +229,9 @@ class _Reader:
             velocity=self._optional(line, row, 'v'),
             acceleration=self._optional(line, row, 'a'),
             session=row.get('session') or '',
-            device=row.get('device') or '',
-            target=row.get('target') or '',
-            frame_id=row.get('frame_id') or '',
+            device=from_cell(row.get('device') or ''),
+            target=from_cell(row.get('target') or ''),
+            frame_id=from_cell(row.get('frame_id') or ''),
             eye_in_hand=self._flag(line, row, 'eye_in_hand'),
             validation=split == 'test',
             delay=self._number(line, row, 'delay') if row.get('delay') else 0.0,

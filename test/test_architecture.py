@@ -14,7 +14,7 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 
 ORDER = [
     {'errors'},
-    {'se3', 'files', 'mcap'},
+    {'escapes', 'files', 'mcap', 'se3'},
     {'effects', 'description', 'values'},
     {'chain', 'settings'},
     {'urdf'},

@@ -288,8 +288,12 @@ def test_demo_shows_the_whole_way(run, tmp_path):
     status, _, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
     assert status == 1
     assert '--force' in err
+    for note in ('notes.txt', 'bag/notes.txt'):
+        (tmp_path / 'demo' / note).write_text('mine')
     again = run('demo', '--poses', 20, '--out', tmp_path / 'demo', '--force')
     assert again == (0, out, '')
+    for note in ('notes.txt', 'bag/notes.txt'):
+        assert (tmp_path / 'demo' / note).read_text() == 'mine'
 
 
 def test_demo_of_another_robot(run, tmp_path):

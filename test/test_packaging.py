@@ -18,7 +18,7 @@ import calib_ros
 from calib_ros.settings import Settings
 
 ROOT = Path(__file__).parents[1]
-CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz')
+CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz', 'security/policy.xml')
 
 
 @pytest.mark.parametrize('arguments', [[], ['--symlink-install']])
