@@ -18,6 +18,12 @@ import calib_ros
 from calib_ros.settings import Settings
 
 ROOT = Path(__file__).parents[1]
+JAZZY = {
+    *('builtin_interfaces', 'diagnostic_aggregator', 'diagnostic_msgs', 'geometry_msgs', 'launch'),
+    *('launch_ros', 'nav_msgs', 'rcl_interfaces', 'rclpy', 'robot_state_publisher', 'rviz2'),
+    *('sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs', 'trajectory_msgs', 'visualization_msgs'),
+}
+"""Packages of Jazzy: rosdep installs their Debian packages, ros-jazzy-NAME."""
 CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz')
 
 
@@ -66,7 +72,8 @@ def test_versions_agree():
 def test_package_xml_names_everything_that_is_imported():
     package = ET.parse(ROOT / 'package.xml').getroot()
     declared = {element.text for element in package.iter('exec_depend')}
-    keys = {'yaml': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+    declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
+    keys = {'yaml': 'python3-yaml'}
     keys |= {name: f'python3-{name}' for name in ('numpy', 'scipy', 'matplotlib')}
     sources = [*(ROOT / 'calib_ros').glob('*.py'), *(ROOT / 'launch').glob('*.py')]
     for source in sources:
@@ -77,6 +84,23 @@ def test_package_xml_names_everything_that_is_imported():
                 top = name.partition('.')[0]
                 if top not in sys.stdlib_module_names and top != 'calib_ros':
                     assert keys.get(top, top) in declared, f'{source.name} imports {top}'
+
+
+def test_rosdep_finds_everything_on_ubuntu():
+    """rosdep refuses keys that it would have to install by pip: PEP 668."""
+    package = ET.parse(ROOT / 'package.xml').getroot()
+    keys = {each.text for each in package if each.tag.endswith('depend')}
+    apt = ('hypothesis', 'matplotlib', 'numpy', 'pytest', 'scipy', 'yaml')
+    assert keys - JAZZY == {f'python3-{name}' for name in apt}
+
+
+def test_the_oldest_versions_are_those_that_pip_may_install():
+    text = (ROOT / 'setup.py').read_text()
+    bounds = dict(re.findall(r"'(\w+)>=([\d.]+)'", text))
+    oldest = (ROOT / 'test/oldest.txt').read_text()
+    pins = re.findall(r'^(\w+)==([\d.]+)(?:; python_version (\S+))?', oldest, re.MULTILINE)
+    assert {name: pin for name, pin, marker in pins if marker in ('', '<')} == bounds
+    assert [name for name, _, marker in pins if marker == '>='] == ['matplotlib']
 
 
 def test_the_parameter_file_states_the_defaults():
