@@ -17,7 +17,7 @@ ORDER = [
     {'se3', 'files', 'mcap'},
     {'effects', 'description', 'values'},
     {'chain', 'settings'},
-    {'urdf'},
+    {'arguments', 'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
     {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
@@ -45,7 +45,7 @@ ONLY = {
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config', 'export', 'programs'},
+    'yaml': {'arguments', 'config', 'export', 'programs'},
 }
 
 
