@@ -26,6 +26,7 @@ from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
 from calib_ros.session import CalibrationSession
 from calib_ros.urdf import corrected_urdf
+from calib_ros.vendors import vendor_files
 
 
 class Published(NamedTuple):
@@ -127,10 +128,12 @@ class Keeper:
     def export(self, found: Exportable) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
         record = calibration_record(found.text)
-        forms = exports(found.chain, self._session.chain, found.joints, record)
+        nominal, links = self._session.chain, self._given.links
+        forms = exports(found.chain, nominal, found.joints, record)
+        forms += vendor_files(found.chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
-            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **self._given.links)
+            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **links)
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:

@@ -24,7 +24,7 @@ ORDER = [
     {'account', 'following', 'names', 'robust', 'waypoints'},
     {'compensation'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
-    {'archive', 'problem'},
+    {'archive', 'problem', 'vendors'},
     {'chance', 'live', 'noise', 'validation'},
     {'identification'},
     {'calibration', 'design', 'salvage', 'selection', 'workspace'},
@@ -45,7 +45,7 @@ ONLY = {
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'arguments', 'config', 'export', 'programs'},
+    'yaml': {'arguments', 'config', 'export', 'programs', 'vendors'},
 }
 
 

@@ -15,6 +15,7 @@ from rclpy.node import Node as RosNode
 from ros_cell import Cell
 
 from calib_ros.arguments import (
+    NODE,
     PARAMETERS,
     launch_arguments,
     refuse_unknown,
@@ -80,7 +81,7 @@ def launched(monkeypatch):
         monkeypatch.setitem(sys.modules, name, module)
 
     def launch(name, **arguments):
-        path = ROOT / 'launch' / name
+        path = ROOT / name if '/' in name else ROOT / 'launch' / name
         words = [f'{key}:={value}' for key, value in arguments.items()]
         monkeypatch.setattr(sys, 'argv', ['ros2', 'launch', 'calib_ros', name, *words])
         space = {'__file__': str(path), '__name__': 'launched'}
@@ -303,6 +304,61 @@ def test_a_node_that_was_killed_goes_on_with_its_samples(launched):
         assert (found['resume'], found['serial'], found['chain']) == (True, '0012', 'ur10e')
     context.is_shutdown = True
     assert exited['on_exit'](SimpleNamespace(returncode=-9), context) == []
+
+
+def test_the_example_feeds_the_corrected_urdf_to_all(launched, tmp_path, monkeypatch):
+    urdf = tmp_path / 'robot_corrected.urdf'
+    urdf.write_text('<robot name="corrected"/>')
+    name = 'examples/corrected_arm.launch.py'
+    (published,), _ = launched(name, urdf=str(urdf))
+    assert published.kwargs['parameters'][0]['robot_description'].args == (urdf.read_text(),)
+
+    def builder(robot, package_name):
+        configured = {'robot_description': 'nominal', 'robot': robot, 'package': package_name}
+        return SimpleNamespace(
+            to_moveit_configs=lambda: SimpleNamespace(to_dict=lambda: configured)
+        )
+
+    module = ModuleType('moveit_configs_utils')
+    module.MoveItConfigsBuilder = builder
+    monkeypatch.setitem(sys.modules, 'moveit_configs_utils', module)
+    actions, _ = launched(name, urdf=str(urdf), moveit_robot='ur', moveit_package='ur_moveit')
+    configured, solvers, last = nodes(actions)['move_group']['parameters']
+    assert (configured['robot'], configured['package']) == ('ur', 'ur_moveit')
+    assert last['robot_description'].args == (urdf.read_text(),)
+    (content,) = yaml.safe_load(Path(solvers).read_text()).values()
+    assert 'robot_description_kinematics' in content['ros__parameters']
+
+
+def test_the_example_moves_nothing_until_it_is_asked_to(launched):
+    name = 'examples/compensated_controller.launch.py'
+    given = {'chain': 'ur10e', 'calibration': '/data/ur10e.yaml'}
+    (node,), _ = launched(name, **given)
+    assert (
+        parameters_of(node.kwargs['ros_arguments'])['calibration_filename'] == '/data/ur10e.yaml'
+    )
+    assert dict(node.kwargs['remappings']) == {
+        '~/joint_trajectory': '/planned_trajectory',
+        '~/compensated_joint_trajectory': '/compensated_trajectory',
+    }
+    (node,), _ = launched(name, **given, execute='true')
+    assert dict(node.kwargs['remappings']) == {
+        '~/joint_trajectory': '/planned_trajectory',
+        '~/compensated_joint_trajectory': '/joint_trajectory_controller/joint_trajectory',
+    }
+
+
+def test_a_real_node_passes_corrected_trajectories_by_the_remapped_topics():
+    remap = (
+        '~/joint_trajectory:=/planned',
+        '~/compensated_joint_trajectory:=/jtc/joint_trajectory',
+    )
+    with Cell() as cell:
+        node = cell.start(remap=remap, chain='ur10e')
+        assert '/jtc/joint_trajectory' in {each.topic_name for each in node.publishers}
+        assert '/planned' in {
+            name for name, _ in node.get_subscriber_names_and_types_by_node(NODE, '/')
+        }
 
 
 @pytest.mark.parametrize('namespace', ['', '/', 'cell_1', '/line/cell_1/'])
