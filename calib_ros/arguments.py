@@ -55,6 +55,18 @@ BESIDE_SETTINGS = (
     Parameter(
         'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'
     ),
+    Parameter(
+        'base_frame',
+        '',
+        "frame of the arm's base that is published on /tf_static in the frame of the "
+        'measurements; default: none',
+    ),
+    Parameter(
+        'flange_frame',
+        '',
+        "frame of the arm's flange in which the target is published on /tf_static; default: none",
+    ),
+    Parameter('target_frame', 'target', 'name of the target on /tf_static'),
 )
 PARAMETERS = {
     each.name: each

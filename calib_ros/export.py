@@ -91,7 +91,7 @@ def exports(
         text = _csv(form, what, lost)
         again = _read_csv(text, form)
         found.append(_checked(f'dh_{convention}.csv', text, arm, again.forward(q), q, lost))
-        text = _head(form, what, lost) + dump_chain(form, origin)
+        text = head(form, what, lost) + dump_chain(form, origin)
         again = parse_chain(text)
         found.append(_checked(f'dh_{convention}.yaml', text, arm, again.forward(q), q, lost))
     text = kinematics_yaml(arm, origin)
@@ -205,7 +205,8 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
-def _head(chain: Chain, what: str, error: float) -> str:
+def head(chain: Chain, what: str, error: float) -> str:
+    """Return the line that says what a file is, and how far [m] from the calibrated arm."""
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
     return f'# {chain.name}: {what}; metres and radians; {exact}\n'
 
@@ -213,7 +214,7 @@ def _head(chain: Chain, what: str, error: float) -> str:
 def _csv(chain: Chain, what: str, error: float) -> str:
     """Return the table of a chain with a line that says what it is."""
     text = io.StringIO()
-    text.write(_head(chain, what, error))
+    text.write(head(chain, what, error))
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(ROW)
     for joint in chain.joints:

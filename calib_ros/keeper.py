@@ -16,6 +16,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros import outgoing
 from calib_ros.archive import Archive
+from calib_ros.broadcast import Broadcast
 from calib_ros.chain import Chain
 from calib_ros.config import calibration_record, parse_calibration, read_text
 from calib_ros.errors import InputError
@@ -25,6 +26,7 @@ from calib_ros.parameters import Given
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
 from calib_ros.session import CalibrationSession
+from calib_ros.sources import parse_sources
 from calib_ros.urdf import corrected_urdf
 from calib_ros.vendors import vendor_files
 
@@ -77,6 +79,9 @@ class Keeper:
         self._posed: tuple[int, Sequence[float]] | None = None
         self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
         self._calibration = node.create_publisher(String, '~/calibration', latched)
+        sources = parse_sources(given.settings.sources)
+        in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
+        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links, latched)
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(
@@ -151,3 +156,4 @@ class Keeper:
         self._published = published
         self._dh_parameters.publish(outgoing.dh_parameters(chain))
         self._calibration.publish(String(data=published.text))
+        self._broadcast.publish(chain, self._session.calibration.world_frame)

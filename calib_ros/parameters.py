@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -30,6 +30,14 @@ DESCRIPTION_WAIT = 10.0
 """Time [s] for which the node waits for the robot's description."""
 
 
+class FrameNames(NamedTuple):
+    """What the frames are called on /tf_static; nothing is published of one without a name."""
+
+    base: str
+    flange: str
+    target: str
+
+
 @dataclass(frozen=True)
 class Given:
     """What a node was started with; what else may change is read where it is used."""
@@ -40,6 +48,7 @@ class Given:
     data_dir: Path | None
     resume: bool
     candidates: Path | None
+    frames: FrameNames
     settings: Settings
 
 
@@ -70,6 +79,7 @@ def declare_all(node: Node) -> Given:
         data_dir=_path(own['data_dir']),
         resume=own['resume'],
         candidates=_path(own['candidates']),
+        frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
         settings=settings,
     )
 

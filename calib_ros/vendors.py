@@ -34,6 +34,7 @@ from calib_ros.export import (
     Export,
     ExportError,
     converted,
+    head,
     origins,
     pose_matrix,
     xyz_rpy,
@@ -156,16 +157,17 @@ def vendor_files(
         if layouts[0] is None or layouts[1] is None or not vendor.has_layout(layouts[0][0]):
             continue
         places, reference = layouts[1]
-        content = _document(vendor, places, origin, checksum)
         q = chain.random_joints(POSES, np.random.default_rng(0))
+        shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
+        lost = float(np.linalg.norm(shift, axis=1).max())
+        content = head(chain, 'kinematics', lost) + _document(vendor, places, origin, checksum)
         difference = float(np.abs(forward_of(content, vendor, q) - reference.forward(q)).max())
         if not difference <= EXACT:
             raise ExportError(
                 f'{vendor.file}, read back, differs from the calibration by {difference:.3g} m or '
                 'more in rotation: it is not written'
             )
-        lost = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
-        found.append(Export(vendor.file, content, float(np.linalg.norm(lost, axis=1).max())))
+        found.append(Export(vendor.file, content, lost))
     return tuple(found)
 
 

@@ -33,14 +33,26 @@ ORDER = [
     {'intake', 'report'},
     {'replay'},
     {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
-    {'commands', 'diagnostics', 'guide', 'keeper'},
+    {'broadcast', 'commands', 'diagnostics', 'guide'},
+    {'keeper'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'keeper', 'outgoing', 'parameters'}
+ROS = {
+    'node',
+    'broadcast',
+    'deferred',
+    'diagnostics',
+    'guide',
+    'inputs',
+    'keeper',
+    'outgoing',
+    'parameters',
+}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,
+    'tf2_msgs': ROS,
     'geometry_msgs': ROS,
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
