@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The launch files, evaluated by a stand-in of launch, which is not on PyPI."""
 
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -237,6 +238,18 @@ def test_an_argument_that_does_not_exist_is_refused(launched):
         launched('calibration.launch.py', chain='ur10e', resum='true')
     with pytest.raises(UnknownNameError, match='did you mean "tracker"'):
         launched('cell.launch.py', traker='driver/node')
+
+
+@pytest.mark.parametrize('name', ['README.md', 'docs/node.md'])
+def test_launch_commands_in_the_documents_are_valid(name):
+    commands = re.findall(
+        r'ros2 launch calib_ros (\S+)((?: +\S+:=\S+)*)', (ROOT / name).read_text()
+    )
+    assert commands
+    for file, words in commands:
+        own = re.findall(r"^    '(\w+)': \(", (ROOT / 'launch' / file).read_text(), re.MULTILINE)
+        for argument in re.findall(r'(\S+):=', words):
+            assert argument in {*launch_arguments(), *own}, f'{file} has no {argument}'
 
 
 def test_arguments_of_another_launch_file_that_includes_ours_are_its_own():

@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 import calib_ros
+from calib_ros.arguments import BESIDE_SETTINGS, PARAMETERS
 from calib_ros.settings import Settings
 
 ROOT = Path(__file__).parents[1]
@@ -24,7 +25,8 @@ JAZZY = {
     *('sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs', 'trajectory_msgs', 'visualization_msgs'),
 }
 """Packages of Jazzy: rosdep installs their Debian packages, ros-jazzy-NAME."""
-CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz')
+INSTALLED = tuple(f'config/{name}' for name in ('calibration_node.yaml', 'calibration.rviz'))
+INSTALLED += ('config/diagnostics.yaml', 'launch/calibration.launch.py', 'launch/cell.launch.py')
 
 
 @pytest.mark.parametrize('arguments', [[], ['--symlink-install']])
@@ -44,7 +46,7 @@ def test_colcon_build_puts_everything_where_ros2_looks(tmp_path, arguments):
     prefix = tmp_path / 'install' / 'calib_ros'
     share = prefix / 'share' / 'calib_ros'
     assert (prefix / 'share/ament_index/resource_index/packages/calib_ros').is_file()
-    for name in ('package.xml', 'launch/calibration.launch.py', *CONFIG):
+    for name in ('package.xml', *INSTALLED):
         assert (share / name).is_file()
     robots = {path.name for path in (ROOT / 'config/robots').iterdir()}
     assert {path.name for path in (share / 'config/robots').iterdir()} == robots
@@ -106,6 +108,7 @@ def test_the_oldest_versions_are_those_that_pip_may_install():
 def test_the_parameter_file_states_the_defaults():
     content = yaml.safe_load((ROOT / 'config/calibration_node.yaml').read_text())
     stated = content['/**']['ros__parameters']
+    assert {each.name: each.default for each in BESIDE_SETTINGS}.items() <= stated.items()
     for item in fields(Settings):
         if isinstance(item.default, tuple):
             assert stated[item.name] == ['']
@@ -129,7 +132,7 @@ def test_rviz_shows_what_the_node_publishes():
         assert latched['Durability Policy'] == 'Transient Local'
 
 
-def test_the_document_of_the_node_lists_every_setting():
+def test_the_document_of_the_node_lists_every_parameter():
     text = (ROOT / 'docs/node.md').read_text()
-    for item in fields(Settings):
-        assert f'`{item.name}`' in text, item.name
+    for name in PARAMETERS:
+        assert f'`{name}`' in text, name
