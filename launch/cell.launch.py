@@ -39,7 +39,7 @@ CONFIG = Path(__file__).parents[1] / 'config'
 OURS = {
     'urdf': (
         '',
-        'URDF of the robot, for robot_state_publisher; the chain too unless one is given',
+        'URDF of the robot, for robot_state_publisher; the chain too if nothing else names it',
     ),
     'tracker': ('', 'driver of the measuring device as PACKAGE/EXECUTABLE; default: none'),
     'tracker_topic': ('pose', 'topic of poses of that driver, remapped to measured_pose'),
@@ -85,7 +85,8 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     started: list[LaunchDescriptionEntity] = []
     if given['urdf']:
         text = Path(given['urdf']).expanduser().read_text(encoding='utf-8')
-        given['chain'] = given['chain'] or 'robot_description'
+        if not given['chain'] and not given['params_file']:
+            given['chain'] = 'robot_description'
         started.append(
             Node(
                 package='robot_state_publisher',

@@ -293,6 +293,16 @@ def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path):
     assert '/cell_1/calibration_node/residuals' in str(manager['Displays'])
 
 
+def test_the_chain_of_a_parameter_file_holds_beside_a_urdf(launched, tmp_path):
+    urdf, path = tmp_path / 'robot.urdf', tmp_path / 'node.yaml'
+    urdf.write_text('<robot name="arm"/>')
+    path.write_text('/**: {ros__parameters: {chain: ur10e}}')
+    quiet = {'rviz': 'false', 'diagnostics': 'false'}
+    actions, _ = launched('cell.launch.py', urdf=str(urdf), params_file=str(path), **quiet)
+    words = nodes(actions)['calibration_node']['ros_arguments']
+    assert parameters_of(words)['chain'] == 'ur10e'
+
+
 def test_parts_of_a_cell_can_be_left_out(launched):
     actions, _ = launched('cell.launch.py', chain='ur10e', rviz='false', diagnostics='false')
     found = nodes(actions)
