@@ -107,12 +107,16 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     ------
     ConfigError
         When a value is not of the type of its parameter.
+    InputError
+        When there is no parameter file.
 
     """
-    path = given.get('params_file', '')
-    if path and not Path(path).is_file():
-        raise InputError(f'params_file: there is no file {path}')
-    words = ['--params-file', path] if path else []
+    words = []
+    if given.get('params_file'):
+        path = Path(given['params_file']).expanduser()
+        if not path.is_file():
+            raise InputError(f'params_file: there is no file {path}')
+        words = ['--params-file', str(path)]
     for parameter in PARAMETERS.values():
         text = given.get(parameter.name, '')
         if text:

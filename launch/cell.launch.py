@@ -34,6 +34,7 @@ from calib_ros.arguments import (
     rviz_config,
     switched,
 )
+from calib_ros.errors import ConfigError
 
 CONFIG = Path(__file__).parents[1] / 'config'
 OURS = {
@@ -99,6 +100,8 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         )
     if given['tracker']:
         package, _, executable = given['tracker'].partition('/')
+        if not executable:
+            raise ConfigError(f'tracker must be PACKAGE/EXECUTABLE, not "{given["tracker"]}"')
         started.append(
             Node(
                 package=package,

@@ -293,6 +293,11 @@ def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path):
     assert '/cell_1/calibration_node/residuals' in str(manager['Displays'])
 
 
+def test_a_driver_needs_its_package(launched):
+    with pytest.raises(ConfigError, match='must be PACKAGE/EXECUTABLE'):
+        launched('cell.launch.py', chain='ur10e', tracker='driver')
+
+
 def test_the_chain_of_a_parameter_file_holds_beside_a_urdf(launched, tmp_path):
     urdf, path = tmp_path / 'robot.urdf', tmp_path / 'node.yaml'
     urdf.write_text('<robot name="arm"/>')
