@@ -8,7 +8,7 @@ from setuptools import setup
 
 NAME = 'calib_ros'
 SHARE = f'share/{NAME}'
-BAGS = 'rosbags>=0.10.9'
+BAGS = 'rosbags>=0.11.0'
 
 setup(
     name=NAME,

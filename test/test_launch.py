@@ -18,12 +18,14 @@ from ros_cell import Cell
 from calib_ros.arguments import (
     NODE,
     PARAMETERS,
+    REMAPPED,
     launch_arguments,
     refuse_unknown,
     ros_arguments,
     rviz_config,
 )
 from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
+from calib_ros.sources import STANDARD
 
 ROOT = Path(__file__).parents[1]
 OTHERS = {'start_type_description_service'}
@@ -131,6 +133,11 @@ def test_what_is_not_given_is_not_passed(launched):
     assert node.kwargs['namespace'] is None
     assert node.kwargs['package'] == 'calib_ros'
     assert node.kwargs['executable'] == node.kwargs['name'] == 'calibration_node'
+
+
+def test_the_launch_file_names_what_is_there():
+    assert f'{NODE} = calib_ros.node:main' in (ROOT / 'setup.py').read_text()
+    assert set(REMAPPED) <= {source.topic for source in STANDARD} | {'joint_states'}
 
 
 def test_the_parameter_file_holds_where_no_argument_is_given(launched, tmp_path):
