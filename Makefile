@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint oldest clean
 
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
@@ -16,10 +16,25 @@ lint: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The oldest versions that setup.py allows, on the Python of Ubuntu 24.04; not part of CI.
+OLDEST_PYTHON ?= python3.12
+OLDEST := .venv-oldest
+OLDEST_TESTS ?= $(addprefix test/test_,cli.py config.py export.py identification.py mcap.py \
+	node.py packaging.py replay.py session.py tables.py urdf.py without_rosbags.py)
+
+oldest: $(OLDEST)/installed
+	$(OLDEST)/bin/python -m pytest $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)
+
+$(OLDEST)/installed: setup.py pyproject.toml test/oldest.txt
+	$(OLDEST_PYTHON) -m venv --clear $(OLDEST) || { echo 'needs $(OLDEST_PYTHON) with venv'; exit 1; }
+	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint test/oldest.txt --editable '.[ros,test]'
+	touch $@
+
 $(VENV)/installed: setup.py pyproject.toml
 	$(PYTHON) -m venv $(VENV) || { echo 'needs venv: apt install python3-venv'; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test]'
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo build install log *.egg-info
+	rm -rf $(VENV) $(OLDEST) demo build install log *.egg-info

@@ -8,6 +8,7 @@ from setuptools import setup
 
 NAME = 'calib_ros'
 SHARE = f'share/{NAME}'
+BAGS = 'rosbags>=0.11.0'
 
 setup(
     name=NAME,
@@ -18,11 +19,21 @@ setup(
     maintainer_email='maintainers@calib-ros.invalid',
     packages=[NAME],
     python_requires='>=3.10',
-    install_requires=['setuptools', 'matplotlib', 'numpy', 'PyYAML', 'rosbags', 'scipy'],
+    # The lower bounds are those of Ubuntu 24.04; `make oldest` runs with exactly these.
+    install_requires=[
+        'setuptools',
+        'matplotlib>=3.6.3',
+        'numpy>=1.26.4',
+        'PyYAML>=6.0.1',
+        'scipy>=1.11.4',
+    ],
     extras_require={
+        # Not in Ubuntu: the node and tables run without it.
+        'bags': [BAGS],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         'test': [
+            BAGS,
             'colcon-core',
             'colcon-python-setup-py',
             'colcon-ros',

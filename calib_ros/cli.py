@@ -117,6 +117,13 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
     export.add_argument('--base-link', help='of the URDF: where the arm starts')
     export.add_argument('--tip-link', help='of the URDF: where the arm ends')
+    export.add_argument(
+        '--ur-hash',
+        default='',
+        metavar='calib_...',
+        help='checksum that the driver of Universal Robots prints at its start, for '
+        'ur_kinematics.yaml',
+    )
     export.add_argument('--out', type=Path, required=True, help='folder to write')
     export.add_argument('--force', action='store_true', help='replace the result in --out')
 
@@ -271,10 +278,11 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from calib_ros.config import load_chain, parse_calibration, read_text
+    from calib_ros.config import URDF_SUFFIXES, load_chain, parse_calibration, read_text
     from calib_ros.export import CORRECTED_URDF, FILES, Export, exports
     from calib_ros.files import write_files
     from calib_ros.urdf import corrected_urdf
+    from calib_ros.vendors import VENDOR_FILES, vendor_files
     from calib_ros.waypoints import read_joints
 
     nominal, path = load_chain(options.chain), options.calibration
@@ -283,11 +291,16 @@ def _export(options: argparse.Namespace) -> int:
     if options.measured is not None:
         measured = read_joints(options.measured, chain)
     found = exports(chain, nominal, measured, origin)
+    links = {'base_link': options.base_link, 'tip_link': options.tip_link}
+    urdf = ''
     if options.urdf is not None:
-        links = (options.base_link, options.tip_link)
-        text = corrected_urdf(read_text(options.urdf), chain, *links)
+        urdf = read_text(options.urdf)
+        text = corrected_urdf(urdf, chain, **links)
         found = (*found, Export(f'{options.urdf.stem}{CORRECTED_URDF}', text, 0.0))
-    with results(options, (*FILES, f'*{CORRECTED_URDF}')) as folder:
+    elif Path(options.chain).suffix in URDF_SUFFIXES:
+        urdf = read_text(Path(options.chain))
+    found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
+    with results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as folder:
         write_files(folder, {each.name: each.content for each in found})
     for each in found:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'

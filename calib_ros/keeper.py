@@ -16,6 +16,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros import outgoing
 from calib_ros.archive import Archive
+from calib_ros.broadcast import Broadcast
 from calib_ros.chain import Chain
 from calib_ros.config import calibration_record, parse_calibration, parse_chain, read_text
 from calib_ros.errors import InputError
@@ -26,7 +27,9 @@ from calib_ros.parameters import Given
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
 from calib_ros.session import CalibrationSession
+from calib_ros.sources import parse_sources
 from calib_ros.urdf import corrected_urdf
+from calib_ros.vendors import vendor_files
 
 
 class Published(NamedTuple):
@@ -79,6 +82,9 @@ class Keeper:
         self._calibration = node.create_publisher(String, '~/calibration', latched)
         for name in ('target_filename', 'calibration_filename'):
             self._named(name)  # refused now rather than after a day's work
+        sources = parse_sources(given.settings.sources)
+        in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
+        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links, latched)
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(
@@ -128,10 +134,12 @@ class Keeper:
     def export(self, found: Exportable) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
         record = calibration_record(found.text)
-        forms = exports(found.chain, self._session.chain, found.joints, record)
+        nominal, links = self._session.chain, self._given.links
+        forms = exports(found.chain, nominal, found.joints, record)
+        forms += vendor_files(found.chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
-            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **self._given.links)
+            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **links)
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:
@@ -162,6 +170,7 @@ class Keeper:
         self._published = published
         self._dh_parameters.publish(outgoing.dh_parameters(chain))
         self._calibration.publish(String(data=published.text))
+        self._broadcast.publish(chain, self._session.calibration.world_frame)
 
 
 def _calibration_text(path: Path) -> str:

@@ -17,14 +17,14 @@ ORDER = [
     {'escapes', 'files', 'mcap', 'se3'},
     {'effects', 'description', 'values'},
     {'chain', 'settings'},
-    {'urdf'},
+    {'arguments', 'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
     {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
     {'account', 'following', 'names', 'robust', 'strays', 'waypoints'},
     {'compensation'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
-    {'archive', 'problem'},
+    {'archive', 'problem', 'vendors'},
     {'chance', 'live', 'noise', 'validation'},
     {'identification'},
     {'calibration', 'design', 'salvage', 'selection', 'workspace'},
@@ -33,19 +33,31 @@ ORDER = [
     {'intake', 'report'},
     {'replay'},
     {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
-    {'commands', 'diagnostics', 'guide', 'keeper'},
+    {'broadcast', 'commands', 'diagnostics', 'guide'},
+    {'keeper'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'keeper', 'outgoing', 'parameters'}
+ROS = {
+    'node',
+    'broadcast',
+    'deferred',
+    'diagnostics',
+    'guide',
+    'inputs',
+    'keeper',
+    'outgoing',
+    'parameters',
+}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,
+    'tf2_msgs': ROS,
     'geometry_msgs': ROS,
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config', 'export', 'programs'},
+    'yaml': {'arguments', 'config', 'export', 'programs', 'vendors'},
 }
 
 
