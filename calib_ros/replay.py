@@ -10,11 +10,10 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from calib_ros.errors import InputError
 from calib_ros.intake import Stream, feed
@@ -27,7 +26,10 @@ from calib_ros.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
 
-STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
+
+STORAGES = ('sqlite3', 'mcap')
 STORAGE = ('chunks', 'connections', 'messages_scan', 'path')
 TIMES = ('message_start_time', 'message_end_time')
 CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length')
@@ -129,8 +131,9 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
     """
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
+    library = _rosbag2()
     try:
-        reader = Reader(path)
+        reader = library.Reader(path)
         reader.open()
     except Exception as err:  # a damaged file fails in many ways, in the library and below it
         found = salvage(path)
@@ -217,6 +220,26 @@ def _in_place(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Str
         raise problem
 
 
+def _rosbag2() -> Any:
+    """Return the library that reads and writes bags; nothing but bags needs it.
+
+    Raises
+    ------
+    InputError
+        When it is not installed: Ubuntu does not package it.
+
+    """
+    try:
+        from rosbags import rosbag2
+    except ImportError as err:
+        raise InputError(
+            f'bags need the Python package rosbags, which is not installed ({err}): pip install '
+            'rosbags, in a virtual environment where the system is managed (README, "Bags"); '
+            'tables (--csv) and the node do without'
+        ) from err
+    return rosbag2
+
+
 @cache
 def _typestore() -> Any:
     """Return the library's message types, which take a tenth of a second that few bags need."""
@@ -292,6 +315,7 @@ def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
     """
     if path.exists():
         raise InputError(f'{path} exists already: remove it or choose another name')
+    library = _rosbag2()
     store = _typestore()
     types = store.types
     time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
@@ -316,7 +340,8 @@ def write_bag(path: Path, recording: Recording, storage: str = 'mcap') -> None:
 
     stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
     names = list(recording.joint_names)
-    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
+    plugin = library.StoragePlugin[storage.upper()]
+    with library.Writer(path, version=9, storage_plugin=plugin) as writer:
         joint_connection = writer.add_connection('/joint_states', JOINT_STATE, typestore=store)
         pose_connections = [
             writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)

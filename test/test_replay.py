@@ -104,7 +104,7 @@ def text_message(text='hello'):
 
 def record(path, events, storage='mcap', silent=()):
     """Write (topic, message) in the order given; `silent` topics (topic, type) get none."""
-    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         connections = {
             topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
             for topic, kind in dict(
@@ -660,7 +660,7 @@ LOG_TIMES = {
 def record_in_chunks(path, storage, mode='none', log_time=LOG_TIMES['in order']):
     """Write 300 messages in some chunks of 1 MB, filled with long texts that nobody wants."""
     rng = np.random.default_rng(7)
-    writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if mode != 'none':
         writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
     types = {each.topic: each.type for each in STREAMS.values()} | {'/x': 'std_msgs/msg/String'}
