@@ -14,8 +14,9 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 
 ORDER = [
     {'errors'},
-    {'se3', 'files', 'mcap'},
-    {'effects', 'description', 'values'},
+    {'se3', 'files', 'mcap', 'texts'},
+    {'effects', 'values'},
+    {'description'},
     {'chain', 'settings'},
     {'urdf'},
     {'config', 'differential', 'observations'},
@@ -45,7 +46,7 @@ ONLY = {
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config', 'export', 'programs'},
+    'yaml': {'config', 'export', 'programs', 'texts'},
 }
 
 

@@ -20,7 +20,7 @@ from calib_ros.cli import main
 from calib_ros.config import load_chain
 from calib_ros.journal import Journal
 from calib_ros.messages import JOINT_STATE
-from calib_ros.replay import STORAGES, replay
+from calib_ros.replay import replay
 from calib_ros.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, drive, faulty, random_frame
