@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text files and YAML, within limits.
+"""Text files, tables and YAML, within limits.
 
 A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
 with any number of digits. The stream of its events is looked at before anything is made of it.
@@ -8,12 +8,16 @@ with any number of digits. The stream of its events is looked at before anything
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.errors import CalibrationError, ConfigError, InputError
+
+Row: TypeAlias = Mapping[str, str | None]
 
 LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""
@@ -43,14 +47,46 @@ def read_text(
         Of the type `error`, when it cannot be read, is too large or is not UTF-8.
 
     """
+    return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
+
+
+def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: str = '') -> bytes:
+    """Return the content of a file, as `read_text` does."""
     try:
         with path.open('rb') as file:
             data = file.read(largest + 1)
-        if len(data) <= largest:
-            return data.decode('utf-8-sig')
-    except (OSError, ValueError) as err:
+    except OSError as err:
         raise error(f'cannot read {what}{path}: {err}') from err
-    raise error(f'{what}{path} is larger than {largest // 1_000_000} MB: is it the right file?')
+    if len(data) > largest:
+        raise error(f'{what}{path} is larger than {largest // 10**6} MB: is it the right file?')
+    return data
+
+
+def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
+    """Return bytes as text."""
+    try:
+        return data.decode('utf-8-sig')
+    except UnicodeDecodeError as err:
+        raise error(f'cannot read {where}: {err}') from err
+
+
+def read_rows(text: str, path: Path) -> tuple[Sequence[str], list[tuple[int, Row]]]:
+    """Return the header of a table, and its rows with their lines; cells may be missing.
+
+    Raises
+    ------
+    InputError
+        When it is no table, or has more columns than any.
+
+    """
+    reader = csv.DictReader(io.StringIO(text, newline=''), strict=True)
+    try:
+        header = reader.fieldnames or []
+        if len(header) > MOST_COLUMNS:
+            raise InputError(f'{path} has {len(header)} columns, more than {MOST_COLUMNS}')
+        return header, [(reader.line_num, row) for row in reader]
+    except csv.Error as err:
+        raise InputError(f'cannot read {path}: {err}') from err
 
 
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:
