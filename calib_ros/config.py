@@ -24,7 +24,7 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.settings import Settings
 from calib_ros.texts import parse_yaml
 from calib_ros.urdf import MOST_JOINTS, chain_from_urdf
-from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_number, parse_numbers
+from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_name, parse_number, parse_numbers
 
 CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
@@ -103,14 +103,14 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
         raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')
     try:
         return Chain(
-            name=str(content.get('name', Path(where).stem)),
+            name=parse_name(content.get('name', Path(where).stem), f'{where}: name'),
             convention=content['convention'],
             joints=tuple(_joint(row, f'{where}: joint {k + 1}') for k, row in enumerate(rows)),
             parallel=None if parallel is None else tuple(parallel),
             base=_frame(content.get('base'), f'{where}: base'),
             tool=_frame(content.get('tool'), f'{where}: tool'),
             frames=tuple(
-                (name, _frame(frame, f'{where}: frames.{name}'))
+                (parse_name(name, f'{where}: frames'), _frame(frame, f'{where}: frames.{name}'))
                 for name, frame in _dictionary(content.get('frames'), f'{where}: frames').items()
             ),
             **_gravity(content, where),
@@ -356,7 +356,7 @@ def _joint(row: object, where: str) -> Joint:
     if sign not in (1.0, -1.0):
         raise ConfigError(f'{where}: sign must be 1 or -1, not {sign:g}')
     return Joint(
-        name=str(content['name']),
+        name=parse_name(content['name'], f'{where}: name'),
         type=content.get('type', 'revolute'),
         sign=int(sign),
         com=(centre[0], centre[1], centre[2]),

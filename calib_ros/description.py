@@ -22,7 +22,7 @@ from calib_ros import se3
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT
-from calib_ros.values import LARGEST
+from calib_ros.values import LARGEST, parse_name
 
 MOVING = ('revolute', 'continuous', 'prismatic')
 TYPES = (*MOVING, 'fixed', 'floating', 'planar')
@@ -183,11 +183,13 @@ def parse_urdf(text: str) -> Description:
         reached = {joint.child for joint in outwards}
         loop = ', '.join(joint.name for joint in joints if joint.child not in reached)
         raise ConfigError(f'the links of a URDF are a tree; there is a loop among joints {loop}')
-    return Description(root.get('name') or 'robot', roots[0], links, tuple(outwards))
+    name = parse_name(root.get('name') or 'robot', 'the name of the robot')
+    return Description(name, roots[0], links, tuple(outwards))
 
 
 def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
-    name, kind = element.get('name', ''), element.get('type', '')
+    name = parse_name(element.get('name', ''), 'the name of a joint')
+    kind = element.get('type', '')
     where = f'joint "{name}"'
     if kind not in TYPES:
         raise UnknownNameError(f'type of {where}', kind, TYPES)

@@ -17,6 +17,7 @@ QUATERNION_TOLERANCE = 1e-3
 LARGEST = 1e6
 """Largest number [m or rad] that is measured or set; some devices send the largest float for
 none."""
+LONGEST_NAME = 200
 LARGEST_STAMP = 2**63 - 1
 SMALLEST_SIGMA, LARGEST_SIGMA = 1e-9, 1e6
 """Standard deviations [m or rad] between which a covariance is believed."""
@@ -40,6 +41,16 @@ def parse_number(
     if abs(number) > largest:
         raise error(f'{where} must be at most {largest:g}, not {number:g}')
     return number
+
+
+def parse_name(value: object, where: str) -> str:
+    """Return a name that can stand in a line of a table, a comment or a path."""
+    name = str(value)
+    if not name.isprintable() or len(name) > LONGEST_NAME:
+        raise ConfigError(
+            f'{where} must be printable and have at most {LONGEST_NAME} characters, not {name!r}'
+        )
+    return name
 
 
 def parse_numbers(
