@@ -22,6 +22,8 @@ setup(
     extras_require={
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
+        # Leads `make fuzz` by the branches reached; not built for every Python.
+        'fuzz': ['atheris'],
         'test': [
             'colcon-core',
             'colcon-python-setup-py',

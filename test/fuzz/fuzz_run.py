@@ -45,7 +45,10 @@ def main():
     def run(name):
         arguments = ['--one', name, '--seconds', f'{each:.0f}', '--seed', str(options.seed)]
         done = subprocess.run(
-            [sys.executable, __file__, *arguments], capture_output=True, text=True, errors='replace'
+            [sys.executable, __file__, *arguments],
+            capture_output=True,
+            text=True,
+            errors='replace',
         )
         words = (done.stdout + done.stderr).strip().split('\n')
         counts = [line for line in words if 'runs' in line or 'number_of_executed' in line]

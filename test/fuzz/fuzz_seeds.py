@@ -20,7 +20,8 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 T = STORE.types
 POSE = 'geometry_msgs/msg/PoseStamped'
 URDF = """<robot name="arm">
-  <link name="base"/><link name="upper"><inertial><origin xyz="0 0 1"/><mass value="2"/></inertial></link>
+  <link name="base"/><link name="upper">
+  <inertial><origin xyz="0 0 1"/><mass value="2"/></inertial></link>
   <link name="tool0"/>
   <joint name="a" type="revolute"><parent link="base"/><child link="upper"/>
     <origin xyz="0 0 0.3" rpy="0 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3"/></joint>
@@ -39,8 +40,14 @@ points:
   velocities: [0.0, 1e-3, 0.0]
 ---
 """
-OPTIONS = ('--sigma-position\n0.001\n--fixed\na.a', '--priors\n*.a=0.001', '--mode\ncontinuous',
-           '--sources\n/pose type=PoseStamped device=t', '--model\nratio+backlash', '--folds\n3')
+OPTIONS = (
+    '--sigma-position\n0.001\n--fixed\na.a',
+    '--priors\n*.a=0.001',
+    '--mode\ncontinuous',
+    '--sources\n/pose type=PoseStamped device=t',
+    '--model\nratio+backlash',
+    '--folds\n3',
+)
 
 
 def header(stamp):
@@ -51,17 +58,27 @@ def made(kind, k):
     stamp = k * 10**7
     if kind == JOINT_STATE:
         none = np.zeros(0)
-        return T[kind](header(stamp), ['a', 'b', 'c'], np.array([0.1, 0.2, k // 40 * 0.1]), none, none)
-    point, turn = T['geometry_msgs/msg/Point'](1.0, 2.0, 3.0), T['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0)
+        return T[kind](
+            header(stamp), ['a', 'b', 'c'], np.array([0.1, 0.2, k // 40 * 0.1]), none, none
+        )
+    point, turn = (
+        T['geometry_msgs/msg/Point'](1.0, 2.0, 3.0),
+        T['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+    )
     pose = T['geometry_msgs/msg/Pose'](point, turn)
     covered = T['geometry_msgs/msg/PoseWithCovariance'](pose, np.diag([1e-8] * 6).ravel())
     vector = T['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0)
-    still = T['geometry_msgs/msg/TwistWithCovariance'](T['geometry_msgs/msg/Twist'](vector, vector), np.zeros(36))
+    still = T['geometry_msgs/msg/TwistWithCovariance'](
+        T['geometry_msgs/msg/Twist'](vector, vector), np.zeros(36)
+    )
     rest = {
         POSE: (pose,),
         'geometry_msgs/msg/PoseWithCovarianceStamped': (covered,),
         'geometry_msgs/msg/PointStamped': (point,),
-        'geometry_msgs/msg/TransformStamped': ('target', T['geometry_msgs/msg/Transform'](vector, turn)),
+        'geometry_msgs/msg/TransformStamped': (
+            'target',
+            T['geometry_msgs/msg/Transform'](vector, turn),
+        ),
         'nav_msgs/msg/Odometry': ('target', covered, still),
         'sensor_msgs/msg/Range': (0, 0.0, 0.0, 9.0, 1.5, 0.0),
     }[kind]
@@ -77,7 +94,10 @@ def bag(path, storage, mode, count):
     if mode:
         writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
     with writer:
-        known = {kind: writer.add_connection(f'/{kind[:4]}', kind, typestore=STORE) for kind in (JOINT_STATE, POSE)}
+        known = {
+            kind: writer.add_connection(f'/{kind[:4]}', kind, typestore=STORE)
+            for kind in (JOINT_STATE, POSE)
+        }
         for k in range(1, count):
             for kind, connection in known.items():
                 writer.write(connection, k, serialised(kind, k))
@@ -92,9 +112,17 @@ def put(name, number, data):
 def main():
     position, covariance = np.array([1.0, 2.0, 3.0]), np.diag([1e-8] * 6)
     samples = [
-        Sample(k * 10**9, np.array([0.1 * k, 0.2, 0.3]), position=position, rotation=np.eye(3),
-               covariance=covariance if k % 2 else None, approach=np.ones(3), device='d', target=f't{k % 2}',
-               validation=k == 3)
+        Sample(
+            k * 10**9,
+            np.array([0.1 * k, 0.2, 0.3]),
+            position=position,
+            rotation=np.eye(3),
+            covariance=covariance if k % 2 else None,
+            approach=np.ones(3),
+            device='d',
+            target=f't{k % 2}',
+            validation=k == 3,
+        )
         for k in range(1, 5)
     ]
     rows = '\n'.join(','.join(cells(sample)) for sample in samples)
@@ -106,15 +134,37 @@ def main():
     put('table', 3, 'q1,q2,q3,location,socket\n0.1,0.2,0.3,L,1\n0.2,0.2,0.3,L,2\n')
     put('waypoints', 0, 'q1,q2,q3\n0.1,0.2,0.3\n')
     put('waypoints', 1, 'x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n')
-    put('program_csv', 0, 'name,q1,q2,q3,s1,s2,s3\nP1,0.1,0.2,0.3,1,-1,0\n"P,2",0.2,0.2,0.3,1,1,1\n')
+    put(
+        'program_csv',
+        0,
+        'name,q1,q2,q3,s1,s2,s3\nP1,0.1,0.2,0.3,1,-1,0\n"P,2",0.2,0.2,0.3,1,1,1\n',
+    )
     put('program_yaml', 0, TRAJECTORY)
     put('chain', 0, dump_chain(ARM.with_effects(('a.ratio',))))
-    put('chain', 1, 'convention: modified\njoints:\n- &j {name: a, a: 0, alpha: 0, d: 0, theta: 0}\n- {<<: *j, name: b}\n'
-                    'tool: {xyz: [0, 0, 1e-1], quat_xyzw: [0, 0, 0, 1], fixed: true}\n')
-    record = {'accepted': True, 'rms_mm_after': 0.1, 'world_frame': 't', 'nominal': nominal_record(ARM)}
+    put(
+        'chain',
+        1,
+        'convention: modified\njoints:\n- &j {name: a, a: 0, alpha: 0, d: 0, theta: 0}\n'
+        '- {<<: *j, name: b}\n'
+        'tool: {xyz: [0, 0, 1e-1], quat_xyzw: [0, 0, 0, 1], fixed: true}\n',
+    )
+    record = {
+        'accepted': True,
+        'rms_mm_after': 0.1,
+        'world_frame': 't',
+        'nominal': nominal_record(ARM),
+    }
     put('calibration', 0, dump_chain(ARM.with_offsets({'a.d': 1e-3}), record))
-    put('result', 0, json.dumps({'covariance': {'names': ['a.d', 'b.a'], 'matrix': [[1e-8, 0], [0, 1e-8]]},
-                                 'validation': {'after': {'rms_mm': 0.1}}}))
+    put(
+        'result',
+        0,
+        json.dumps(
+            {
+                'covariance': {'names': ['a.d', 'b.a'], 'matrix': [[1e-8, 0], [0, 1e-8]]},
+                'validation': {'after': {'rms_mm': 0.1}},
+            }
+        ),
+    )
     put('urdf', 0, URDF)
     for k, text in enumerate(OPTIONS):
         put('settings', k, text)
@@ -122,10 +172,18 @@ def main():
     put('command', 1, 'chain\nur10e')
     put('command', 2, 'verify\nm.csv\n--chain\nur10e\n--calibration\nc\n--tolerance\n0.1')
     put('command', 3, 'workspace\nresult\n--chain\nur10e\n--out\no\n--joint-box\n1\n2')
-    put('message', 0, MARK.join(bytes([k % 7]) + serialised([JOINT_STATE, *DECODERS][k % 7], 20 + k) for k in range(14)))
+    put(
+        'message',
+        0,
+        MARK.join(
+            bytes([k % 7]) + serialised([JOINT_STATE, *DECODERS][k % 7], 20 + k) for k in range(14)
+        ),
+    )
     put('message', 1, MARK.join(b'\0' + serialised(JOINT_STATE, k) for k in range(1, 9)))
     with tempfile.TemporaryDirectory() as name:
-        for k, (storage, mode) in enumerate([('mcap', None), ('mcap', 'STORAGE'), ('sqlite3', None)]):
+        for k, (storage, mode) in enumerate(
+            [('mcap', None), ('mcap', 'STORAGE'), ('sqlite3', None)]
+        ):
             path = Path(name) / 'bag'
             bag(path, storage, mode, 12)
             (file,) = (each for each in path.iterdir() if each.suffix in ('.mcap', '.db3'))
