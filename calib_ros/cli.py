@@ -14,7 +14,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -224,7 +224,8 @@ def _identify(options: argparse.Namespace) -> int:
         result = session.identify()
         account = session.account()
         read = f'{replayed}; {account}'
-        samples = {'bag': asdict(replayed)} | account.as_document()
+        counts = {'recorded': replayed.recorded, 'read': replayed.read}
+        samples = counts | account.as_document()
         lost = replayed.refusals(account, options.largest_loss)
         result = replace(result, refusals=(*result.refusals, *lost))
     for warning in warnings:

@@ -84,7 +84,7 @@ def _unpack_file(file: Path, target: Path) -> None:
                 if left < 0:
                     raise InputError(f'{file} unpacks to {mcap.LARGEST_RATIO} times its size')
                 out.write(part)
-    except InputError:
+    except (InputError, OSError):  # the latter of a full disk
         raise
     except Exception:  # decompressors have errors of their own; what is missing will be told
         return
@@ -108,7 +108,7 @@ def check(path: Path) -> None:
                 _check_layout(connection)
                 _check_rows(connection)
         elif not mcap.is_indexed(file):
-            raise ValueError(NOT_CLOSED)
+            raise ValueError('it has no index, and no messages could be found without')
 
 
 @dataclass

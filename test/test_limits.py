@@ -422,8 +422,8 @@ def test_identify_says_what_it_read_and_refuses_half_a_bag(tmp_path, monkeypatch
     assert main([*whole, '--out', 'whole']) == 0
     out = capsys.readouterr().out
     document = json.loads((tmp_path / 'whole' / 'result.json').read_text())
-    count = document['samples']['bag']['recorded']
-    assert document['samples']['bag']['read'] == count
+    count = document['samples']['recorded']
+    assert document['samples']['read'] == count > 0
     assert f'read {count} of {count} messages' in out
     (file,) = (tmp_path / 'bag').glob('*.mcap')
     shutil.copytree('bag', 'half')
