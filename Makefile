@@ -3,13 +3,19 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint oldest clean
+.PHONY: demo test fuzz lint oldest clean
 
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
 
 test: $(VENV)/installed
 	$(BIN)/python -m pytest $(PYTEST_ARGUMENTS)
+
+FUZZ_SECONDS ?= 600
+fuzz: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: atheris \
+	    || echo 'no atheris for this Python: hypothesis alone'
+	OMP_NUM_THREADS=1 $(BIN)/python test/fuzz/fuzz_run.py --seconds $(FUZZ_SECONDS)
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -32,6 +32,8 @@ setup(
         'bags': [BAGS],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
+        # Leads `make fuzz` by the branches reached; not built for every Python.
+        'fuzz': ['atheris'],
         'test': [
             BAGS,
             'colcon-core',

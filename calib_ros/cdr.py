@@ -132,7 +132,8 @@ def readings(
     else:
         good &= (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
     if numbers.shape[1] >= 7:
-        length = np.linalg.norm(numbers[:, 3:7], axis=1)
+        with np.errstate(over='ignore'):  # of what is not good
+            length = np.linalg.norm(numbers[:, 3:7], axis=1)
         good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
     if numbers.shape[1] > 7:
         good &= _usable_covariances(numbers[:, 7:])

@@ -5,24 +5,35 @@
 from __future__ import annotations
 
 import itertools
+import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
+from mmap import ACCESS_READ, mmap
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import InputError
+from calib_ros.account import Account
+from calib_ros.errors import InputError, shortened
 from calib_ros.files import whole_folder, write_file
 from calib_ros.intake import Stream, feed
-from calib_ros.mcap import logged
+from calib_ros.mcap import (
+    LARGEST_CHUNK,
+    LARGEST_RATIO,
+    logged,
+    unindexed,
+    unpacked,
+    unpacked_size,
+)
 from calib_ros.messages import DECODERS, JOINT_STATE
 from calib_ros.observations import Observations
-from calib_ros.salvage import recorded, salvage
+from calib_ros.salvage import NOT_CLOSED, Salvage, check, recorded, salvage, unpacked_files
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -32,12 +43,17 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 STORAGES = ('sqlite3', 'mcap')
-STORAGE = ('chunks', 'connections', 'messages_scan', 'path')
+STORAGE = ('chunks', 'connections', 'path')
 TIMES = ('message_start_time', 'message_end_time')
-CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length')
+CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompressed_size')
 """What the library does not promise: without them, it is asked for the messages itself."""
 BATCH = 2000
 """Messages that are decoded at once."""
+LARGEST_MESSAGE = 65_536
+"""Bytes of a message; a joint state of a thousand joints has fewer."""
+ALLOW = 'take the rest all the same with --largest-loss'
+_LOSS = re.compile(r'stamp|lateness|buffer full|memory')
+_TWICE = re.compile(r'same stamp twice|is there already')
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
 
@@ -120,8 +136,55 @@ def _contents(available: Mapping[str, str]) -> str:
     return ', '.join(f'{t} ({kind})' for t, kind in sorted(available.items())) or 'nothing'
 
 
-def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
-    """Feed a bag to a session; return warnings about what could not be read.
+@dataclass(frozen=True)
+class Replayed:
+    """What was read of a bag, and warnings about the rest.
+
+    `recorded` is how many messages it should hold, None where that is not known, and `read` how
+    many of these could be read; a message that cannot be decoded was not read.
+    """
+
+    recorded: int | None
+    read: int
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """Return in words what was read."""
+        if self.recorded is None:
+            return f'read {self.read} messages of the bag; how many are lost is not known'
+        return f'read {self.read} of {self.recorded} messages of the bag'
+
+    def refusals(self, account: Account, largest_loss: float) -> tuple[str, ...]:
+        """Return why a result must not be accepted: more was lost than a share allows.
+
+        Lost is what could not be read and, of joint states and measurements each, what was
+        dropped for its stamp or for want of room. What the device did not see is not.
+        """
+        if self.recorded is None and largest_loss < 1.0:
+            return (f'how much of the bag is lost is not known, {ALLOW} 1',)
+        lost = {'of the messages could not be read': _share(self.recorded, self.read)}
+        for name, all_of_them in (('joints', account.joint_states), ('poses', account.poses)):
+            dropped = sum(
+                count
+                for cause, count in account.dropped.items()
+                if cause.startswith(name) and _LOSS.search(cause) and not _TWICE.search(cause)
+            )
+            cause = f'of the {name} were dropped for their stamps or for want of room'
+            lost[cause] = _share(all_of_them, all_of_them - dropped)
+        return tuple(
+            f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}'
+            for cause, share in lost.items()
+            if share > largest_loss
+        )
+
+
+def _share(expected: int | None, found: int) -> float:
+    """Return the share that is missing."""
+    return max(0.0, 1.0 - found / expected) if expected else 0.0
+
+
+def replay(path: Path, session: CalibrationSession) -> Replayed:
+    """Feed a bag to a session; return what could be read.
 
     Parameters
     ----------
@@ -133,93 +196,148 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
     """
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
+    with unpacked_files(path) as folder:
+        return _replay(path, folder, session)
+
+
+def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
+    """Feed the files in a folder, which are those of a bag or were unpacked from it."""
     library = _rosbag2()
     try:
-        reader = library.Reader(path)
+        check(folder)
+        reader = library.Reader(folder)
         reader.open()
     except Exception as err:  # a damaged file fails in many ways, in the library and below it
-        found = salvage(path)
+        found = salvage(folder)
         if found is None:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
-        topics = Topics.choose(found.topics, session.settings)
-        count, problem = _feed(session, topics.of(found.messages))
-        total = recorded(path if path.is_dir() else path.parent)
-        lost = 'how many are lost is not known'
-        if total is not None:
-            lost = f'{total - len(found.messages)} of {total} messages are lost'
-        return (
-            f'{path} is damaged ({problem or found.problem}): {count} messages could be read '
-            f'and are used, {lost}',
-        )
+        return _salvaged(path, folder, found, session)
     with closing(reader):
         available = {c.topic: c.msgtype for c in reader.connections}
         topics = Topics.choose(available, session.settings)
-        expected = sum(c.msgcount for c in reader.connections if c.topic in topics.types)
+        counts = [c.msgcount for c in reader.connections if c.topic in topics.types]
+        expected = sum(count for count in counts if isinstance(count, int) and count > 0)
         count, problem = _feed(session, read(reader, topics.streams))
     if problem is not None and count == 0:
-        found = salvage(path)
+        found = salvage(folder)
         if found is not None:
-            count, _ = _feed(session, topics.of(found.messages))
+            count, _ = _feed(session, topics.of(found.messages()))
     if problem is None:
-        return session.warnings
-    return (
-        *session.warnings,
-        f'{path} is damaged ({problem}): {expected - count} of {expected} messages are lost',
+        return Replayed(expected, count, session.warnings)
+    lost = max(0, expected - count)
+    damaged = f'{path} is damaged ({shortened(problem)}): {lost} of {expected} messages are lost'
+    return Replayed(expected, count, (*session.warnings, damaged))
+
+
+def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSession) -> Replayed:
+    """Feed what could be read of a bag without the library."""
+    topics = Topics.choose(found.topics, session.settings)
+    count, problem = _feed(session, topics.of(found.messages()))
+    problem = problem or found.problem
+    total = recorded(folder if folder.is_dir() else folder.parent)
+    if total is None and found.whole:
+        total = found.count
+    if not problem and total == found.count:
+        return Replayed(total, found.count, session.warnings)
+    lost = 'how many are lost is not known'
+    if total is not None and not (total == found.count and problem == NOT_CLOSED):
+        lost = f'{max(0, total - found.count)} of {total} messages are lost'
+    damaged = (
+        f'{path} is damaged ({shortened(problem)}): {count} messages could be read and are used, '
+        f'{lost}'
     )
+    return Replayed(total, found.count, (*session.warnings, damaged))
 
 
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
     """Return the messages of an open bag on some topics, in the order in which they were logged.
 
-    Those of mcap files come chunk by chunk where each chunk ends before the next begins, and as
-    they stand in the file where it has none. All others come as the library merges them, which
-    takes twice as long for mcap.
+    Those of mcap files come chunk by chunk, merged where chunks overlap in time, and as they
+    stand in the file where it has none. All others come as the library reads them.
     """
     storage = getattr(reader, 'storage', None)
     storages = getattr(storage, 'storages', [storage])
-    if reader.compression_mode != 'message' and all(map(_is_consecutive, storages)):
-        return itertools.chain.from_iterable(_in_place(each, streams) for each in storages)
-    connections = [c for c in reader.connections if c.topic in streams]
-    return (
-        (streams[c.topic], data)
-        for c, _, data in reader.messages(connections)
-        if c.msgtype == streams[c.topic].type
-    )
+    if not all(map(_is_known, storages)):
+        connections = [c for c in reader.connections if c.topic in streams]
+        return (
+            (streams[c.topic], data)
+            for c, _, data in reader.messages(connections)
+            if c.msgtype == streams[c.topic].type
+        )
+    found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
+    if reader.compression_mode == 'message':
+        return ((stream, unpacked(data, 'zstd', LARGEST_MESSAGE)) for stream, data in found)
+    return found
 
 
-def _is_consecutive(storage: Any) -> bool:
-    """Return whether it is an mcap file of which each chunk ends before the next one begins."""
+def _is_known(storage: Any) -> bool:
+    """Return whether it is a database, or an mcap file with what is needed of its index."""
+    if hasattr(storage, 'dbconn'):
+        return True
     if not all(hasattr(storage, name) for name in STORAGE):
         return False
-    if not all(hasattr(each, name) for each in storage.chunks for name in CHUNK):
-        return False
-    pairs = itertools.pairwise(storage.chunks)
-    return all(a.message_end_time <= b.message_start_time for a, b in pairs)
+    return all(hasattr(each, name) for each in storage.chunks for name in CHUNK)
 
 
-def _in_place(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-    """Yield the messages of an mcap file; what is wrong with a chunk is raised at the end."""
-    channels = {
-        each.id: streams[each.topic]
+def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+    """Yield the messages of a file; what is wrong with a chunk is raised at the end."""
+    wanted = [
+        each
         for each in storage.connections
         if each.topic in streams and each.msgtype == streams[each.topic].type
-    }
-    if not storage.chunks:
-        wanted = [each for each in storage.connections if each.id in channels]
-        yield from ((channels[c.id], data) for c, _, data in storage.messages_scan(wanted))
-    problem = None
+    ]
+    channels = {each.id: streams[each.topic] for each in wanted}
+    if hasattr(storage, 'dbconn'):
+        if wanted:
+            yield from ((channels[c.id], data) for c, _, data in storage.messages(wanted))
+        return
     with storage.path.open('rb') as file:
-        for chunk in storage.chunks:
-            counts = chunk.channel_count  # empty where the recorder wrote no index of messages
-            if counts and not any(counts.get(key) for key in channels):
-                continue
-            file.seek(chunk.chunk_start_offset)
-            try:
-                yield from logged(file.read(chunk.chunk_length), channels)
-            except Exception as err:  # see `replay`
-                problem = err
+        if not storage.chunks:
+            with closing(mmap(file.fileno(), 0, access=ACCESS_READ)) as content:
+                yield from unindexed(content, channels)
+            return
+        left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
+        problem: Exception | None = None
+        for overlapping in _together(storage.chunks, channels):
+            found: list[tuple[int, Stream, bytes]] = []
+            for chunk in overlapping:
+                file.seek(chunk.chunk_start_offset)
+                try:
+                    data = file.read(chunk.chunk_length)
+                    left -= unpacked_size(data)
+                    if left < 0:
+                        raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+                    messages, wrong = logged(data, channels)
+                except Exception as err:  # see `replay`
+                    messages, wrong = [], err
+                found += messages
+                problem = wrong or problem
+            if len(overlapping) > 1:
+                found.sort(key=itemgetter(0))
+            yield from ((stream, data) for _, stream, data in found)
     if problem is not None:
         raise problem
+
+
+def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
+    """Yield chunks that hold messages on some channels, those that overlap in time together.
+
+    As far as they fit into memory; messages may come in any order.
+    """
+    together: list[Any] = []
+    end = size = 0
+    for chunk in sorted(chunks, key=attrgetter('message_start_time', 'chunk_start_offset')):
+        counts = chunk.channel_count  # empty where the recorder wrote no index of messages
+        if counts and not any(counts.get(key) for key in channels):
+            continue
+        size += chunk.uncompressed_size
+        if together and (chunk.message_start_time >= end or size > LARGEST_CHUNK):
+            yield sorted(together, key=attrgetter('chunk_start_offset'))
+            together, end, size = [], 0, chunk.uncompressed_size
+        together.append(chunk)
+        end = max(end, chunk.message_end_time)
+    if together:
+        yield sorted(together, key=attrgetter('chunk_start_offset'))
 
 
 def _rosbag2() -> Any:
@@ -266,8 +384,15 @@ def _feed(
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        problems = feed(session, batch, _deserialised)
-        count += len(batch) - len(problems)
+        usable = [
+            (stream, data)
+            for stream, data in batch
+            if isinstance(data, bytes) and len(data) <= LARGEST_MESSAGE
+        ]
+        problems = feed(session, usable, _deserialised)
+        count += len(usable) - len(problems)
+        if len(usable) < len(batch):
+            problems.append(f'messages without data, or of more than {LARGEST_MESSAGE} bytes')
         problem = (problem, *problems)[-1]
     session.finish()
     return count, problem

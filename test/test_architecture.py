@@ -14,8 +14,9 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 
 ORDER = [
     {'errors'},
-    {'escapes', 'files', 'mcap', 'se3'},
-    {'effects', 'description', 'values'},
+    {'escapes', 'files', 'mcap', 'se3', 'texts'},
+    {'effects', 'values'},
+    {'description'},
     {'chain', 'settings'},
     {'arguments', 'urdf'},
     {'config', 'differential', 'observations'},
@@ -57,7 +58,7 @@ ONLY = {
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'arguments', 'config', 'export', 'programs', 'vendors'},
+    'yaml': {'arguments', 'config', 'export', 'programs', 'texts', 'vendors'},
 }
 
 

@@ -403,7 +403,9 @@ def test_a_damaged_bag_warns_and_says_so_in_the_report(run, tmp_path):
     (file,) = bag.glob('*.mcap')
     file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
     out = tmp_path / 'out'
-    status, said, err = run('identify', bag, '--chain', 'ur5e', '--out', out, '--json')
+    given = ('identify', bag, '--chain', 'ur5e', '--json', '--out')
+    assert run(*given, tmp_path / 'refused')[0] == 3
+    status, said, err = run(*given, out, '--largest-loss', '0.5')
     assert status == 0
     assert err.startswith('warning: ')
     assert err.count('\n') == 1
