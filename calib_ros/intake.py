@@ -73,7 +73,7 @@ def feed(
         Makes a message of bytes and a message type.
 
     """
-    groups = _decoded(batch)
+    groups = decoded(batch)
     alone = np.ones(len(batch), dtype=bool)
     for group in groups:
         alone[group.places] = False
@@ -104,7 +104,7 @@ class DecodingError(Exception):
     """A message that cannot be decoded."""
 
 
-def _decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
+def decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
     """Return the messages that are laid out like others of their stream and length."""
     alike: dict[tuple[str, int], list[int]] = {}
     for place, (stream, data) in enumerate(batch):

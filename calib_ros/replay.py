@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,15 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from calib_ros.errors import InputError
 from calib_ros.intake import Stream, feed
 from calib_ros.mcap import logged
-from calib_ros.messages import DECODERS, JOINT_STATE
+from calib_ros.messages import JOINT_STATE
 from calib_ros.observations import Observations
 from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
-from calib_ros.settings import Settings
-from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
+from calib_ros.sources import VALIDATION
+from calib_ros.topics import check_joints, choose
+
+Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
 STORAGE = ('chunks', 'connections', 'messages_scan', 'path')
@@ -36,84 +38,6 @@ BATCH = 2000
 """Messages that are decoded at once."""
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Topics of a bag to replay: their message types, and the sources of measurements."""
-
-    types: Mapping[str, str]
-    sources: Mapping[str, Source]
-
-    @classmethod
-    def choose(cls, available: Mapping[str, str], settings: Settings) -> Topics:
-        """Choose topics by type from those available (topic to type), unless they are named.
-
-        Raises
-        ------
-        InputError
-            When there is none or more than one; it lists the candidates.
-
-        """
-        named = settings.joint_topics
-        joints = [topic for topic, kind in available.items() if kind == JOINT_STATE]
-        if named:
-            for topic in named:
-                if topic not in joints:
-                    raise _no_topic(f'"{topic}"', (JOINT_STATE,), available)
-            joints = list(named)
-        elif not joints:
-            raise _no_topic('joint topic', (JOINT_STATE,), available)
-        sources = parse_sources(settings.sources)
-        if not sources:
-            sources = _found(available)
-        for source in sources:
-            kind = available.get(source.topic, '')
-            if kind not in DECODERS or source.type not in ('', kind):
-                expected = (source.type,) if source.type else tuple(DECODERS)
-                raise _no_topic(f'"{source.topic}"', expected, available)
-        if all(source.validation for source in sources):
-            raise _no_topic('pose topic', tuple(DECODERS), available)
-        chosen = {source.topic: source for source in sources}
-        return cls({topic: available[topic] for topic in (*joints, *chosen)}, chosen)
-
-    @property
-    def streams(self) -> dict[str, Stream]:
-        """Return what comes on each topic."""
-        return {
-            topic: Stream(topic, k, self.sources.get(topic)) for topic, k in self.types.items()
-        }
-
-    def of(self, messages: Iterable[tuple[str, bytes]]) -> Iterator[tuple[Stream, bytes]]:
-        """Return those of some messages that are on these topics."""
-        streams = self.streams
-        return ((streams[topic], data) for topic, data in messages if topic in streams)
-
-
-def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
-    """Return the sources of a bag by their types; one at most is fitted."""
-    sources = [
-        parse_source(f'{topic} type={kind}')
-        for topic, kind in available.items()
-        if kind in DECODERS
-    ]
-    fitted = sorted(source.topic for source in sources if not source.validation)
-    if len(fitted) > 1:
-        raise InputError(
-            'the bag has several pose topics, choose one or more with --sources: '
-            f'{", ".join(fitted)}; it holds {_contents(available)}'
-        )
-    return tuple(sources)
-
-
-def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
-    return InputError(
-        f'the bag has no {what} of type {" or ".join(types)}; it holds {_contents(available)}'
-    )
-
-
-def _contents(available: Mapping[str, str]) -> str:
-    return ', '.join(f'{t} ({kind})' for t, kind in sorted(available.items())) or 'nothing'
 
 
 def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
@@ -136,8 +60,9 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         found = salvage(path)
         if found is None:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
-        topics = Topics.choose(found.topics, session.settings)
-        count, problem = _feed(session, topics.of(found.messages))
+        streams = choose(found.topics, session.settings)
+        _check_joints(session, streams, found.on)
+        count, problem = _feed(session, found.on(streams))
         total = recorded(path if path.is_dir() else path.parent)
         lost = 'how many are lost is not known'
         if total is not None:
@@ -147,20 +72,30 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
             f'and are used, {lost}',
         )
     with closing(reader):
-        available = {c.topic: c.msgtype for c in reader.connections}
-        topics = Topics.choose(available, session.settings)
-        expected = sum(c.msgcount for c in reader.connections if c.topic in topics.types)
-        count, problem = _feed(session, read(reader, topics.streams))
+        streams = choose({c.topic: c.msgtype for c in reader.connections}, session.settings)
+        expected = sum(c.msgcount for c in reader.connections if c.topic in streams)
+        _check_joints(session, streams, partial(read, reader))
+        count, problem = _feed(session, read(reader, streams))
     if problem is not None and count == 0:
         found = salvage(path)
         if found is not None:
-            count, _ = _feed(session, topics.of(found.messages))
+            _check_joints(session, streams, found.on)
+            count, _ = _feed(session, found.on(streams))
     if problem is None:
         return session.warnings
     return (
         *session.warnings,
         f'{path} is damaged ({problem}): {expected - count} of {expected} messages are lost',
     )
+
+
+def _check_joints(
+    session: CalibrationSession, streams: Mapping[str, Stream], messages_on: Reading
+) -> None:
+    """Refuse several topics of the same joints, unless they were named."""
+    joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
+    if len(joints) > 1 and not session.settings.joint_topics:
+        check_joints(messages_on(joints), session.joint_names, _deserialised)
 
 
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:

@@ -11,10 +11,14 @@ from __future__ import annotations
 import re
 import sqlite3
 import struct
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from calib_ros import mcap
+
+Stream = TypeVar('Stream')
 
 
 def recorded(path: Path) -> int | None:
@@ -34,6 +38,10 @@ class Salvage:
     problem: str = 'the recording was not closed'
     topics: dict[str, str] = field(default_factory=dict)
     messages: list[tuple[str, bytes]] = field(default_factory=list)
+
+    def on(self, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+        """Yield the messages on some topics, as what these carry."""
+        return ((streams[topic], data) for topic, data in self.messages if topic in streams)
 
 
 def salvage(path: Path) -> Salvage | None:

@@ -12,6 +12,12 @@ from calib_ros.messages import DECODERS
 
 VALIDATION = 'validation_'
 """Topics whose last name starts so hold measurements that judge the result, never fitted."""
+MARKERS = {
+    'status': 'std_msgs/msg/String',
+    'calibration': 'std_msgs/msg/String',
+    'dh_parameters': 'std_msgs/msg/Float64MultiArray',
+}
+"""Topics that together tell that what is above them is one of our nodes."""
 DISTANCE = 'distance'
 """Device of distances that name none: their origin is not that of a tracker."""
 

@@ -31,6 +31,7 @@ ORDER = [
     {'candidates', 'placement', 'verification'},
     {'planning', 'plots', 'session', 'testposes'},
     {'intake', 'report'},
+    {'topics'},
     {'replay'},
     {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
     {'commands', 'diagnostics', 'guide', 'keeper'},

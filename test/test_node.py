@@ -56,6 +56,7 @@ from calib_ros.settings import Settings
 from calib_ros.simulation import Cell as SimulatedCell
 from calib_ros.simulation import faulty, measure, random_frame
 from calib_ros.sources import STANDARD
+from calib_ros.topics import outputs
 
 SHIPPED = Path(__file__).parents[1] / 'config' / 'calibration_node.yaml'
 
@@ -795,3 +796,18 @@ def test_the_launch_file_names_what_is_there():
     assert {'share', 'calib_ros', 'config', 'calibration_node.yaml'} - {'share'} <= constants
     remapped = [pair.elts[0].value for pair in given['remappings'].elts]
     assert set(remapped) <= {source.topic for source in STANDARD} | {'joint_states'}
+
+
+def test_recordings_of_all_topics_tell_what_the_node_published(tmp_path):
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        node = cell.start(
+            namespace='/hall/left', remap=('__node:=calib',), chain='ur10e', data_dir=str(tmp_path)
+        )
+        found = cell.peer.get_publisher_names_and_types_by_node
+        own = {}
+        cell.spin_until(lambda: own.update(found('calib', '/hall/left')) or len(own) > 9)
+        assert node.get_fully_qualified_name() == '/hall/left/calib'
+    available = {topic: kinds[0] for topic, kinds in own.items()}
+    private = {topic for topic in available if topic.startswith('/hall/left/calib/')}
+    assert {topic.rpartition('/')[2] for topic in private} >= {'corrected_pose', 'next_pose'}
+    assert outputs(available | {'/hall/left/measured_pose': 'x'}) == private
