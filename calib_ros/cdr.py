@@ -25,6 +25,7 @@ from calib_ros.messages import (
     JointReadings,
     MessageError,
     Readings,
+    frame_name,
     measured_covariance,
 )
 from calib_ros.se3 import FloatArray
@@ -86,14 +87,8 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
     names = rows[:, _HEAD + _STAMP : begin]
     if (rows[:, :2] != rows[0, :2]).any() or (names != names[0]).any():
         return None
-    stamps = _numbers(rows, _HEAD, '<u4', 2).astype(np.int64)
     numbers = _numbers(rows, begin, dtype, count)
-    seconds = stamps[:, 0].astype(np.uint32).view(np.int32)
-    return Batch(
-        seconds.astype(np.int64) * 1_000_000_000 + stamps[:, 1],
-        strings,
-        numbers.astype(np.float64),
-    )
+    return Batch(_stamps(_numbers(rows, _HEAD, '<u4', 2)), strings, numbers.astype(np.float64))
 
 
 def readings(
@@ -138,6 +133,74 @@ def readings(
     return Readings(batch.stamps_ns[good], frame_id, child, distance, numbers[good]), good
 
 
+@dataclass(frozen=True, eq=False)
+class Alike:
+    """TFMessages that are laid out alike and name the same frames: which of a batch they are.
+
+    `links` names parent and child frame of each transform in them.
+    """
+
+    which: NDArray[np.intp]
+    links: tuple[tuple[str, str], ...]
+    _rows: NDArray[np.uint8]
+    _places: tuple[tuple[int, int], ...]  # of the stamps and of the numbers
+
+    def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
+        """Return stamps (N,) and numbers (N, 7) of one transform of each, and which are usable."""
+        begin, numbers_begin = self._places[k]
+        numbers = _numbers(self._rows, numbers_begin, '<f8', 7).astype(np.float64)
+        good = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
+        length = np.linalg.norm(numbers[:, 3:], axis=1)
+        good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
+        return _stamps(_numbers(self._rows, begin, '<u4', 2)), numbers, good
+
+    def ends(self, k: int) -> tuple[int, int]:
+        """Return the first and the last stamp of one transform of each."""
+        begin = self._places[k][0]
+        first, last = _stamps(_numbers(self._rows[[0, -1]], begin, '<u4', 2)).tolist()
+        return first, last
+
+
+def transforms(blobs: Sequence[bytes]) -> list[Alike]:
+    """Return what is in TFMessages of one length; those that cannot be read are in none."""
+    if not blobs[0]:
+        return []
+    rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), len(blobs[0]))
+    rest = np.flatnonzero((rows[:, :2] == tuple(LITTLE_ENDIAN)).all(axis=1))
+    found = []
+    while len(rest):
+        try:
+            links, places, names = _transform_layout(blobs[rest[0]])
+        except (struct.error, UnicodeDecodeError):
+            rest = rest[1:]
+            continue
+        equal = (rows[np.ix_(rest, names)] == rows[rest[0], names]).all(axis=1)
+        found.append(Alike(rest[equal], links, rows[rest[equal]], places))
+        rest = rest[~equal]
+    return found
+
+
+def _transform_layout(
+    blob: bytes,
+) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[int, int], ...], NDArray[np.intp]]:
+    """Return the links, the places of their stamps and numbers, and those of all names."""
+    count, at = _integer(blob, _HEAD)
+    links, places, names = [], [], [np.arange(_HEAD, at)]
+    for _ in range(count):
+        stamp = _aligned(at, 4)
+        parent, middle = _string(blob, stamp + _STAMP)
+        begin = _aligned(middle, 4)
+        child, end = _string(blob, begin)
+        numbers = _aligned(end, 8)
+        at = numbers + 56
+        if at > len(blob):
+            raise struct.error
+        names += [np.arange(stamp + _STAMP, middle), np.arange(begin, end)]
+        links.append((frame_name(parent), frame_name(child)))
+        places.append((stamp, numbers))
+    return tuple(links), tuple(places), np.concatenate(names)
+
+
 def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:
     """Return (N,) which covariances (N, 36) are none or usable; mostly all are the same."""
     usable = np.ones(len(rows), dtype=bool)
@@ -148,6 +211,12 @@ def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:
         except MessageError:
             usable[begin:end] = False
     return usable
+
+
+def _stamps(times: NDArray[np.generic]) -> Stamps:
+    """Return stamps (N,) [ns] of signed seconds and nanoseconds (N, 2)."""
+    seconds, nanoseconds = times[:, 0].view(np.int32), times[:, 1]
+    return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
 
 
 def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:

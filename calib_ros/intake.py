@@ -5,17 +5,27 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.cdr import readings
-from calib_ros.messages import JointReading, JointReadings, Readings
+from calib_ros.cdr import readings, transforms
+from calib_ros.messages import (
+    DECODERS,
+    TRANSFORM,
+    TRANSFORMS,
+    JointReading,
+    JointReadings,
+    MessageError,
+    Readings,
+    frame_name,
+)
 from calib_ros.session import CalibrationSession
 from calib_ros.sources import Source
+from calib_ros.transforms import STATIC, Links
 
 WINDOW = 1024
 """Messages that are looked at at once."""
@@ -23,11 +33,41 @@ WINDOW = 1024
 
 @dataclass(frozen=True)
 class Stream:
-    """What comes on one topic: its message type, and what it measures; None for joint states."""
+    """What comes on one topic: its message type, and what it measures; None for joint states.
+
+    A topic of transforms between frames may measure several things, or hold what stands still.
+    """
 
     topic: str
     type: str
     source: Source | None = None
+    links: Links | None = None
+
+    @property
+    def still(self) -> bool:
+        """Tell whether it holds links that stand still."""
+        return self.links is not None and self.topic != self.links.topic
+
+
+def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream]:
+    """Return the streams of sources; message types (by topic) where they name none."""
+    streams = []
+    linked: dict[str, list[Source]] = {}
+    for source in sources:
+        kind = source.type or types[source.topic]
+        if kind == TRANSFORMS:
+            linked.setdefault(source.topic, []).append(source)
+        else:
+            streams.append(Stream(source.topic, kind, source))
+    for topic, some in linked.items():
+        links = Links(topic, some)
+        streams += [Stream(name, TRANSFORMS, None, links) for name in (topic + STATIC, topic)]
+    return streams
+
+
+def links_of(streams: Iterable[Stream]) -> list[Links]:
+    """Return the links between frames that come on some streams."""
+    return list(dict.fromkeys(each.links for each in streams if each.links is not None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +117,9 @@ def feed(
     alone = np.ones(len(batch), dtype=bool)
     for group in groups:
         alone[group.places] = False
+    more, known = linked(batch)
+    groups += more
+    alone[known] = False
     problems = []
     begin = 0
     while begin < len(batch):
@@ -108,7 +151,8 @@ def decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
     """Return the messages that are laid out like others of their stream and length."""
     alike: dict[tuple[str, int], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
-        alike.setdefault((stream.topic, len(data)), []).append(place)
+        if stream.links is None:
+            alike.setdefault((stream.topic, len(data)), []).append(place)
     groups = []
     for places in alike.values():
         stream = batch[places[0]][0]
@@ -116,6 +160,54 @@ def decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
         if found is not None:
             groups.append(Group(stream, np.array(places)[found[1]], found[0]))
     return groups
+
+
+def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int]]:
+    """Return what is measured by transforms between frames, and the places of all that are known.
+
+    Frames that are named anywhere in the batch are known for all of it.
+    """
+    lengths: dict[tuple[Stream, int], list[int]] = {}
+    for place, (stream, data) in enumerate(batch):
+        if stream.links is not None:
+            lengths.setdefault((stream, len(data)), []).append(place)
+    parts = [
+        (stream, np.array(places)[alike.which], alike)
+        for (stream, _), places in lengths.items()
+        for alike in transforms([batch[place][1] for place in places])
+    ]
+    for stream, _, alike in parts:
+        assert stream.links is not None
+        for k, link in enumerate(alike.links):
+            if stream.still:
+                _, numbers, good = alike.of(k)
+                for row in numbers[good]:
+                    stream.links.fix(link, row)
+            else:
+                stream.links.move(link, len(alike.which), *alike.ends(k))
+    groups, known = [], []
+    for links in links_of(stream for stream, _, _ in parts):
+        first = min(int(places[0]) for stream, places, _ in parts if stream.links is links)
+        for source, found in links.released():
+            where = np.full(len(found.stamps_ns), first)
+            groups.append(Group(Stream(links.topic, TRANSFORMS, source), where, found))
+    for stream, places, alike in parts:
+        assert stream.links is not None
+        wanted = (
+            []
+            if stream.still
+            else [k for k, x in enumerate(alike.links) if stream.links.wanted(x)]
+        )
+        values = [(alike.links[k], *alike.of(k)) for k in wanted]
+        usable = np.ones(len(places), dtype=bool)
+        for _, stamps, _, good in values:
+            usable &= good & (stamps > 0)
+        known += places[usable].tolist()
+        for link, stamps, numbers, _ in values:
+            for source, found in stream.links.readings(link, stamps[usable], numbers[usable]):
+                one = Stream(stream.topic, stream.type, source)
+                groups.append(Group(one, places[usable], found))
+    return groups, known
 
 
 def _keep(session: CalibrationSession, groups: Sequence[Group]) -> None:
@@ -154,7 +246,35 @@ def _take(
         message = deserialise(data, stream.type)
     except Exception as err:  # damaged bytes fail in many ways
         raise DecodingError(f'a message on {stream.topic} cannot be decoded: {err!r}') from err
-    if stream.source is None:
+    if stream.links is not None:
+        _take_transforms(session, stream, stream.links, message.transforms)
+    elif stream.source is None:
         session.take_joints(message)
     else:
         session.take(stream.source, stream.type, message)
+
+
+def _take_transforms(
+    session: CalibrationSession, stream: Stream, links: Links, come: Sequence[Any]
+) -> None:
+    """Let a session take what is measured by some transforms, one after the other."""
+    for each in come:
+        link = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
+        still = stream.still
+        try:
+            reading = DECODERS[TRANSFORM](each)
+        except MessageError:
+            for source in () if still else links.measured_by(link):
+                session.take(source, TRANSFORM, each)  # counted by what is wrong with it
+            continue
+        stamps, numbers = np.array([reading.stamp_ns]), np.array([reading.numbers])
+        if still:
+            links.fix(link, numbers[0])
+        else:
+            links.move(link, 1, reading.stamp_ns, reading.stamp_ns)
+        found = links.released()
+        if not still:
+            found += links.readings(link, stamps, numbers)
+        for source, some in found:
+            for k in range(len(some.stamps_ns)):
+                session.take_reading(source, some.row(k))

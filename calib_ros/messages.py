@@ -21,6 +21,8 @@ from calib_ros.se3 import FloatArray
 from calib_ros.values import QUATERNION_TOLERANCE
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
+TRANSFORM = 'geometry_msgs/msg/TransformStamped'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 LARGEST = 1e6
 """Largest number [m or rad] that is measured; some devices send the largest float for none."""
 
@@ -152,11 +154,16 @@ DECODERS: dict[str, Callable[[Any], Reading]] = {
     'geometry_msgs/msg/PoseStamped': pose_stamped,
     'geometry_msgs/msg/PoseWithCovarianceStamped': pose_with_covariance,
     'geometry_msgs/msg/PointStamped': point_stamped,
-    'geometry_msgs/msg/TransformStamped': transform_stamped,
+    TRANSFORM: transform_stamped,
     'nav_msgs/msg/Odometry': odometry,
     'sensor_msgs/msg/Range': distance,
 }
 """Types of measurements."""
+
+
+def frame_name(name: str) -> str:
+    """Return the name of a frame without the slash that older programs write before it."""
+    return name.removeprefix('/')
 
 
 def stamp(time: Any) -> int:

@@ -5,19 +5,19 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from calib_ros.errors import InputError
-from calib_ros.intake import Stream, feed
+from calib_ros.intake import Stream, feed, links_of
 from calib_ros.mcap import logged
 from calib_ros.messages import JOINT_STATE
 from calib_ros.observations import Observations
@@ -25,9 +25,7 @@ from calib_ros.salvage import recorded, salvage
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
 from calib_ros.sources import VALIDATION
-from calib_ros.topics import check_joints, choose
-
-Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
+from calib_ros.topics import Reading, check_joints, choose
 
 STORAGES = {'sqlite3': StoragePlugin.SQLITE3, 'mcap': StoragePlugin.MCAP}
 STORAGE = ('chunks', 'connections', 'messages_scan', 'path')
@@ -60,9 +58,10 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         found = salvage(path)
         if found is None:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
-        streams = choose(found.topics, session.settings)
+        streams = choose(found.topics, session.settings, found.on)
         _check_joints(session, streams, found.on)
         count, problem = _feed(session, found.on(streams))
+        _check_links(streams)
         total = recorded(path if path.is_dir() else path.parent)
         lost = 'how many are lost is not known'
         if total is not None:
@@ -72,7 +71,8 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
             f'and are used, {lost}',
         )
     with closing(reader):
-        streams = choose({c.topic: c.msgtype for c in reader.connections}, session.settings)
+        available = {c.topic: c.msgtype for c in reader.connections}
+        streams = choose(available, session.settings, partial(read, reader))
         expected = sum(c.msgcount for c in reader.connections if c.topic in streams)
         _check_joints(session, streams, partial(read, reader))
         count, problem = _feed(session, read(reader, streams))
@@ -81,6 +81,7 @@ def replay(path: Path, session: CalibrationSession) -> tuple[str, ...]:
         if found is not None:
             _check_joints(session, streams, found.on)
             count, _ = _feed(session, found.on(streams))
+    _check_links(streams)
     if problem is None:
         return session.warnings
     return (
@@ -96,6 +97,13 @@ def _check_joints(
     joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
     if len(joints) > 1 and not session.settings.joint_topics:
         check_joints(messages_on(joints), session.joint_names, _deserialised)
+
+
+def _check_links(streams: Mapping[str, Stream]) -> None:
+    """Refuse sources that could not be measured between their frames."""
+    problems = [words for links in links_of(streams.values()) for words in links.problems()]
+    if problems:
+        raise InputError('; '.join(problems))
 
 
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:

@@ -7,23 +7,30 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.intake import Stream, decoded
-from calib_ros.messages import DECODERS, JOINT_STATE, JointReadings, joint_state
+from calib_ros.intake import Stream, decoded, linked, measured
+from calib_ros.messages import DECODERS, JOINT_STATE, TRANSFORMS, JointReadings, joint_state
 from calib_ros.se3 import FloatArray
 from calib_ros.settings import Settings
-from calib_ros.sources import MARKERS, Source, parse_source, parse_sources
+from calib_ros.sources import MARKERS, TYPES, Source, parse_source, parse_sources
 from calib_ros.track import Stamps
+from calib_ros.transforms import STATIC, Links
 
 SAME = 1e-9
 """Joint values [rad or m] of two topics that differ by less are the same."""
 
 
-def choose(available: Mapping[str, str], settings: Settings) -> dict[str, Stream]:
+Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
+"""Returns the messages of a recording on some topics."""
+
+
+def choose(
+    available: Mapping[str, str], settings: Settings, messages_on: Reading
+) -> dict[str, Stream]:
     """Choose topics by type from those available (topic to type), unless they are named.
 
     Raises
@@ -49,13 +56,26 @@ def choose(available: Mapping[str, str], settings: Settings) -> dict[str, Stream
     sources = sources or _found(available)
     for source in sources:
         kind = available.get(source.topic, '')
-        if kind not in DECODERS or source.type not in ('', kind):
+        if kind not in TYPES or source.type not in ('', kind):
             expected = (source.type,) if source.type else tuple(DECODERS)
             raise _no_topic(f'"{source.topic}"', expected, available)
     if all(source.validation for source in sources):
-        raise _no_topic('pose topic', tuple(DECODERS), available)
-    measured = {each.topic: Stream(each.topic, available[each.topic], each) for each in sources}
-    return {topic: Stream(topic, JOINT_STATE) for topic in joints} | measured
+        error = _no_topic('pose topic', tuple(DECODERS), available)
+        raise InputError('; '.join([str(error), *_links(available, messages_on)]))
+    streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
+    return {stream.topic: stream for stream in streams if stream.topic in available}
+
+
+def _links(available: Mapping[str, str], messages_on: Reading) -> list[str]:
+    """Return in words which links between frames move, by topic."""
+    found = []
+    for topic, kind in available.items():
+        if kind == TRANSFORMS and not topic.endswith(STATIC):
+            links = Links(topic)
+            for batch in _batches(messages_on({topic: Stream(topic, kind, None, links)})):
+                linked(batch)
+            found.append(str(links))
+    return found
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
@@ -121,20 +141,13 @@ def _joint_values(
 ) -> dict[tuple[str, str], list[tuple[Stamps, FloatArray]]]:
     """Return stamps and values by topic and joint."""
     found = defaultdict(list)
-    ended = False
-    while not ended:
-        batch: list[tuple[Stream, bytes]] = []
-        try:
-            batch.extend(itertools.islice(messages, 2000))
-            ended = not batch
-        except Exception:  # what is wrong with a recording is told when it is replayed
-            ended = True
+    for batch in _batches(messages):
         groups = decoded(batch)
         for k in sorted(set(range(len(batch))).difference(*(each.places for each in groups))):
             stream, data = batch[k]
             try:
                 reading = joint_state(deserialise(data, stream.type))
-            except Exception:  # likewise
+            except Exception:  # it is counted when it is replayed
                 continue
             for name, value in zip(reading.names, reading.values, strict=True):
                 part = np.array([reading.stamp_ns]), np.array([value], dtype=np.float64)
@@ -145,6 +158,21 @@ def _joint_values(
             for name, column in zip(names, values.T, strict=True):
                 found[group.stream.topic, name].append((stamps, column))
     return found
+
+
+def _batches(
+    messages: Iterator[tuple[Stream, bytes]],
+) -> Iterator[list[tuple[Stream, bytes]]]:
+    """Yield messages by the batch; what is wrong with a recording is told when it is replayed."""
+    ended = False
+    while not ended:
+        batch: list[tuple[Stream, bytes]] = []
+        try:
+            batch.extend(itertools.islice(messages, 2000))
+            ended = not batch
+        except Exception:
+            ended = True
+        yield batch
 
 
 def _apart(

@@ -21,7 +21,7 @@ ORDER = [
     {'config', 'differential', 'observations'},
     {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
     {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
-    {'account', 'following', 'names', 'robust', 'waypoints'},
+    {'account', 'following', 'names', 'robust', 'transforms', 'waypoints'},
     {'compensation'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
     {'archive', 'problem'},
