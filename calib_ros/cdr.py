@@ -33,6 +33,8 @@ from calib_ros.track import Stamps
 from calib_ros.values import QUATERNION_TOLERANCE
 
 LITTLE_ENDIAN = b'\x00\x01'
+MOST_LAYOUTS = 100
+"""Layouts of messages of one length that are remembered."""
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
 
 # Of each type: strings before the numbers, bytes between, kind and count of the numbers.
@@ -134,71 +136,104 @@ def readings(
 
 
 @dataclass(frozen=True, eq=False)
-class Alike:
-    """TFMessages that are laid out alike and name the same frames: which of a batch they are.
+class Layout:
+    """Where in a TFMessage things are: of its transforms the links, stamps and numbers.
 
-    `links` names parent and child frame of each transform in them.
+    `names` are the places of all that makes it this layout, `text` is what stands there.
     """
 
-    which: NDArray[np.intp]
     links: tuple[tuple[str, str], ...]
-    _rows: NDArray[np.uint8]
-    _places: tuple[tuple[int, int], ...]  # of the stamps and of the numbers
+    stamps: tuple[int, ...]
+    numbers: tuple[int, ...]
+    names: NDArray[np.intp]
+    text: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Alike:
+    """TFMessages of one layout: which of a batch they are, and their bytes (N, ...)."""
+
+    layout: Layout
+    which: NDArray[np.intp]
+    ends: tuple[bytes, bytes]
+    rows: NDArray[np.uint8]
 
     def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
         """Return stamps (N,) and numbers (N, 7) of one transform of each, and which are usable."""
-        begin, numbers_begin = self._places[k]
-        numbers = _numbers(self._rows, numbers_begin, '<f8', 7).astype(np.float64)
+        numbers = _numbers(self.rows, self.layout.numbers[k], '<f8', 7).astype(np.float64)
         good = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
         length = np.linalg.norm(numbers[:, 3:], axis=1)
         good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
-        return _stamps(_numbers(self._rows, begin, '<u4', 2)), numbers, good
+        return _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2)), numbers, good
 
-    def ends(self, k: int) -> tuple[int, int]:
+    def span(self, k: int) -> tuple[int, int]:
         """Return the first and the last stamp of one transform of each."""
-        begin = self._places[k][0]
-        first, last = _stamps(_numbers(self._rows[[0, -1]], begin, '<u4', 2)).tolist()
-        return first, last
+        (s, ns), (t, nt) = (struct.unpack_from('<iI', x, self.layout.stamps[k]) for x in self.ends)
+        return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
 
 
-def transforms(blobs: Sequence[bytes]) -> list[Alike]:
-    """Return what is in TFMessages of one length; those that cannot be read are in none."""
-    if not blobs[0]:
+def transforms(blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:
+    """Return what is in TFMessages of one length; those that cannot be read are in none.
+
+    Layouts that are `known` by the length of messages need not be found again, and are added.
+    """
+    length = len(blobs[0])
+    if length < _HEAD:
         return []
-    rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), len(blobs[0]))
+    rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
     rest = np.flatnonzero((rows[:, :2] == tuple(LITTLE_ENDIAN)).all(axis=1))
-    found = []
+    layouts = known.setdefault(length, [])
+    found: list[Alike] = []
+    for layout in layouts:
+        rest = _part(blobs, rows, rest, layout, found)
     while len(rest):
         try:
-            links, places, names = _transform_layout(blobs[rest[0]])
+            layout = _transform_layout(blobs[rest[0]])
         except (struct.error, UnicodeDecodeError):
             rest = rest[1:]
             continue
-        equal = (rows[np.ix_(rest, names)] == rows[rest[0], names]).all(axis=1)
-        found.append(Alike(rest[equal], links, rows[rest[equal]], places))
-        rest = rest[~equal]
+        if len(layouts) == MOST_LAYOUTS:
+            layouts.clear()
+        layouts.append(layout)
+        rest = _part(blobs, rows, rest, layout, found)
     return found
 
 
-def _transform_layout(
-    blob: bytes,
-) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[int, int], ...], NDArray[np.intp]]:
-    """Return the links, the places of their stamps and numbers, and those of all names."""
+def _part(
+    blobs: Sequence[bytes],
+    rows: NDArray[np.uint8],
+    rest: NDArray[np.intp],
+    layout: Layout,
+    found: list[Alike],
+) -> NDArray[np.intp]:
+    """Add those of some messages that have a layout to what is found; return the others."""
+    equal = (rows[np.ix_(rest, layout.names)] == layout.text).all(axis=1)
+    which: NDArray[np.intp] = rest[equal]
+    others: NDArray[np.intp] = rest[~equal]
+    if len(which):
+        found.append(Alike(layout, which, (blobs[which[0]], blobs[which[-1]]), rows[which]))
+    return others
+
+
+def _transform_layout(blob: bytes) -> Layout:
     count, at = _integer(blob, _HEAD)
-    links, places, names = [], [], [np.arange(_HEAD, at)]
+    links, stamps, numbers, names = [], [], [], [np.arange(_HEAD, at)]
     for _ in range(count):
-        stamp = _aligned(at, 4)
-        parent, middle = _string(blob, stamp + _STAMP)
-        begin = _aligned(middle, 4)
+        stamps.append(_aligned(at, 4))
+        begin = stamps[-1] + _STAMP
+        parent, end = _string(blob, begin)
+        names.append(np.arange(begin, end))
+        begin = _aligned(end, 4)
         child, end = _string(blob, begin)
-        numbers = _aligned(end, 8)
-        at = numbers + 56
+        names.append(np.arange(begin, end))
+        links.append((frame_name(parent), frame_name(child)))
+        numbers.append(_aligned(end, 8))
+        at = numbers[-1] + 56
         if at > len(blob):
             raise struct.error
-        names += [np.arange(stamp + _STAMP, middle), np.arange(begin, end)]
-        links.append((frame_name(parent), frame_name(child)))
-        places.append((stamp, numbers))
-    return tuple(links), tuple(places), np.concatenate(names)
+    places = np.concatenate(names)
+    text = np.frombuffer(blob, dtype=np.uint8)[places]
+    return Layout(tuple(links), tuple(stamps), tuple(numbers), places, text)
 
 
 def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:

@@ -174,17 +174,18 @@ def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int
     parts = [
         (stream, np.array(places)[alike.which], alike)
         for (stream, _), places in lengths.items()
-        for alike in transforms([batch[place][1] for place in places])
+        if stream.links is not None
+        for alike in transforms([batch[place][1] for place in places], stream.links.layouts)
     ]
     for stream, _, alike in parts:
         assert stream.links is not None
-        for k, link in enumerate(alike.links):
+        for k, link in enumerate(alike.layout.links):
             if stream.still:
                 _, numbers, good = alike.of(k)
                 for row in numbers[good]:
                     stream.links.fix(link, row)
             else:
-                stream.links.move(link, len(alike.which), *alike.ends(k))
+                stream.links.move(link, len(alike.which), *alike.span(k))
     groups, known = [], []
     for links in links_of(stream for stream, _, _ in parts):
         first = min(int(places[0]) for stream, places, _ in parts if stream.links is links)
@@ -193,12 +194,11 @@ def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int
             groups.append(Group(Stream(links.topic, TRANSFORMS, source), where, found))
     for stream, places, alike in parts:
         assert stream.links is not None
-        wanted = (
-            []
-            if stream.still
-            else [k for k, x in enumerate(alike.links) if stream.links.wanted(x)]
-        )
-        values = [(alike.links[k], *alike.of(k)) for k in wanted]
+        values = [
+            (link, *alike.of(k))
+            for k, link in enumerate(alike.layout.links)
+            if not stream.still and stream.links.wanted(link)
+        ]
         usable = np.ones(len(places), dtype=bool)
         for _, stamps, _, good in values:
             usable &= good & (stamps > 0)

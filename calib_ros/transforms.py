@@ -18,6 +18,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from calib_ros import se3
+from calib_ros.cdr import Layout
 from calib_ros.messages import Readings
 from calib_ros.se3 import FloatArray
 from calib_ros.sources import Source
@@ -80,6 +81,10 @@ class Links:
         self._changed: set[Pair] = set()
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
         self._known = False  # whether the routes are up to date
+        self._wanted: set[Pair] = set()
+        self._open = True  # whether frames of a source are not linked yet
+        self.layouts: dict[int, list[Layout]] = {}
+        """How its messages are laid out, by their length."""
         self._held: deque[tuple[Pair, Stamps, FloatArray]] = deque()
         self._count = 0
 
@@ -107,7 +112,7 @@ class Links:
     def wanted(self, link: Pair) -> bool:
         """Tell whether the numbers of a link are of use, now or perhaps later."""
         self._update()
-        return '' in self._routes.values() or any(True for _ in self._of(link))
+        return self._open or link in self._wanted
 
     def measured_by(self, link: Pair) -> list[Source]:
         """Return the sources that a link measures."""
@@ -122,7 +127,7 @@ class Links:
         Where the frames between are not known yet, it waits for them.
         """
         self._update()
-        if '' in self._routes.values():
+        if self._open:
             self._held.append((link, stamps, numbers))
             self._count += len(stamps)
             while self._count > HELD:
@@ -147,7 +152,7 @@ class Links:
             for source, route in fresh.items()
             if route.link == link
         ]
-        if '' not in self._routes.values():
+        if not self._open:
             self._held.clear()
             self._count = 0
         return found
@@ -202,6 +207,9 @@ class Links:
     def _update(self) -> None:
         if not self._known:
             self._routes = {source: self._route(source) for source in self.sources}
+            routes = self._routes.values()
+            self._wanted = {route.link for route in routes if isinstance(route, Route)}
+            self._open = '' in routes
             self._known = True
 
     def _route(self, source: Source) -> Route | str:

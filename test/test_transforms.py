@@ -321,12 +321,12 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
     """Serialisers leave bytes of any kind where numbers are aligned."""
     message = tf(link('world', 'tool', 105 * MS, frame(rng)), link('a', 'bc', 7, frame(rng)))
     data = bytes(TYPESTORE.serialize_cdr(message, TRANSFORMS))
-    (alike,) = transforms([data])
-    assert alike.links == (('world', 'tool'), ('a', 'bc'))
+    (alike,) = transforms([data], {})
+    assert alike.layout.links == (('world', 'tool'), ('a', 'bc'))
     other = bytearray(data)
     gap = data.index(b'world\0') + 6
     other[gap : gap + 2] = b'\xff\xff'
-    (both,) = transforms([data, bytes(other)])
+    (both,) = transforms([data, bytes(other)], {})
     assert both.which.tolist() == [0, 1]
     stamps, numbers, good = both.of(1)
     assert stamps.tolist() == [7, 7]
@@ -337,7 +337,7 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
 @pytest.mark.parametrize('cut', range(4, 130, 7))
 def test_messages_that_are_cut_off_are_not_read(rng, cut):
     data = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
-    assert transforms([data[:cut]]) == [] or cut >= len(data)
+    assert transforms([data[:cut]], {}) == [] or cut >= len(data)
 
 
 @pytest.mark.parametrize(
