@@ -34,7 +34,7 @@ from calib_ros.values import QUATERNION_TOLERANCE
 
 LITTLE_ENDIAN = b'\x00\x01'
 MOST_LAYOUTS = 100
-"""Layouts of messages of one length that are remembered."""
+"""Layouts of messages of one length that are remembered, and such lengths."""
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
 
 # Of each type: strings before the numbers, bytes between, kind and count of the numbers.
@@ -184,6 +184,8 @@ def transforms(blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[A
         return []
     rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
     rest = np.flatnonzero((rows[:, :2] == tuple(LITTLE_ENDIAN)).all(axis=1))
+    if len(known) == MOST_LAYOUTS:
+        known.clear()
     layouts = known.setdefault(length, [])
     found: list[Alike] = []
     for layout in layouts:
@@ -226,16 +228,14 @@ def _transform_layout(blob: bytes) -> Layout:
     for _ in range(count):
         stamps.append(_aligned(at, 4))
         begin = stamps[-1] + _STAMP
-        parent, end = _string(blob, begin)
-        names.append(np.arange(begin, end))
-        begin = _aligned(end, 4)
-        child, end = _string(blob, begin)
-        names.append(np.arange(begin, end))
-        links.append((frame_name(parent), frame_name(child)))
+        parent, middle = _string(blob, begin)
+        child, end = _string(blob, _aligned(middle, 4))
         numbers.append(_aligned(end, 8))
         at = numbers[-1] + 56
         if at > len(blob):
             raise struct.error
+        names += [np.arange(begin, middle), np.arange(_aligned(middle, 4), end)]
+        links.append((frame_name(parent), frame_name(child)))
     places = np.concatenate(names)
     text = np.frombuffer(blob, dtype=np.uint8)[places]
     last = int(names[-1][0]), int(names[-1][-1]) + 1

@@ -42,6 +42,8 @@ class Hearing:
     last: float | None = None
     deaf: str = ''
     """What a publisher offers that is not what is asked for, in words."""
+    latched: bool = False
+    """True when it comes once and not again."""
     lost: int = 0
     """Messages that got lost on the way, as DDS tells by their numbers."""
     full: int = 0
@@ -62,7 +64,8 @@ class Hearing:
     @property
     def silent(self) -> bool:
         """Tell whether it has been heard before and is not any more."""
-        return self.last is not None and time.monotonic() - self.last > SILENCE
+        heard = self.last is not None and not self.latched
+        return heard and time.monotonic() - self.last > SILENCE
 
 
 class Inputs:
@@ -151,6 +154,7 @@ class Inputs:
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
         heard = self._heard.setdefault(self._node.resolve_topic_name(stream.topic), Hearing())
+        heard.latched = stream.still
         try:
             subscription = self._node.create_subscription(
                 _message_type(stream.type),

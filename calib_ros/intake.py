@@ -167,16 +167,16 @@ def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int
 
     Frames that are named anywhere in the batch are known for all of it.
     """
-    lengths: dict[tuple[Stream, int], list[int]] = {}
+    lengths: dict[tuple[str, int], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
         if stream.links is not None:
-            lengths.setdefault((stream, len(data)), []).append(place)
-    parts = [
-        (stream, np.array(places)[alike.which], alike)
-        for (stream, _), places in lengths.items()
-        if stream.links is not None
-        for alike in transforms([batch[place][1] for place in places], stream.links.layouts)
-    ]
+            lengths.setdefault((stream.topic, len(data)), []).append(place)
+    parts = []
+    for places in lengths.values():
+        stream = batch[places[0]][0]
+        assert stream.links is not None
+        for alike in transforms([batch[place][1] for place in places], stream.links.layouts):
+            parts.append((stream, np.array(places)[alike.which], alike))
     for stream, _, alike in parts:
         assert stream.links is not None
         for k, link in enumerate(alike.layout.links):
@@ -192,21 +192,21 @@ def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int
         for source, found in links.released():
             where = np.full(len(found.stamps_ns), first)
             groups.append(Group(Stream(links.topic, TRANSFORMS, source), where, found))
-    for stream, places, alike in parts:
+    for stream, where, alike in parts:
         assert stream.links is not None
         values = [
             (link, *alike.of(k))
             for k, link in enumerate(alike.layout.links)
             if not stream.still and stream.links.wanted(link)
         ]
-        usable = np.ones(len(places), dtype=bool)
+        usable = np.ones(len(where), dtype=bool)
         for _, stamps, _, good in values:
             usable &= good & (stamps > 0)
-        known += places[usable].tolist()
+        known += where[usable].tolist()
         for link, stamps, numbers, _ in values:
             for source, found in stream.links.readings(link, stamps[usable], numbers[usable]):
                 one = Stream(stream.topic, stream.type, source)
-                groups.append(Group(one, places[usable], found))
+                groups.append(Group(one, where[usable], found))
     return groups, known
 
 

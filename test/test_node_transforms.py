@@ -35,7 +35,7 @@ from tf2_msgs.msg import TFMessage
 from calib_ros import se3
 from calib_ros.config import load_chain
 from calib_ros.errors import ConfigError
-from calib_ros.inputs import deserialised
+from calib_ros.inputs import Hearing, deserialised
 from calib_ros.intake import Stream, feed, measured
 from calib_ros.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.replay import STORAGES, replay
@@ -167,3 +167,8 @@ def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):
         Cell(chain='ur10e', sources=[SOURCE], data_dir=str(tmp_path)),
     ):
         pass
+
+
+@pytest.mark.parametrize('latched', [False, True])
+def test_frames_that_stand_still_may_be_silent(latched):
+    assert Hearing(last=-100.0, latched=latched).silent is not latched

@@ -340,6 +340,12 @@ def test_messages_that_are_cut_off_are_not_read(rng, cut):
     assert transforms([data[:cut]], {}) == [] or cut >= len(data)
 
 
+def test_a_name_of_absurd_length_is_not_read():
+    data = bytearray(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
+    data[16:20] = b'\xff\xff\xff\xff'
+    assert transforms([bytes(data)], {}) == []
+
+
 @pytest.mark.parametrize(
     'text',
     [
