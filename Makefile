@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
 
-test: $(VENV)/installed
+test: $(VENV)/installed $(VENV)/tf2_msgs/installed
 	$(BIN)/python -m pytest $(PYTEST_ARGUMENTS)
 
 FUZZ_SECONDS ?= 600
@@ -40,6 +40,17 @@ $(OLDEST)/installed: setup.py pyproject.toml test/oldest.txt
 $(VENV)/installed: setup.py pyproject.toml
 	$(PYTHON) -m venv $(VENV) || { echo 'needs venv: apt install python3-venv'; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test]'
+	touch $@
+
+# The one package of messages that ROS has and PyPI has not.
+$(VENV)/tf2_msgs/installed: $(VENV)/installed test/tf2_msgs/CMakeLists.txt
+	mkdir -p $(VENV)/tf2_msgs
+	export PATH="$(CURDIR)/$(BIN):$$PATH" CMAKE_PREFIX_PATH="$(CURDIR)/$(VENV)" \
+	AMENT_PREFIX_PATH="$(CURDIR)/$(VENV)" && { \
+	cmake -S test/tf2_msgs -B $(VENV)/tf2_msgs -DBUILD_TESTING=OFF \
+	-DCMAKE_INSTALL_PREFIX="$(CURDIR)/$(VENV)" -DPython3_EXECUTABLE="$(CURDIR)/$(BIN)/python" && \
+	cmake --build $(VENV)/tf2_msgs --target install; } > $(VENV)/tf2_msgs/log 2>&1 \
+	|| { tail $(VENV)/tf2_msgs/log; echo 'needs a C++ compiler: apt install g++'; exit 1; }
 	touch $@
 
 clean:

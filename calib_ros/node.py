@@ -43,7 +43,7 @@ from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.guide import Guide
 from calib_ros.inputs import Inputs, deserialised
-from calib_ros.intake import Stream, feed
+from calib_ros.intake import Stream, feed, measured
 from calib_ros.keeper import Exportable, Keeper, Published
 from calib_ros.messages import JOINT_STATE
 from calib_ros.parameters import changed, declare_all, load_robot
@@ -196,10 +196,10 @@ class CalibrationNode(Node):
         streams = [
             Stream(topic, JOINT_STATE) for topic in settings.joint_topics or ('joint_states',)
         ]
-        for source in parse_sources(settings.sources) or STANDARD:
-            kind = source.type or 'geometry_msgs/msg/PoseStamped'
-            streams.append(Stream(source.topic, kind, source))
-        return streams
+        sources = parse_sources(settings.sources) or STANDARD
+        return streams + measured(
+            sources, {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
+        )
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:

@@ -7,10 +7,10 @@ from __future__ import annotations
 import itertools
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from mmap import ACCESS_READ, mmap
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from calib_ros.account import Account
 from calib_ros.errors import InputError, shortened
 from calib_ros.files import whole_folder, write_file
-from calib_ros.intake import Stream, feed
+from calib_ros.intake import Stream, feed, links_of
 from calib_ros.mcap import (
     LARGEST_CHUNK,
     LARGEST_RATIO,
@@ -31,13 +31,13 @@ from calib_ros.mcap import (
     unpacked,
     unpacked_size,
 )
-from calib_ros.messages import DECODERS, JOINT_STATE
+from calib_ros.messages import JOINT_STATE
 from calib_ros.observations import Observations
 from calib_ros.salvage import NOT_CLOSED, Salvage, check, recorded, salvage, unpacked_files
 from calib_ros.se3 import FloatArray, to_quat
 from calib_ros.session import CalibrationSession
-from calib_ros.settings import Settings
-from calib_ros.sources import VALIDATION, Source, parse_source, parse_sources
+from calib_ros.sources import VALIDATION
+from calib_ros.topics import Reading, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -56,84 +56,6 @@ _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|is there already')
 STAND_NS = 400_000_000
 """Time for which the arm stands at each row of a table that is made into a bag."""
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Topics of a bag to replay: their message types, and the sources of measurements."""
-
-    types: Mapping[str, str]
-    sources: Mapping[str, Source]
-
-    @classmethod
-    def choose(cls, available: Mapping[str, str], settings: Settings) -> Topics:
-        """Choose topics by type from those available (topic to type), unless they are named.
-
-        Raises
-        ------
-        InputError
-            When there is none or more than one; it lists the candidates.
-
-        """
-        named = settings.joint_topics
-        joints = [topic for topic, kind in available.items() if kind == JOINT_STATE]
-        if named:
-            for topic in named:
-                if topic not in joints:
-                    raise _no_topic(f'"{topic}"', (JOINT_STATE,), available)
-            joints = list(named)
-        elif not joints:
-            raise _no_topic('joint topic', (JOINT_STATE,), available)
-        sources = parse_sources(settings.sources)
-        if not sources:
-            sources = _found(available)
-        for source in sources:
-            kind = available.get(source.topic, '')
-            if kind not in DECODERS or source.type not in ('', kind):
-                expected = (source.type,) if source.type else tuple(DECODERS)
-                raise _no_topic(f'"{source.topic}"', expected, available)
-        if all(source.validation for source in sources):
-            raise _no_topic('pose topic', tuple(DECODERS), available)
-        chosen = {source.topic: source for source in sources}
-        return cls({topic: available[topic] for topic in (*joints, *chosen)}, chosen)
-
-    @property
-    def streams(self) -> dict[str, Stream]:
-        """Return what comes on each topic."""
-        return {
-            topic: Stream(topic, k, self.sources.get(topic)) for topic, k in self.types.items()
-        }
-
-    def of(self, messages: Iterable[tuple[str, bytes]]) -> Iterator[tuple[Stream, bytes]]:
-        """Return those of some messages that are on these topics."""
-        streams = self.streams
-        return ((streams[topic], data) for topic, data in messages if topic in streams)
-
-
-def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
-    """Return the sources of a bag by their types; one at most is fitted."""
-    sources = [
-        parse_source(f'{topic} type={kind}')
-        for topic, kind in available.items()
-        if kind in DECODERS
-    ]
-    fitted = sorted(source.topic for source in sources if not source.validation)
-    if len(fitted) > 1:
-        raise InputError(
-            'the bag has several pose topics, choose one or more with --sources: '
-            f'{", ".join(fitted)}; it holds {_contents(available)}'
-        )
-    return tuple(sources)
-
-
-def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
-    return InputError(
-        f'the bag has no {what} of type {" or ".join(types)}; it holds {_contents(available)}'
-    )
-
-
-def _contents(available: Mapping[str, str]) -> str:
-    return ', '.join(f'{t} ({kind})' for t, kind in sorted(available.items())) or 'nothing'
 
 
 @dataclass(frozen=True)
@@ -214,14 +136,16 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
         return _salvaged(path, folder, found, session)
     with closing(reader):
         available = {c.topic: c.msgtype for c in reader.connections}
-        topics = Topics.choose(available, session.settings)
-        counts = [c.msgcount for c in reader.connections if c.topic in topics.types]
+        streams = _chosen(session, available, partial(read, reader))
+        counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
-        count, problem = _feed(session, read(reader, topics.streams))
+        count, problem = _feed(session, read(reader, streams))
     if problem is not None and count == 0:
         found = salvage(folder)
         if found is not None:
-            count, _ = _feed(session, topics.of(found.messages()))
+            _check_joints(session, streams, found.on)
+            count, _ = _feed(session, found.on(streams))
+    _check_links(streams)
     if problem is None:
         return Replayed(expected, count, session.warnings)
     lost = max(0, expected - count)
@@ -231,8 +155,9 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
 
 def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSession) -> Replayed:
     """Feed what could be read of a bag without the library."""
-    topics = Topics.choose(found.topics, session.settings)
-    count, problem = _feed(session, topics.of(found.messages()))
+    streams = _chosen(session, found.topics, found.on)
+    count, problem = _feed(session, found.on(streams))
+    _check_links(streams)
     problem = problem or found.problem
     total = recorded(folder if folder.is_dir() else folder.parent)
     if total is None and found.whole:
@@ -247,6 +172,31 @@ def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSess
         f'{lost}'
     )
     return Replayed(total, found.count, (*session.warnings, damaged))
+
+
+def _chosen(
+    session: CalibrationSession, available: Mapping[str, str], messages_on: Reading
+) -> dict[str, Stream]:
+    """Return what is read of the topics available."""
+    streams = choose(available, session.settings, _decodable(messages_on))
+    _check_joints(session, streams, messages_on)
+    return streams
+
+
+def _check_joints(
+    session: CalibrationSession, streams: Mapping[str, Stream], messages_on: Reading
+) -> None:
+    """Refuse several topics of the same joints, unless they were named."""
+    joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
+    if len(joints) > 1 and not session.settings.joint_topics:
+        check_joints(_decodable(messages_on)(joints), session.joint_names, _deserialised)
+
+
+def _check_links(streams: Mapping[str, Stream]) -> None:
+    """Refuse sources that could not be measured between their frames."""
+    problems = [words for links in links_of(streams.values()) for words in links.problems()]
+    if problems:
+        raise InputError('; '.join(problems))
 
 
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
@@ -372,6 +322,16 @@ def _deserialised(data: bytes, kind: str) -> Any:
     return _typestore().deserialize_cdr(data, kind)
 
 
+def _is_message(data: object) -> bool:
+    """Tell whether it may be a message: a file may hold anything."""
+    return isinstance(data, bytes) and len(data) <= LARGEST_MESSAGE
+
+
+def _decodable(messages_on: Reading) -> Reading:
+    """Leave out what cannot be a message; `_feed` tells of it."""
+    return lambda streams: (each for each in messages_on(streams) if _is_message(each[1]))
+
+
 def _feed(
     session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
 ) -> tuple[int, str | None]:
@@ -384,11 +344,7 @@ def _feed(
             ended = len(batch) < BATCH
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        usable = [
-            (stream, data)
-            for stream, data in batch
-            if isinstance(data, bytes) and len(data) <= LARGEST_MESSAGE
-        ]
+        usable = [each for each in batch if _is_message(each[1])]
         problems = feed(session, usable, _deserialised)
         count += len(usable) - len(problems)
         if len(usable) < len(batch):

@@ -12,12 +12,12 @@ import mmap
 import re
 import sqlite3
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 from calib_ros import mcap
 from calib_ros.errors import ConfigError, InputError
@@ -37,6 +37,8 @@ GROWING = {
 """What must grow from row to row; in a file that was made to be endless it comes again."""
 _PLAIN = re.compile(r'CREATE (TABLE|INDEX) (?!.*\b(AS|GENERATED)\b)', re.IGNORECASE | re.DOTALL)
 _NUMBERED = re.compile(r'[^(]*\(\s*id INTEGER PRIMARY KEY', re.IGNORECASE)
+
+Stream = TypeVar('Stream')
 
 
 def recorded(path: Path) -> int | None:
@@ -132,6 +134,10 @@ class Salvage:
     def note(self, problem: str) -> None:
         """Note why a file could not be read to its end."""
         self.problem, self.whole = problem, False
+
+    def on(self, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+        """Yield the messages on some topics, as what these carry."""
+        return ((streams[topic], data) for topic, data in self.messages() if topic in streams)
 
 
 def salvage(path: Path) -> Salvage | None:

@@ -76,7 +76,7 @@ class Settings:
     sources: tuple[str, ...] = _setting(
         (),
         'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
-        'target, eye_in_hand, validation',
+        'target, eye_in_hand, validation; of /tf with parent and child',
     )
     joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
     wanted_accuracy: float = _setting(

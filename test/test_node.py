@@ -54,6 +54,7 @@ from calib_ros.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.simulation import Cell as SimulatedCell
 from calib_ros.simulation import faulty, measure, random_frame
+from calib_ros.topics import outputs
 
 SHIPPED = Path(__file__).parents[1] / 'config' / 'calibration_node.yaml'
 
@@ -777,3 +778,18 @@ def test_the_parameter_file_applies_under_a_namespace(tmp_path):
         output = child.wait_for('ready to calibrate meca500')
         assert 'cell_2.arm' in output
         assert child.end(signal.SIGINT) == 0, child.output
+
+
+def test_recordings_of_all_topics_tell_what_the_node_published(tmp_path):
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        node = cell.start(
+            namespace='/hall/left', remap=('__node:=calib',), chain='ur10e', data_dir=str(tmp_path)
+        )
+        found = cell.peer.get_publisher_names_and_types_by_node
+        own = {}
+        cell.spin_until(lambda: own.update(found('calib', '/hall/left')) or len(own) > 9)
+        assert node.get_fully_qualified_name() == '/hall/left/calib'
+    available = {topic: kinds[0] for topic, kinds in own.items()}
+    private = {topic for topic in available if topic.startswith('/hall/left/calib/')}
+    assert {topic.rpartition('/')[2] for topic in private} >= {'corrected_pose', 'next_pose'}
+    assert outputs(available | {'/hall/left/measured_pose': 'x'}) == private

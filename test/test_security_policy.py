@@ -15,6 +15,7 @@ from calib_ros.config import load_chain
 
 ROOT = Path(__file__).parents[1]
 POLICY = ROOT / 'security' / 'policy.xml'
+FRAMES = '/tf_static'
 AT_START = {'/robot_description'}
 """Heard at the start only, with chain:=robot_description."""
 
@@ -57,12 +58,19 @@ def names(tmp_path):
 
 
 def test_topics_and_services_are_those_of_a_running_node(names):
-    assert allowed('topic', 'publish') == names('publisher') | {'/tf_static'}
+    assert allowed('topic', 'publish') == names('publisher') | {FRAMES}
     assert allowed('topic', 'subscribe') == names('subscriber') | AT_START
     assert allowed('service', 'reply') == names('service')
     assert allowed('service', 'request') == names('client') == set()
     rules = {rule for group in profile() for rule in group.attrib}
     assert rules == {'publish', 'subscribe', 'reply'}
+
+
+def test_frames_found_may_be_published(tmp_path):
+    pytest.importorskip('tf2_msgs.msg', reason='make test builds it')
+    assert FRAMES in allowed('topic', 'publish')
+    with Cell(chain='ur10e', data_dir=str(tmp_path), base_frame='base') as cell:
+        assert FRAMES in {each.topic_name for each in cell.node.publishers}
 
 
 def test_what_is_heard_at_the_start_is_allowed(tmp_path, monkeypatch):

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every reader as a function of bytes, and the contract that it has to keep.
 
-A reader takes whatever it is given, or says what is wrong by a `CalibrationError` of at most 400
+A reader takes whatever it is given, or says what is wrong by a `CalibrationError` of at most 1,000
 characters or an `OSError`; within ten seconds of CPU and 500 MB.
 """
 
