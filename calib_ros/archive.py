@@ -8,13 +8,13 @@ Rows that cannot be written, because the disk is full say, wait in memory until 
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from calib_ros.errors import InputError
-from calib_ros.files import write_file
+from calib_ros.files import whole_folder, write_file, write_files
 from calib_ros.journal import Journal
 from calib_ros.samples import Sample
 from calib_ros.tables import read_journal
@@ -28,13 +28,18 @@ class Archive:
     Parameters
     ----------
     folder : Path
-        It is made when the first file is written.
+        It is made if there is none.
     robot : str
         Name of the robot, with its serial number if there are several.
     joints : int
         Number of joints.
     configuration : callable
         Returns the configuration to write beside a journal.
+
+    Raises
+    ------
+    InputError
+        When no file can be written in the folder.
 
     """
 
@@ -51,6 +56,20 @@ class Archive:
         self._waiting: list[tuple[Sample, bool]] = []
         self._path = self._new_path(JOURNAL)
         self._due = False
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=folder):
+                pass
+        except OSError as err:
+            raise InputError(
+                f'samples cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
+                'in which files can be written'
+            ) from err
+
+    @property
+    def trouble(self) -> str:
+        """Return in words that samples would be lost by now; empty while all are on the disk."""
+        return f'samples are in memory only: {self.error}; ' if self.error else ''
 
     @property
     def journal(self) -> Path | None:
@@ -74,6 +93,7 @@ class Archive:
         """Write what waits, as far as that is possible; `error` tells whether it was."""
         try:
             if self._journal is None and (self._waiting or self._due):
+                self.folder.mkdir(parents=True, exist_ok=True)
                 write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
                 self._journal = Journal(self._path, self._joints)
                 self._due = False
@@ -139,16 +159,19 @@ class Archive:
         Raises
         ------
         InputError
-            When the file is there already.
+            When one of the files is there already.
         OSError
             When it cannot be written.
 
         """
         path = path or self._new_path(CALIBRATION)
+        beside = path.with_suffix(SETTINGS)
+        if configuration and beside.exists():
+            raise InputError(f'{beside} exists already: move it or choose another name')
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, text)
         if configuration:
-            write_file(path.with_suffix(SETTINGS), configuration, overwrite=True)
+            write_file(beside, configuration)
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:
@@ -157,14 +180,8 @@ class Archive:
         Returns its path.
         """
         folder = self._new_path('')
-        partial = folder.with_name(f'.{folder.name}.partial')
-        try:
-            partial.mkdir(parents=True)
-            for name, content in files.items():
-                write_file(partial / name, content)
-            partial.rename(folder)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+        with whole_folder(folder) as partial:
+            write_files(partial, files)
         return folder
 
     def close(self) -> None:

@@ -25,6 +25,7 @@ from calib_ros.messages import (
     JointReadings,
     MessageError,
     Readings,
+    frame_name,
     measured_covariance,
 )
 from calib_ros.se3 import FloatArray
@@ -32,6 +33,10 @@ from calib_ros.track import Stamps
 from calib_ros.values import QUATERNION_TOLERANCE
 
 LITTLE_ENDIAN = b'\x00\x01'
+MOST_NAMES = 10_000
+"""Joints of a trajectory that are passed over on the way to its points."""
+MOST_LAYOUTS = 100
+"""Layouts of messages of one length that are remembered, and such lengths."""
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
 
 # Of each type: strings before the numbers, bytes between, kind and count of the numbers.
@@ -86,14 +91,8 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
     names = rows[:, _HEAD + _STAMP : begin]
     if (rows[:, :2] != rows[0, :2]).any() or (names != names[0]).any():
         return None
-    stamps = _numbers(rows, _HEAD, '<u4', 2).astype(np.int64)
     numbers = _numbers(rows, begin, dtype, count)
-    seconds = stamps[:, 0].astype(np.uint32).view(np.int32)
-    return Batch(
-        seconds.astype(np.int64) * 1_000_000_000 + stamps[:, 1],
-        strings,
-        numbers.astype(np.float64),
-    )
+    return Batch(_stamps(_numbers(rows, _HEAD, '<u4', 2)), strings, numbers.astype(np.float64))
 
 
 def readings(
@@ -130,12 +129,120 @@ def readings(
     else:
         good &= (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
     if numbers.shape[1] >= 7:
-        length = np.linalg.norm(numbers[:, 3:7], axis=1)
+        with np.errstate(over='ignore'):  # of what is not good
+            length = np.linalg.norm(numbers[:, 3:7], axis=1)
         good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
     if numbers.shape[1] > 7:
         good &= _usable_covariances(numbers[:, 7:])
         numbers[~numbers[:, 7:].any(axis=1), 7:] = np.nan
     return Readings(batch.stamps_ns[good], frame_id, child, distance, numbers[good]), good
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where in a TFMessage things are: of its transforms the links, stamps and numbers.
+
+    `names` are the places of all that makes it this layout, the `last` ones in one piece, and
+    `text` is what stands there.
+    """
+
+    links: tuple[tuple[str, str], ...]
+    stamps: tuple[int, ...]
+    numbers: tuple[int, ...]
+    names: NDArray[np.intp]
+    last: tuple[int, int]
+    text: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Alike:
+    """TFMessages of one layout: which of a batch they are, and their bytes (N, ...)."""
+
+    layout: Layout
+    which: NDArray[np.intp]
+    ends: tuple[bytes, bytes]
+    rows: NDArray[np.uint8]
+
+    def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
+        """Return stamps (N,) and numbers (N, 7) of one transform of each, and which are usable."""
+        numbers = _numbers(self.rows, self.layout.numbers[k], '<f8', 7).astype(np.float64)
+        good = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
+        length = np.linalg.norm(numbers[:, 3:], axis=1)
+        good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
+        return _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2)), numbers, good
+
+    def span(self, k: int) -> tuple[int, int]:
+        """Return the first and the last stamp of one transform of each."""
+        (s, ns), (t, nt) = (struct.unpack_from('<iI', x, self.layout.stamps[k]) for x in self.ends)
+        return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
+
+
+def transforms(blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:
+    """Return what is in TFMessages of one length; those that cannot be read are in none.
+
+    Layouts that are `known` by the length of messages need not be found again, and are added.
+    """
+    length = len(blobs[0])
+    if length < _HEAD:
+        return []
+    rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
+    rest = np.flatnonzero((rows[:, :2] == tuple(LITTLE_ENDIAN)).all(axis=1))
+    if len(known) == MOST_LAYOUTS:
+        known.clear()
+    layouts = known.setdefault(length, [])
+    found: list[Alike] = []
+    for layout in layouts:
+        rest = _part(blobs, rows, rest, layout, found)
+    while len(rest):
+        try:
+            layout = _transform_layout(blobs[rest[0]])
+        except (struct.error, UnicodeDecodeError):
+            rest = rest[1:]
+            continue
+        if len(layouts) == MOST_LAYOUTS:
+            layouts.clear()
+        layouts.append(layout)
+        rest = _part(blobs, rows, rest, layout, found)
+    return found
+
+
+def _part(
+    blobs: Sequence[bytes],
+    rows: NDArray[np.uint8],
+    rest: NDArray[np.intp],
+    layout: Layout,
+    found: list[Alike],
+) -> NDArray[np.intp]:
+    """Add those of some messages that have a layout to what is found; return the others."""
+    begin, end = layout.last
+    equal = (rows[rest, begin:end] == layout.text[len(layout.text) - (end - begin) :]).all(axis=1)
+    likely = np.flatnonzero(equal)  # mostly the last name tells; places are slow to gather
+    equal[likely] = (rows[np.ix_(rest[likely], layout.names)] == layout.text).all(axis=1)
+    which: NDArray[np.intp] = rest[equal]
+    others: NDArray[np.intp] = rest[~equal]
+    if len(which):
+        found.append(Alike(layout, which, (blobs[which[0]], blobs[which[-1]]), rows[which]))
+    return others
+
+
+def _transform_layout(blob: bytes) -> Layout:
+    count, at = _integer(blob, _HEAD)
+    links, stamps, numbers, names = [], [], [], [np.arange(_HEAD, at)]
+    for _ in range(count):
+        stamps.append(_aligned(at, 4))
+        begin = stamps[-1] + _STAMP
+        parent, middle = _string(blob, begin)
+        child, end = _string(blob, _aligned(middle, 4))
+        numbers.append(_aligned(end, 8))
+        at = numbers[-1] + 56
+        if at > len(blob):
+            raise struct.error
+        names += [np.arange(begin, middle), np.arange(_aligned(middle, 4), end)]
+        links.append((frame_name(parent), frame_name(child)))
+    places = np.concatenate(names)
+    text = np.frombuffer(blob, dtype=np.uint8)[places]
+    last = int(names[-1][0]), int(names[-1][-1]) + 1
+    return Layout(tuple(links), tuple(stamps), tuple(numbers), places, last, text)
 
 
 def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:
@@ -148,6 +255,12 @@ def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:
         except MessageError:
             usable[begin:end] = False
     return usable
+
+
+def _stamps(times: NDArray[np.generic]) -> Stamps:
+    """Return stamps (N,) [ns] of signed seconds and nanoseconds (N, 2)."""
+    seconds, nanoseconds = times[:, 0].view(np.int32), times[:, 1]
+    return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
 
 
 def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
@@ -170,18 +283,36 @@ def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
     return tuple(strings), _aligned(at + between, np.dtype(dtype).itemsize), dtype, count
 
 
+def trajectory_size(blob: bytes) -> tuple[int, int]:
+    """Return how many joints and points a serialised JointTrajectory has.
+
+    Zero for what cannot be read: such a message cannot be decoded either.
+    """
+    order = '<' if blob[:2] == LITTLE_ENDIAN else '>'
+    names = 0
+    try:
+        at = _string(blob, _HEAD + _STAMP, order)[1]
+        names, at = _integer(blob, at, order)
+        for _ in range(min(names, MOST_NAMES)):
+            at = _string(blob, at, order)[1]
+        points = _integer(blob, at, order)[0] if names <= MOST_NAMES else 0
+    except (struct.error, UnicodeDecodeError):
+        return names, 0
+    return names, points
+
+
 def _aligned(at: int, size: int) -> int:
     """Return the next place that is a multiple of a size after the encapsulation."""
     return at + (_HEAD - at) % size
 
 
-def _integer(blob: bytes, at: int) -> tuple[int, int]:
+def _integer(blob: bytes, at: int, order: str = '<') -> tuple[int, int]:
     at = _aligned(at, 4)
-    return int(struct.unpack_from('<I', blob, at)[0]), at + 4
+    return int(struct.unpack_from(f'{order}I', blob, at)[0]), at + 4
 
 
-def _string(blob: bytes, at: int) -> tuple[str, int]:
-    length, at = _integer(blob, at)
+def _string(blob: bytes, at: int, order: str = '<') -> tuple[str, int]:
+    length, at = _integer(blob, at, order)
     return blob[at : at + max(length - 1, 0)].decode(), at + length
 
 

@@ -14,6 +14,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +23,18 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
 from calib_ros.commands import add_commands
-from calib_ros.errors import CalibrationError, InputError
+from calib_ros.errors import CalibrationError, InputError, shortened
 from calib_ros.options import (
     NOT_ACCEPTED,
     add_chain,
     add_settings,
-    refuse_overwriting,
+    results,
     settings_of,
 )
+
+LARGEST_LOSS = 0.1
+"""Share of the messages of a bag that may be lost. As many fewer samples at random make standard
+deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
 
 if TYPE_CHECKING:
     from calib_ros.chain import Chain
@@ -43,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status: int = options.run(options)
     except (CalibrationError, OSError) as err:
-        print(f'calib_ros: {err}', file=sys.stderr)
+        print(f'calib_ros: {shortened(str(err))}', file=sys.stderr)
         return 1
     return status
 
@@ -77,6 +82,13 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         help='the poses are those of a fixed target in a camera on the flange',
     )
     identify.add_argument(
+        '--largest-loss',
+        type=float,
+        default=LARGEST_LOSS,
+        metavar='SHARE',
+        help='of the messages of a bag, beyond which the result is not accepted; 1: any',
+    )
+    identify.add_argument(
         '--socket-distance',
         type=float,
         metavar='M',
@@ -84,7 +96,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     add_chain(identify)
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
-    identify.add_argument('--force', action='store_true', help='overwrite files in --out')
+    identify.add_argument('--force', action='store_true', help='replace the result in --out')
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
     if 'identify' in given:  # they know numpy, which takes longer than all the rest
         add_settings(identify)
@@ -117,8 +129,15 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     export.add_argument('--urdf', type=Path, help='nominal URDF of the robot, to correct as well')
     export.add_argument('--base-link', help='of the URDF: where the arm starts')
     export.add_argument('--tip-link', help='of the URDF: where the arm ends')
+    export.add_argument(
+        '--ur-hash',
+        default='',
+        metavar='calib_...',
+        help='checksum that the driver of Universal Robots prints at its start, for '
+        'ur_kinematics.yaml',
+    )
     export.add_argument('--out', type=Path, required=True, help='folder to write')
-    export.add_argument('--force', action='store_true', help='overwrite files in --out')
+    export.add_argument('--force', action='store_true', help='replace the result in --out')
 
     add_commands(command, given)
 
@@ -134,7 +153,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     )
     demo.add_argument('--out', type=Path, default=Path('demo'), help='folder for what it writes')
     demo.add_argument('--chain', default='ur10e', help='chain file, URDF, or a robot by its name')
-    demo.add_argument('--force', action='store_true', help='overwrite an earlier demo')
+    demo.add_argument('--force', action='store_true', help='replace an earlier demo')
     _add_simulation(demo)
     return parser
 
@@ -153,6 +172,30 @@ def _add_simulation(parser: argparse.ArgumentParser) -> None:
 
 def _identify(options: argparse.Namespace) -> int:
     from calib_ros import report
+
+    if options.out is None:
+        result, samples, warnings, _, read = _identified(options)
+    else:
+        with results(options, RESULT_FILES) as folder:
+            result, samples, warnings, configuration, read = _identified(options)
+            _write_result(folder, options.out, result, samples, warnings, configuration)
+    for warning in (*warnings, *result.remarks):
+        print(f'warning: {warning}', file=sys.stderr)
+    if options.json:
+        document = report.as_document(result, samples) | {'warnings': list(warnings)}
+        print(json.dumps(document, indent=2))
+    else:
+        if read:
+            print(read)
+        print(report.summary(result))
+    return 0 if result.accepted else NOT_ACCEPTED
+
+
+def _identified(
+    options: argparse.Namespace,
+) -> tuple[Identification, dict[str, Any], tuple[str, ...], str, str]:
+    """Return a result, what became of the input, warnings, the configuration, what was read."""
+    from calib_ros import report
     from calib_ros.config import load_chain
     from calib_ros.problem import Problem
     from calib_ros.selection import identify_model
@@ -170,8 +213,10 @@ def _identify(options: argparse.Namespace) -> int:
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
     chain = load_chain(options.chain)
     settings = settings_of(options)
-    refuse_overwriting(options, RESULT_FILES)
+    if not 0.0 <= options.largest_loss <= 1.0:
+        raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     warnings: tuple[str, ...] = ()
+    read = ''
     if options.csv is not None:
         from calib_ros.tables import read_table
 
@@ -204,19 +249,16 @@ def _identify(options: argparse.Namespace) -> int:
         from calib_ros.session import CalibrationSession
 
         session = CalibrationSession(chain, settings)
-        warnings = replay(options.bag, session)
+        replayed = replay(options.bag, session)
+        warnings = replayed.warnings
         result = session.identify()
-        samples = session.account().as_document()
-    for warning in (*warnings, *result.remarks):
-        print(f'warning: {warning}', file=sys.stderr)
-    configuration = report.configuration_yaml(options.chain, settings)
-    _write_result(options.out, result, samples, warnings, configuration)
-    if options.json:
-        document = report.as_document(result, samples) | {'warnings': list(warnings)}
-        print(json.dumps(document, indent=2))
-    else:
-        print(report.summary(result))
-    return 0 if result.accepted else NOT_ACCEPTED
+        account = session.account()
+        read = f'{replayed}; {account}'
+        counts = {'recorded': replayed.recorded, 'read': replayed.read}
+        samples = counts | account.as_document()
+        lost = replayed.refusals(account, options.largest_loss)
+        result = replace(result, refusals=(*result.refusals, *lost))
+    return result, samples, warnings, report.configuration_yaml(options.chain, settings), read
 
 
 def _sessions(options: argparse.Namespace) -> tuple[str, ...]:
@@ -226,7 +268,7 @@ def _sessions(options: argparse.Namespace) -> tuple[str, ...]:
 def _simulate(options: argparse.Namespace) -> int:
     from calib_ros.config import load_chain
 
-    truth = _write_simulation(load_chain(options.chain), options)
+    truth = _write_simulation(load_chain(options.chain), options, options.bag)
     print(f'wrote {options.bag} and the true chain {truth}')
     return 0
 
@@ -258,10 +300,11 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from calib_ros.config import load_chain, parse_calibration, read_text
-    from calib_ros.export import Export, exports
-    from calib_ros.files import write_file
+    from calib_ros.config import URDF_SUFFIXES, load_chain, parse_calibration, read_text
+    from calib_ros.export import CORRECTED_URDF, FILES, Export, exports
+    from calib_ros.files import write_files
     from calib_ros.urdf import corrected_urdf
+    from calib_ros.vendors import VENDOR_FILES, vendor_files
     from calib_ros.waypoints import read_joints
 
     nominal, path = load_chain(options.chain), options.calibration
@@ -270,14 +313,18 @@ def _export(options: argparse.Namespace) -> int:
     if options.measured is not None:
         measured = read_joints(options.measured, chain)
     found = exports(chain, nominal, measured, origin)
+    links = {'base_link': options.base_link, 'tip_link': options.tip_link}
+    urdf = ''
     if options.urdf is not None:
-        links = (options.base_link, options.tip_link)
-        text = corrected_urdf(read_text(options.urdf), chain, *links)
-        found = (*found, Export(f'{options.urdf.stem}_corrected.urdf', text, 0.0))
-    options.out.mkdir(parents=True, exist_ok=True)
-    refuse_overwriting(options, [each.name for each in found])
+        urdf = read_text(options.urdf)
+        text = corrected_urdf(urdf, chain, **links)
+        found = (*found, Export(f'{options.urdf.stem}{CORRECTED_URDF}', text, 0.0))
+    elif Path(options.chain).suffix in URDF_SUFFIXES:
+        urdf = read_text(Path(options.chain))
+    found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
+    with results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as folder:
+        write_files(folder, {each.name: each.content for each in found})
     for each in found:
-        write_file(options.out / each.name, each.content, overwrite=options.force)
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
         print(f'{options.out / each.name}: {exact}')
     return 0
@@ -318,34 +365,33 @@ def _demo(options: argparse.Namespace) -> int:
     from calib_ros.session import CalibrationSession
     from calib_ros.settings import Settings
 
-    refuse_overwriting(options, RESULT_FILES)
-    options.bag = options.out / 'bag'
-    if options.force and options.bag.exists():
-        import shutil
-
-        shutil.rmtree(options.bag)
     chain = load_chain(options.chain)
-    truth = _write_simulation(chain, options)
-    print(f'1. simulated: {options.bag}, an arm with known errors ({truth.name})')
-    session = CalibrationSession(chain, Settings())
-    replay(options.bag, session)
-    result = session.identify()
+    own = (*RESULT_FILES, 'bag_truth.yaml', 'bag/bag.*', 'bag/metadata.yaml')
+    with results(options, own) as folder:
+        folder.mkdir()
+        bag = folder / 'bag'
+        truth = _write_simulation(chain, options, bag)
+        session = CalibrationSession(chain, Settings())
+        replay(bag, session)
+        result = session.identify()
+        configuration = report.configuration_yaml(options.chain, session.settings)
+        document = session.account().as_document()
+        _write_result(folder, options.out, result, document, (), configuration)
+        against = report.against_truth(result, load_chain(truth))
+    print(f'1. simulated: {options.out / "bag"}, an arm with known errors ({truth.name})')
     print(f'2. replayed: {session.account()}')
     print(f'3. identified: {report.summary(result)}')
     print('4. identified offsets against the true ones [mm, mrad]:')
-    print(report.against_truth(result, load_chain(truth)))
-    configuration = report.configuration_yaml(options.chain, session.settings)
-    _write_result(options.out, result, session.account().as_document(), (), configuration)
+    print(against)
     print(f'5. wrote {options.out}/: {", ".join(RESULT_FILES)}')
     return 0 if result.accepted else NOT_ACCEPTED
 
 
-def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
+def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
     """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
     import numpy as np
 
     from calib_ros.config import dump_chain
-    from calib_ros.files import write_file
     from calib_ros.replay import Recording, write_bag
     from calib_ros.simulation import Cell, drive, faulty, measure
 
@@ -363,11 +409,9 @@ def _write_simulation(chain: Chain, options: argparse.Namespace) -> Path:
     recording = Recording(
         chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
     )
-    options.bag.parent.mkdir(parents=True, exist_ok=True)
-    write_bag(options.bag, recording, options.storage)
-    path: Path = options.bag.parent / f'{options.bag.name}_truth.yaml'
-    write_file(path, dump_chain(true, {'source': 'simulation'}), overwrite=True)
-    return path
+    truth = bag.with_name(f'{bag.name}_truth.yaml')
+    write_bag(bag, recording, options.storage, {truth: dump_chain(true, {'source': 'simulation'})})
+    return truth
 
 
 RESULT_FILES = (
@@ -380,7 +424,8 @@ RESULT_FILES = (
 
 
 def _write_result(
-    out: Path | None,
+    folder: Path,
+    out: Path,
     result: Identification,
     samples: dict[str, Any],
     warnings: tuple[str, ...],
@@ -388,16 +433,13 @@ def _write_result(
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
 
-    Files of an earlier result are in the way only with --force; `refuse_overwriting` has seen
-    to it. A chain that was accepted earlier is kept under another name when this result is not.
+    A chain that was accepted earlier, in `out`, is kept under another name when this result is
+    not: it does not belong to the files beside it any more.
     """
-    if out is None:
-        return
     from calib_ros import report
-    from calib_ros.files import write_file
+    from calib_ros.files import write_files
     from calib_ros.plots import before_after_png
 
-    out.mkdir(parents=True, exist_ok=True)
     document = report.as_document(result, samples) | {'warnings': list(warnings)}
     contents: dict[str, str | bytes] = {
         'result.json': json.dumps(document, indent=2) + '\n',
@@ -408,10 +450,9 @@ def _write_result(
     earlier = out / 'calibration.yaml'
     if result.accepted:
         contents['calibration.yaml'] = report.calibration_yaml(result)
-    elif earlier.exists():  # it does not belong to the files beside it any more
-        earlier.replace(out / 'calibration.previous.yaml')
-    for name, content in contents.items():
-        write_file(out / name, content, overwrite=True)
+    elif earlier.exists():
+        contents['calibration.previous.yaml'] = earlier.read_bytes()
+    write_files(folder, contents)
 
 
 if __name__ == '__main__':

@@ -26,14 +26,13 @@ from calib_ros.messages import Reading
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
 from calib_ros.settings import Settings
+from calib_ros.strays import JUMP
 from calib_ros.track import CAUSES, Motion, Rows, Stamps, Track, unwrapped
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
-JUMP = 20
-"""So many joint samples in succession from before the buffer mean that the clock jumped back."""
 MOST_STREAMS = 50
 """Streams of measurements that are told apart: a tracker may number its markers without end."""
 _DISTANCE, _POSITION, _QUAT, _COVARIANCE = slice(0, 1), slice(0, 3), slice(3, 7), slice(7, 43)
@@ -147,7 +146,7 @@ class Collector:
             if self._backwards < JUMP:
                 self.dropped['joints: later than lateness allows'] += 1
                 return
-            self._start_anew()
+            self.start_anew()
         self._backwards = 0
         if not self._track.room(columns):
             self._make_room(columns)
@@ -523,7 +522,7 @@ class Collector:
         if not self._track.room(columns):
             self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
 
-    def _start_anew(self) -> None:
+    def start_anew(self) -> None:
         """Go on after the clock jumped back: finish what came before, keep the samples."""
         self.finish()
         self.notes['the clock jumped back'] += 1

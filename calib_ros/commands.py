@@ -19,7 +19,7 @@ from calib_ros.options import (
     NOT_ACCEPTED,
     add_chain,
     add_settings,
-    refuse_overwriting,
+    results,
     settings_of,
 )
 
@@ -115,7 +115,7 @@ def _add_workspace(parser: argparse.ArgumentParser) -> None:
     add('--cells', type=int, default=9, help='placements along each axis')
     add('--turns', type=int, default=1, help='turns of the task about the vertical to try')
     add('--seed', type=int, default=0, help='of the random numbers')
-    add('--force', action='store_true', help='overwrite files in --out')
+    add('--force', action='store_true', help='replace the result in --out')
 
 
 def _add_calibration(parser: argparse.ArgumentParser) -> None:
@@ -292,17 +292,26 @@ def _check_plan(options: argparse.Namespace) -> None:
 
 
 def _workspace(options: argparse.Namespace) -> int:
-    import numpy as np
-
-    from calib_ros import placement, plots, workspace
-    from calib_ros.config import load_chain
-    from calib_ros.files import write_file
-    from calib_ros.waypoints import csv_of, joints_csv
+    from calib_ros.files import write_files
 
     for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
         if getattr(options, name) < lowest:
             raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
-    refuse_overwriting(options, WORKSPACE_FILES + PLACEMENT_FILES)
+    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as folder:
+        contents = _workspace_files(options)
+        write_files(folder, contents)
+    print(contents['workspace.md'], end='')
+    return 0
+
+
+def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
+    """Return the files of a map, and of placements where there is a task."""
+    import numpy as np
+
+    from calib_ros import placement, plots, workspace
+    from calib_ros.config import load_chain
+    from calib_ros.waypoints import csv_of, joints_csv
+
     arm = workspace.CalibratedArm.read(options.result, load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
@@ -322,11 +331,7 @@ def _workspace(options: argparse.Namespace) -> int:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name, content in (contents | {'workspace.md': words}).items():
-        write_file(options.out / name, content, overwrite=options.force)
-    print(words, end='')
-    return 0
+    return contents | {'workspace.md': words}
 
 
 def _task(

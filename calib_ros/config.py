@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros import se3
+from calib_ros import se3, texts
 from calib_ros.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.settings import Settings
-from calib_ros.urdf import chain_from_urdf
-from calib_ros.values import QUATERNION_TOLERANCE, parse_number, parse_numbers
+from calib_ros.texts import parse_yaml
+from calib_ros.urdf import MOST_JOINTS, chain_from_urdf
+from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_name, parse_number, parse_numbers
 
 CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
@@ -65,10 +66,7 @@ def read_urdf(
 
 def read_text(path: Path) -> str:
     """Return the text of a chain file."""
-    try:
-        return path.read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as err:
-        raise ConfigError(f'cannot read chain file {path}: {err}') from err
+    return texts.read_text(path, what='chain file ')
 
 
 def shipped_robots() -> dict[str, Path]:
@@ -88,22 +86,7 @@ def shipped_robots() -> dict[str, Path]:
 
 def parse_chain(text: str, where: str = 'chain file') -> Chain:
     """Turn the text of a chain file into a chain; `where` names it in errors."""
-    import yaml
-
-    class Loader(yaml.SafeLoader):
-        """Refuses a key that comes twice, of which YAML silently keeps the last."""
-
-        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-            keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
-            for key in keys:
-                if keys.count(key) > 1:
-                    raise ConfigError(f'{where}: key "{key}" comes twice')
-            return super().construct_mapping(node, deep)
-
-    try:
-        document = yaml.load(text, Loader)
-    except (yaml.YAMLError, ValueError) as err:
-        raise ConfigError(f'{where} is not valid YAML: {" ".join(str(err).split())}') from err
+    document = parse_yaml(text, where)
     content = _mapping(document, CHAIN_KEYS, where)
     for key in ('convention', 'joints'):
         if key not in content:
@@ -111,6 +94,8 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
+    if len(rows) > MOST_JOINTS:
+        raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_JOINTS}')
     parallel = content.get('parallel')
     if parallel is not None and not (
         isinstance(parallel, list) and all(isinstance(name, str) for name in parallel)
@@ -118,14 +103,14 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
         raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')
     try:
         return Chain(
-            name=str(content.get('name', Path(where).stem)),
+            name=parse_name(content.get('name', Path(where).stem), f'{where}: name'),
             convention=content['convention'],
             joints=tuple(_joint(row, f'{where}: joint {k + 1}') for k, row in enumerate(rows)),
             parallel=None if parallel is None else tuple(parallel),
             base=_frame(content.get('base'), f'{where}: base'),
             tool=_frame(content.get('tool'), f'{where}: tool'),
             frames=tuple(
-                (name, _frame(frame, f'{where}: frames.{name}'))
+                (parse_name(name, f'{where}: frames'), _frame(frame, f'{where}: frames.{name}'))
                 for name, frame in _dictionary(content.get('frames'), f'{where}: frames').items()
             ),
             **_gravity(content, where),
@@ -147,9 +132,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
 
 def calibration_record(text: str) -> dict[str, Any]:
     """Return what a chain file says about where its numbers come from."""
-    import yaml
-
-    record = yaml.safe_load(text).get('calibration')
+    record = parse_yaml(text, 'chain file').get('calibration')
     return record if isinstance(record, dict) else {}
 
 
@@ -360,15 +343,20 @@ def _joint(row: object, where: str) -> Joint:
             raise ConfigError(f'{where}: key "{key}" is missing')
     numbers = {
         key: parse_number(content[key], f'{where}: {key}')
-        for key in (*DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'gear_ratio')
+        for key in (*DH_KINDS, 'sign', 'mass', 'gear_ratio')
         if content.get(key) is not None
     }
+    for key in ('lower', 'upper'):
+        if content.get(key) is not None:
+            limit = parse_number(content[key], f'{where}: {key}', largest=math.inf)
+            if abs(limit) <= LARGEST:  # what some write where there is none
+                numbers[key] = limit
     sign = numbers.pop('sign', 1.0)
     centre = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
     if sign not in (1.0, -1.0):
         raise ConfigError(f'{where}: sign must be 1 or -1, not {sign:g}')
     return Joint(
-        name=str(content['name']),
+        name=parse_name(content['name'], f'{where}: name'),
         type=content.get('type', 'revolute'),
         sign=int(sign),
         com=(centre[0], centre[1], centre[2]),

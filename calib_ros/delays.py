@@ -31,6 +31,10 @@ CONVINCING = 0.8
 """Least correlation."""
 MOVING = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
+FEWEST = 10
+"""Fewest samples of joints, and measurements, that are looked at."""
+MOST_TIME = 300.0
+"""Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
 WATCH_NS = 15_000_000_000
 """Time over which a watch looks."""
 WATCHED = 20_000
@@ -138,7 +142,7 @@ def find_delay(
 
     Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3).
     """
-    if len(joint_stamps) < 10 or len(stamps) < 10:
+    if len(joint_stamps) < FEWEST or len(stamps) < FEWEST:
         return None
     start = joint_stamps[0]
     joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
@@ -146,9 +150,12 @@ def find_delay(
     end = min(joint_times[-1], times[-1] + LONGEST)
     if end - begin < LEAST_MOTION:
         return None
+    begin = max(begin, end - MOST_TIME)
     grid = np.arange(begin, end, STEP)
     coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
     nearest = np.unique(np.round(coarse).astype(int))
+    if len(nearest) < FEWEST:  # a gap
+        return None
     poses = chain.forward(joints[nearest])
     first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
     second = _speed(times, positions, rotations, rotations is not None)

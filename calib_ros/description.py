@@ -7,8 +7,10 @@ Origins are written into the text itself: everything else stays as it is, byte f
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ET
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from xml.parsers import expat
@@ -19,12 +21,20 @@ from scipy.spatial.transform import Rotation
 from calib_ros import se3
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.se3 import FloatArray
+from calib_ros.texts import LARGEST_TEXT
+from calib_ros.values import LARGEST, parse_name
 
 MOVING = ('revolute', 'continuous', 'prismatic')
 TYPES = (*MOVING, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
+MOST_LINKS = 10_000
+"""Links, and joints, of a URDF."""
+SHORTEST_AXIS = 1e-9
+"""Largest component of a joint's axis that shows no direction."""
 UNCHANGED = 1e-13
 """A position [m] or rotation that would change by less is left as it is written."""
+
+_DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,15 +82,15 @@ class Description:
         tip = self._usual_tip(base) if tip is None else tip
         leading = {joint.child: joint for joint in self.joints}
         path: list[DescribedJoint] = []
-        while (path[0].parent if path else tip) != base:
-            link = path[0].parent if path else tip
+        while (link := path[-1].parent if path else tip) != base:
             if link not in leading:
-                before = ', '.join([link, *(joint.child for joint in path)])
+                before = ', '.join([link, *(joint.child for joint in reversed(path))])
                 raise ConfigError(
                     f'no joints lead from link "{base}" out to link "{tip}": choose base_link '
                     f'among those before it, {before}'
                 )
-            path.insert(0, leading[link])
+            path.append(leading[link])
+        path.reverse()
         if not any(joint.moves for joint in path):
             raise ConfigError(f'no joint moves between link "{base}" and link "{tip}"')
         for joint in path:
@@ -129,9 +139,16 @@ def parse_urdf(text: str) -> Description:
         When it is no URDF.
 
     """
+    if _DOCTYPE.search(text):
+        raise ConfigError(
+            'the URDF has a <!DOCTYPE>, in which entities can stand for anything: remove it, no '
+            'URDF needs one'
+        )
+    if len(text) > LARGEST_TEXT:
+        raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
     try:
         root = ET.fromstring(text)
-    except ET.ParseError as err:
+    except (ET.ParseError, ValueError) as err:  # the latter for what UTF-8 cannot hold
         raise ConfigError(f'the URDF is not valid XML: {err}') from err
     if any('xacro' in element.tag.rpartition('}')[0] for element in root.iter()):
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
@@ -139,33 +156,40 @@ def parse_urdf(text: str) -> Description:
         raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>')
     masses = [(element.get('name', ''), _inertial(element)) for element in root.findall('link')]
     links = dict(masses)
-    joints = [_joint(element, links) for element in root.findall('joint')]
+    described = root.findall('joint')
+    if max(len(masses), len(described)) > MOST_LINKS:
+        raise ConfigError(f'the URDF has more than {MOST_LINKS} links or joints')
+    joints = [_joint(element, links) for element in described]
     for what, names in (
         ('links are named', [name for name, _ in masses]),
         ('joints are named', [joint.name for joint in joints]),
         ('joints lead to link', [joint.child for joint in joints]),
     ):
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise ConfigError(f'two {what} "{name}" in the URDF')
-    roots = [name for name in links if name not in {joint.child for joint in joints}]
+    children = {joint.child for joint in joints}
+    roots = [name for name in links if name not in children]
     if len(roots) != 1:
         found = ', '.join(roots) or 'none'
         raise ConfigError(f'the links of a URDF are a tree with one root; roots here: {found}')
-    outwards: list[DescribedJoint] = []
-    reached = [roots[0]]
-    for link in reached:  # grows
-        behind = [joint for joint in joints if joint.parent == link]
-        outwards += behind
-        reached += [joint.child for joint in behind]
+    behind: dict[str, list[DescribedJoint]] = {}
+    for joint in joints:
+        behind.setdefault(joint.parent, []).append(joint)
+    outwards = list(behind.get(roots[0], ()))
+    for joint in outwards:  # grows
+        outwards += behind.get(joint.child, ())
     if len(outwards) < len(joints):
-        loop = ', '.join(joint.name for joint in joints if joint not in outwards)
+        reached = {joint.child for joint in outwards}
+        loop = ', '.join(joint.name for joint in joints if joint.child not in reached)
         raise ConfigError(f'the links of a URDF are a tree; there is a loop among joints {loop}')
-    return Description(root.get('name') or 'robot', roots[0], links, tuple(outwards))
+    name = parse_name(root.get('name') or 'robot', 'the name of the robot')
+    return Description(name, roots[0], links, tuple(outwards))
 
 
 def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
-    name, kind = element.get('name', ''), element.get('type', '')
+    name = parse_name(element.get('name', ''), 'the name of a joint')
+    kind = element.get('type', '')
     where = f'joint "{name}"'
     if kind not in TYPES:
         raise UnknownNameError(f'type of {where}', kind, TYPES)
@@ -176,16 +200,15 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     axis = np.zeros(3)
     if kind in MOVING:
         axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
-        if not axis.any():
+        size = np.abs(axis).max()
+        if size < SHORTEST_AXIS:
             raise ConfigError(f'the axis of {where} has no direction')
+        axis = axis / size
         axis = axis / np.linalg.norm(axis)
     lower, upper = None, None
     limit = _child(element, 'limit')
     if kind in ('revolute', 'prismatic') and {'lower', 'upper'} & set(limit.keys()):
-        lower, upper = (
-            float(_numbers(limit, key, f'limit of {where}', '0', 1)[0])
-            for key in ('lower', 'upper')
-        )
+        lower, upper = (_limit(limit, key, where) for key in ('lower', 'upper'))
     return DescribedJoint(
         name=name,
         type=kind,
@@ -197,6 +220,12 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
         upper=upper,
         mimics=element.find('mimic') is not None,
     )
+
+
+def _limit(element: ET.Element, key: str, where: str) -> float | None:
+    """Return a limit [rad or m]; none where it is as large as no arm moves."""
+    limit = float(_numbers(element, key, f'limit of {where}', '0', 1, math.inf)[0])
+    return limit if abs(limit) <= LARGEST else None
 
 
 def _inertial(link: ET.Element) -> tuple[float, FloatArray]:
@@ -220,7 +249,12 @@ def _child(element: ET.Element, tag: str) -> ET.Element:
 
 
 def _numbers(
-    element: ET.Element, key: str, where: str, default: str, count: int = 3
+    element: ET.Element,
+    key: str,
+    where: str,
+    default: str,
+    count: int = 3,
+    largest: float = LARGEST,
 ) -> FloatArray:
     text = element.get(key, default)
     if '${' in text:
@@ -232,6 +266,8 @@ def _numbers(
     if len(values) != count or not np.isfinite(values).all():
         what = f'{count} finite numbers' if count > 1 else 'a finite number'
         raise ConfigError(f'{key} in the {where} must be {what}, not "{text}"')
+    if np.abs(values).max() > largest:
+        raise ConfigError(f'{key} in the {where} must be at most {largest:g}, not "{text}"')
     return values
 
 
@@ -253,8 +289,7 @@ def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
     for start, tag, name in sorted(_places(data, origins), reverse=True):
         before, rest = data[:start].decode(), data[start:].decode()
         match = _TAG.match(rest)
-        if match is None:
-            raise ConfigError(f'the origin of joint "{name}" is an XML entity: write it in place')
+        assert match is not None  # without entities, an element begins where expat says
         head, tail = rest[: match.end()], rest[match.end() :]
         if tag == 'origin':
             head = _with_origin(head, origins[name])

@@ -93,10 +93,9 @@ class Diagnostics:
         if fresh:
             wrong.append(f'messages are dropped ({", ".join(fresh)})')
         level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
-        if self._archive.error:
-            wrong.insert(0, f'samples are in memory only: {self._archive.error}')
+        if self._archive.trouble:
             level = DiagnosticStatus.ERROR
-        return level, ''.join(f'{text}; ' for text in wrong)
+        return level, ''.join([self._archive.trouble, *(f'{text}; ' for text in wrong)])
 
     def _figures(self, account: Account) -> dict[str, Any]:
         session = self._session

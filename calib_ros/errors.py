@@ -7,9 +7,29 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LONGEST = 1000
+"""Characters of a message; what is quoted from a file may be of any length."""
+LIKELY = 1000
+"""Alternatives, and characters of a name, among which a misspelt name is looked for."""
+
+
+def shortened(text: str, longest: int = LONGEST) -> str:
+    """Return a text without its middle where it is too long.
+
+    What is wrong stands first in a message, how to mend it last.
+    """
+    if len(text) <= longest:
+        return text
+    gap = f' ... ({len(text)} characters) ... '
+    end = (longest - len(gap)) // 3
+    return text[: longest - len(gap) - end] + gap + text[len(text) - end :]
+
 
 class CalibrationError(Exception):
     """Base of every error that calib_ros raises on purpose."""
+
+    def __init__(self, message: str = '') -> None:
+        super().__init__(shortened(message))
 
 
 class ConfigError(CalibrationError):
@@ -27,7 +47,8 @@ class UnknownNameError(ConfigError):
         self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)
-        near = difflib.get_close_matches(str(name), self.alternatives, n=1, cutoff=0.5)
+        likely = self.alternatives[:LIKELY] if len(str(name)) <= LIKELY else ()
+        near = difflib.get_close_matches(str(name), likely, n=1, cutoff=0.5)
         hint = f'did you mean "{near[0]}"? ' if near else ''
         super().__init__(
             f'unknown {what} "{name}": {hint}valid are {", ".join(self.alternatives)}'

@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -30,6 +31,7 @@ from calib_ros import se3
 from calib_ros.chain import DH_KINDS, Chain, Frame, Joint, JointType
 from calib_ros.config import dump_chain, dump_yaml, parse_chain
 from calib_ros.errors import CalibrationError
+from calib_ros.escapes import from_cell, to_cell
 from calib_ros.identifiability import structurally_independent
 from calib_ros.leastsquares import Samples, System, minimise
 from calib_ros.observations import Observations
@@ -40,6 +42,12 @@ EXACT = 1e-9
 POSES = 1000
 FITTED = 200
 """Poses to which a table that cannot be exact is fitted; it is judged on all."""
+FILES = (
+    *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
+    *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
+)
+CORRECTED_URDF = '_corrected.urdf'
+"""End of the name of a corrected URDF beside these files."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)
 
 
@@ -91,7 +99,7 @@ def exports(
         text = _csv(form, what, lost)
         again = _read_csv(text, form)
         found.append(_checked(f'dh_{convention}.csv', text, arm, again.forward(q), q, lost))
-        text = _head(form, what, lost) + dump_chain(form, origin)
+        text = head(form, what, lost) + dump_chain(form, origin)
         again = parse_chain(text)
         found.append(_checked(f'dh_{convention}.yaml', text, arm, again.forward(q), q, lost))
     text = kinematics_yaml(arm, origin)
@@ -149,12 +157,8 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
     slides along, the z axis of its frame.
     """
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
-    zero = [replace(joint, sign=1) for joint in form.joints]
-    poses = {}
-    for joint in zero:
-        single = Chain(chain.name, 'modified', (joint,), parallel=())
-        poses[joint.name] = _xyz_rpy(single.forward(np.zeros((1, 1)))[0])
-    poses['flange'] = _xyz_rpy(form.frame('tool').matrix)
+    names = (*chain.joint_names, 'flange')
+    poses = {name: xyz_rpy(place) for name, place in zip(names, origins(form), strict=True)}
     document: dict[str, Any] = {
         'kinematics': poses,
         'signs': {joint.name: joint.sign for joint in form.joints},
@@ -164,6 +168,17 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
     if origin:
         document['calibration'] = dict(origin)
     return dump_yaml(document)
+
+
+def origins(form: Chain) -> FloatArray:
+    """Return the frames of the joints of a modified chain, each in the one before, and the flange.
+
+    Shape (n + 1, 4, 4), at zero. The flange is the tool of the chain.
+    """
+    rows = [replace(joint, sign=1) for joint in form.joints]
+    chains = [Chain(form.name, 'modified', (row,), parallel=()) for row in rows]
+    places = [chain.forward(np.zeros((1, 1)))[0] for chain in chains]
+    return np.array([*places, form.frame('tool').matrix])
 
 
 def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
@@ -181,45 +196,50 @@ def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
             moved[:, :3, :3] = se3.exp_rotation(turn)
         else:
             moved[:, 2, 3] = signs[joint.name] * values
-        pose = pose @ _matrix(poses[joint.name]) @ moved
-    return np.asarray(pose @ _matrix(poses['flange']) @ chain.frame('tool').matrix)
+        pose = pose @ pose_matrix(poses[joint.name]) @ moved
+    return np.asarray(pose @ pose_matrix(poses['flange']) @ chain.frame('tool').matrix)
 
 
-def _xyz_rpy(matrix: FloatArray) -> dict[str, float]:
+def xyz_rpy(matrix: FloatArray) -> dict[str, float]:
+    """Return a pose (4, 4) as x, y, z [m] and the angles [rad] about fixed axes."""
     angles = Rotation.from_matrix(matrix[:3, :3]).as_euler('xyz')
     numbers = [*matrix[:3, 3].tolist(), *angles.tolist()]
     return dict(zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), numbers, strict=True))
 
 
-def _matrix(pose: Mapping[str, float]) -> FloatArray:
+def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
+    """Return the pose (4, 4) that x, y, z, roll, pitch, yaw say."""
     rotation = Rotation.from_euler('xyz', [pose[k] for k in ('roll', 'pitch', 'yaw')])
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
-def _head(chain: Chain, what: str, error: float) -> str:
+def head(chain: Chain, what: str, error: float) -> str:
+    """Return the line that says what a file is, and how far [m] from the calibrated arm."""
+    name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
-    return f'# {chain.name}: {what}; metres and radians; {exact}\n'
+    return f'# {name}: {what}; metres and radians; {exact}\n'
 
 
 def _csv(chain: Chain, what: str, error: float) -> str:
     """Return the table of a chain with a line that says what it is."""
     text = io.StringIO()
-    text.write(_head(chain, what, error))
+    text.write(head(chain, what, error))
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(ROW)
     for joint in chain.joints:
         numbers = [repr(float(getattr(joint, kind))) for kind in DH_KINDS]
-        writer.writerow([joint.name, joint.type, joint.sign, *numbers])
+        writer.writerow([to_cell(joint.name), joint.type, joint.sign, *numbers])
     return text.getvalue()
 
 
 def _read_csv(text: str, form: Chain) -> Chain:
     """Return a chain with the rows of a table, in the frames of another one."""
     joints = []
-    for row in csv.DictReader(text.splitlines()[1:]):
+    for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
         kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'
         a, alpha, d, theta, beta = (float(row[name]) for name in DH_KINDS)
-        joints.append(Joint(row['joint'], kind, a, alpha, d, theta, beta, int(row['sign'])))
+        name = from_cell(row['joint'])
+        joints.append(Joint(name, kind, a, alpha, d, theta, beta, int(row['sign'])))
     return replace(form, joints=tuple(joints))
 
 

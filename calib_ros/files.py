@@ -1,17 +1,29 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files written as a whole or not at all."""
+"""Files and folders written as a whole or not at all, and names that may lead to files.
+
+A folder NAME is made as `.NAME.partial/NAME` beside its place. At the end an earlier NAME becomes
+`.NAME.partial/NAME.old`, and the new one takes its place: two renames. A process that is killed
+leaves `.NAME.partial` behind, with the earlier folder in it if it was killed between the two; the
+next one that writes NAME puts it back and removes the rest. `.NAME.partial` is locked by the
+process that writes into it, so leftovers of dead processes are told from the work of others.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import os
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from calib_ros.errors import InputError
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a file under a temporary name beside it, then rename it.
+    """Write a file under a temporary name beside it, then put it in place.
 
     Raises
     ------
@@ -19,15 +31,227 @@ def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> 
         When there is a file already and `overwrite` is False.
 
     """
-    if path.exists() and not overwrite:
-        raise InputError(f'{path} exists already: move it or choose another name')
-    partial = path.with_name(f'.{path.name}.{os.getpid()}.partial')
+    partial = path.with_name(f'.{path.name}.{secrets.token_hex(8)}.partial')
     data = content.encode() if isinstance(content, str) else content
+    if path.exists() and not overwrite:
+        raise _exists(path)
     try:
-        with partial.open('wb') as file:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+        with os.fdopen(os.open(partial, flags, 0o666), 'wb') as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        partial.replace(path)
+        if overwrite:
+            partial.replace(path)
+        else:
+            _rename_new(partial, path)
+    except OSError as err:
+        err.filename = err.filename or str(path)
+        raise
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
+    """Write new files by name into a folder, which is made if there is none."""
+    folder.mkdir(exist_ok=True)
+    for name, content in contents.items():
+        write_file(folder / name, content)
+
+
+@contextmanager
+def whole_folder(
+    path: Path, own: Sequence[str] | None = None, *, overwrite: bool = False
+) -> Iterator[Path]:
+    """Yield a path at which to make a folder; it is put in place when the block has ended.
+
+    When the block fails, or the process is killed, there is no folder, or the one from before.
+
+    Parameters
+    ----------
+    path : Path
+        The place of the folder. Missing parents are made.
+    own : sequence of str, optional
+        Glob patterns of what belongs to the folder. What an earlier folder holds besides is
+        kept. By default there must be no earlier one.
+    overwrite : bool
+        Replace what is there of `own`.
+
+    Raises
+    ------
+    InputError
+        When there is something that must not be replaced, or when another process writes the
+        same folder.
+
+    """
+    place = Path(os.path.realpath(path))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    work = place.with_name(f'.{place.name}.partial')
+    new, old = work / place.name, work / f'{place.name}.old'
+    claim = _claim(work, path)
+    try:
+        _clean_up(place, new, old)
+        _check_place(path, place, own, overwrite)
+        try:
+            yield new
+            _sync(new)
+            if place.exists():
+                _carry_over(place, new, own or ())
+                place.rename(old)
+            new.rename(place)
+            _sync(place.parent, deep=False)
+        finally:
+            _clean_up(place, new, old)
+    finally:
+        with suppress(OSError):  # it holds what could neither be put back nor removed
+            work.rmdir()
+        os.close(claim)
+
+
+def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
+    """Return the real path of a file that somebody else names, if it is in one of some folders.
+
+    Relative names are in the first folder. `allowed_by` says what to set otherwise.
+
+    Raises
+    ------
+    InputError
+        When it is elsewhere, by `..` or by a symbolic link say. Whether there is such a file is
+        not told.
+
+    """
+    places = [Path(os.path.realpath(folder)) for folder in folders]
+    try:
+        path = Path(os.path.realpath(places[0] / Path(name).expanduser()))
+    except (RuntimeError, ValueError):  # no such home, a zero byte
+        path = Path('/')
+    if not any(path.is_relative_to(place) for place in places):
+        raise InputError(f'{name!r:.200} is outside the folders of the node: {allowed_by}')
+    return path
+
+
+def _exists(path: Path) -> InputError:
+    return InputError(f'{path} exists already: move it or choose another name')
+
+
+def _rename_new(partial: Path, path: Path) -> None:
+    """Rename a file to a name that nothing has."""
+    try:
+        os.link(partial, path)
+    except FileExistsError:
+        raise _exists(path) from None
+    except OSError:  # a file system without hard links
+        if path.exists():
+            raise _exists(path) from None
+        partial.rename(path)
+
+
+def _claim(work: Path, path: Path) -> int:
+    """Make a folder to work in, or take one over that a dead process has left.
+
+    Returns its handle; the claim ends when that is closed.
+    """
+    while True:
+        try:
+            work.mkdir(mode=0o700)
+            made = True
+        except FileExistsError:
+            made = False
+        with suppress(FileNotFoundError):  # its owner has just ended: once more
+            handle = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                _lock(handle, work, path, made)
+                if os.path.samestat(os.fstat(handle), os.lstat(work)):
+                    return handle
+            except BaseException:
+                os.close(handle)
+                raise
+            os.close(handle)
+
+
+def _lock(handle: int, work: Path, path: Path, made: bool) -> None:
+    if os.fstat(handle).st_uid != os.geteuid():
+        raise InputError(f'{work} belongs to another user: choose another place for {path}')
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InputError(
+            f'another process is writing {path}: wait for it or choose another name'
+        ) from None
+    except OSError:  # a file system without locks: whoever made the folder has it
+        if not made:
+            raise InputError(
+                f'another process is writing {path}, or was killed: remove {work} if none runs'
+            ) from None
+
+
+def _clean_up(place: Path, new: Path, old: Path) -> None:
+    """Put an earlier folder back that was not replaced, and remove what is left over."""
+    if old.exists() and new.exists():
+        try:
+            old.rename(place)
+        except OSError as err:
+            raise InputError(f'{old} is the earlier {place}: move it away ({err})') from err
+    for folder in (old, new):
+        for inner, _, _ in os.walk(folder):
+            os.chmod(inner, 0o700)
+        if folder.exists():
+            shutil.rmtree(folder)
+
+
+def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: bool) -> None:
+    """Refuse a place at which no folder can or must be put."""
+    if not os.path.lexists(place):
+        return
+    if own is None:
+        raise InputError(f'{path} exists already: remove it or choose another name')
+    if not place.is_dir():
+        raise InputError(f'{path} is no folder: choose another name')
+    if os.path.ismount(place) or Path.cwd().is_relative_to(place):
+        raise InputError(
+            f'{path} is the current folder or a mount point, which cannot be put in place as a '
+            f'whole: choose a folder in it, such as {path / "result"}'
+        )
+    there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
+    if there and not overwrite:
+        raise InputError(f'{path} holds {", ".join(there)} already: choose another or --force')
+
+
+def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
+    """Give a folder what is in another one, `own` left out and nothing replaced."""
+    owned = _matching(source, own)
+
+    def left_out(folder: str, names: list[str]) -> list[str]:
+        return [name for name in names if Path(folder, name) in owned]
+
+    def link(first: str, second: str) -> None:
+        try:
+            os.link(first, second, follow_symlinks=False)
+        except FileExistsError:
+            pass
+        except OSError:  # no hard links here, or not to this file
+            shutil.copy2(first, second)
+
+    shutil.copytree(
+        source, target, symlinks=True, ignore=left_out, copy_function=link, dirs_exist_ok=True
+    )
+
+
+def _matching(folder: Path, patterns: Sequence[str]) -> set[Path]:
+    return {path for each in patterns for path in folder.glob(each)}
+
+
+def _sync(folder: Path, *, deep: bool = True) -> None:
+    """Wait until a folder is on the disk, with all that is in it."""
+    paths = [folder]
+    if deep:
+        paths += [inner for inner in folder.rglob('*') if inner.is_file() or inner.is_dir()]
+    for path in paths:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        except OSError:
+            if path.is_file():  # not every file system does that for folders
+                raise
+        finally:
+            os.close(handle)

@@ -22,12 +22,14 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros import outgoing
 from calib_ros.calibration import Calibration
 from calib_ros.candidates import draw_candidates
+from calib_ros.cdr import trajectory_size
 from calib_ros.compensation import Compensator, compensate_program, in_words
 from calib_ros.design import Design
 from calib_ros.errors import CalibrationError, InputError
@@ -50,6 +52,10 @@ CLOUD = 10_000
 """Points of the cloud of errors."""
 MOST_POINTS = 50_000
 """Points of a trajectory; a longer one is refused."""
+MOST_JOINTS = 1000
+"""Joints that a trajectory names; one of more is refused."""
+MOST_BYTES = 20_000_000
+"""Size of a serialised trajectory; 50,000 points of ten joints with all rates take 18 MB."""
 MOST_WAITING = 10
 """Trajectories that may wait; those that come on top are refused."""
 MOST_REASONS = 3
@@ -95,7 +101,11 @@ class Guide:
             JointTrajectory, '~/compensated_joint_trajectory', 10
         )
         node.create_subscription(
-            JointTrajectory, '~/joint_trajectory', self._guarded(self._on_trajectory), 10
+            JointTrajectory,
+            '~/joint_trajectory',
+            self._guarded(self._on_trajectory),
+            10,
+            raw=True,  # see `_too_large`
         )
 
     def join(self, timeout: float) -> bool:
@@ -117,7 +127,7 @@ class Guide:
         busy = self._advising is not None and not self._advising.done()
         if busy or self._session.settings.mode == 'continuous':
             return
-        samples = tuple(self._session.samples)
+        samples = tuple(self._session.usable)
         if samples == self._advised or all(sample.validation for sample in samples):
             return
         self._advised = samples
@@ -166,15 +176,18 @@ class Guide:
             )
         )
 
-    def _on_trajectory(self, message: Any) -> None:
+    def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_WAITING:
             self._refuse(f'{MOST_WAITING} others wait already, send them more slowly')
+        elif too_large := _too_large(data):
+            self._refuse(too_large)
         else:
-            self._start(self._correct, message, self._session.calibration)
+            self._start(self._correct, data, self._session.calibration)
 
-    def _correct(self, message: Any, calibration: Calibration | None) -> None:
+    def _correct(self, data: bytes, calibration: Calibration | None) -> None:
         """Publish a corrected trajectory, or nothing at all and log why."""
         try:
+            message = deserialize_message(data, JointTrajectory)
             corrected, self._last_trajectory = self._corrected_by(message, calibration)
         except CalibrationError as err:
             self._refuse(str(err))
@@ -190,8 +203,6 @@ class Guide:
             raise InputError(
                 'there is no accepted calibration to correct it by: call ~/identify or ~/load'
             )
-        if len(message.points) > MOST_POINTS:
-            raise InputError(f'{len(message.points)} points, at most {MOST_POINTS} are taken')
         compensator = self._compensator_of(calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
         program = trajectory_program(
@@ -233,3 +244,19 @@ class Guide:
 
     def _now(self) -> Any:
         return self._node.get_clock().now().to_msg()
+
+
+def _too_large(data: bytes) -> str:
+    """Return in words what a serialised trajectory has too much of; empty when it can be decoded.
+
+    To decode a million points takes many seconds, and no other thread runs meanwhile.
+    """
+    names, points = trajectory_size(data)
+    for count, most, what in (
+        (len(data), MOST_BYTES, 'bytes'),
+        (names, MOST_JOINTS, 'joints'),
+        (points, MOST_POINTS, 'points'),
+    ):
+        if count > most:
+            return f'{count} {what}, at most {most} are taken'
+    return ''

@@ -9,6 +9,7 @@ no executor may serve these subscriptions.
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,13 +18,13 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from calib_ros.errors import ConfigError
-from calib_ros.intake import Stream
+from calib_ros.intake import Stream, links_of
 
 INPUT_QUEUE = 2000
 """Messages of a topic that may wait while the node is busy; what comes on top is lost."""
@@ -39,8 +40,10 @@ class Hearing:
     before: int = 0
     rate: float = 0.0
     last: float | None = None
-    deaf: bool = False
-    """True when a publisher offers a QoS that is not asked for."""
+    deaf: str = ''
+    """What a publisher offers that is not what is asked for, in words."""
+    latched: bool = False
+    """True when it comes once and not again."""
     lost: int = 0
     """Messages that got lost on the way, as DDS tells by their numbers."""
     full: int = 0
@@ -61,7 +64,8 @@ class Hearing:
     @property
     def silent(self) -> bool:
         """Tell whether it has been heard before and is not any more."""
-        return self.last is not None and time.monotonic() - self.last > SILENCE
+        heard = self.last is not None and not self.latched
+        return heard and time.monotonic() - self.last > SILENCE
 
 
 class Inputs:
@@ -122,11 +126,13 @@ class Inputs:
             if heard.silent
         ]
         wrong += [
-            f'{topic} is published best effort, but reliable is asked for'
+            f'{topic} is published {heard.deaf} is asked for'
             for topic, heard in self._heard.items()
             if heard.deaf and not heard.count
         ]
         wrong += self._of_other_types()
+        streams = [stream for stream, _ in self._inputs.values()]
+        wrong += [words for links in links_of(streams) for words in links.problems()]
         losing = [topic for topic, heard in self._heard.items() if heard.losing]
         if losing:
             wrong.append(f'messages get lost on {", ".join(losing)}')
@@ -148,16 +154,13 @@ class Inputs:
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
         heard = self._heard.setdefault(self._node.resolve_topic_name(stream.topic), Hearing())
+        heard.latched = stream.still
         try:
             subscription = self._node.create_subscription(
                 _message_type(stream.type),
                 stream.topic,
                 lambda data: None,  # no executor serves it
-                QoSProfile(  # one for each: overriding changes it
-                    depth=INPUT_QUEUE,
-                    reliability=qos_profile_sensor_data.reliability,
-                    durability=qos_profile_sensor_data.durability,
-                ),
+                _qos(stream),
                 qos_overriding_options=overriding,
                 event_callbacks=self._noting(heard),
                 raw=True,
@@ -170,7 +173,8 @@ class Inputs:
 
     def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:
         def note_deaf(event: Any) -> None:
-            heard.deaf = True
+            latched = event.last_policy_kind == QoSPolicyKind.DURABILITY
+            heard.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
 
         def note_lost(event: Any) -> None:
             heard.lost = event.total_count  # the change leaves out what came with others
@@ -207,6 +211,20 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
     return found
 
 
+def _qos(stream: Stream) -> QoSProfile:
+    """Return how a topic is asked for; a new one each time, because overriding changes it."""
+    return QoSProfile(
+        depth=INPUT_QUEUE,
+        reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if stream.still else DurabilityPolicy.VOLATILE,
+    )
+
+
 def _message_type(name: str) -> Any:
     package, _, kind = name.partition('/msg/')
-    return getattr(importlib.import_module(f'{package}.msg'), kind)
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), kind)
+    except ImportError as err:
+        distribution = os.environ.get('ROS_DISTRO', 'jazzy')
+        name = f'ros-{distribution}-{package.replace("_", "-")}'
+        raise ConfigError(f'{package} cannot be imported, install {name}: {err}') from err

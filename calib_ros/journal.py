@@ -104,8 +104,8 @@ class Journal:
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
-        csv.writer(text, lineterminator='\n').writerow(row)
-        data = text.getvalue().encode()
+        csv.writer(text).writerow(row)  # by its own end of lines it quotes names with any
+        data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
         begin = os.fstat(self._file).st_size
         written = os.write(self._file, data)
         if written < len(data):  # the disk is full: no half row may stay

@@ -16,16 +16,20 @@ from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros import outgoing
 from calib_ros.archive import Archive
+from calib_ros.broadcast import Broadcast
 from calib_ros.chain import Chain
-from calib_ros.config import calibration_record, parse_calibration, read_text
+from calib_ros.config import calibration_record, parse_calibration, parse_chain, read_text
 from calib_ros.errors import InputError
 from calib_ros.export import exports
+from calib_ros.files import confined
 from calib_ros.identification import Identification
 from calib_ros.parameters import Given
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
 from calib_ros.session import CalibrationSession
+from calib_ros.sources import parse_sources
 from calib_ros.urdf import corrected_urdf
+from calib_ros.vendors import vendor_files
 
 
 class Published(NamedTuple):
@@ -76,6 +80,11 @@ class Keeper:
         self._posed: tuple[int, Sequence[float]] | None = None
         self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
         self._calibration = node.create_publisher(String, '~/calibration', latched)
+        for name in ('target_filename', 'calibration_filename'):
+            self._named(name)  # refused now rather than after a day's work
+        sources = parse_sources(given.settings.sources)
+        in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
+        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links, latched)
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(
@@ -90,20 +99,18 @@ class Keeper:
         """Write the calibration to `target_filename` or a new file; return its path."""
         if not self._published.text:
             raise InputError('there is no accepted calibration to save: call ~/identify first')
-        target = self._node.get_parameter('target_filename').value
-        return self._archive.save(*self._published, Path(target).expanduser() if target else None)
+        return self._archive.save(*self._published, self._named('target_filename'))
 
     def load(self) -> Path:
         """Take the calibration in `calibration_filename` or the newest one; return its path."""
-        name = self._node.get_parameter('calibration_filename').value
-        path = Path(name).expanduser() if name else self._archive.newest_calibration()
+        path = self._named('calibration_filename') or self._archive.newest_calibration()
         session = self._session
         if path is None:
             raise InputError(
                 f'there is no saved calibration of {session.chain.name} in '
                 f'{self._archive.folder}: set calibration_filename'
             )
-        text = read_text(path)
+        text = _calibration_text(path)
         chain, record = parse_calibration(text, str(path), session.chain, session.settings)
         serial, ours = record.get('robot_serial'), self._given.serial
         if serial and ours and serial != ours:
@@ -127,10 +134,12 @@ class Keeper:
     def export(self, found: Exportable) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
         record = calibration_record(found.text)
-        forms = exports(found.chain, self._session.chain, found.joints, record)
+        nominal, links = self._session.chain, self._given.links
+        forms = exports(found.chain, nominal, found.joints, record)
+        forms += vendor_files(found.chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
-            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **self._given.links)
+            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **links)
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:
@@ -144,7 +153,37 @@ class Keeper:
             outgoing.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
         )
 
+    def _named(self, parameter: str) -> Path | None:
+        """Return the file that a parameter names, which any node may have set, if it does."""
+        name = self._node.get_parameter(parameter).value
+        if not name:
+            return None
+        if not name.endswith(('.yaml', '.yml')):
+            raise InputError(f'{parameter} must end in .yaml or .yml')
+        return confined(
+            name,
+            (self._archive.folder, *self._given.allowed_folders),
+            f'choose {parameter} in data_dir, or start the node with allowed_folders',
+        )
+
     def _publish(self, chain: Chain, published: Published) -> None:
         self._published = published
         self._dh_parameters.publish(outgoing.dh_parameters(chain))
         self._calibration.publish(String(data=published.text))
+        self._broadcast.publish(chain, self._session.calibration.world_frame)
+
+
+def _calibration_text(path: Path) -> str:
+    """Return the text of a chain file; of any other file the answer must tell nothing."""
+    if not path.is_file():
+        raise InputError(f'there is no file {path}')
+    try:
+        text = read_text(path)
+        parse_chain(text)
+    except Exception as err:  # whatever it is, its words may quote the file
+        if isinstance(err.__cause__, OSError):
+            raise
+        raise InputError(
+            f'{path} is not a calibration: `calib_ros chain {path}` says what is wrong with it'
+        ) from None
+    return text

@@ -237,11 +237,7 @@ def _whitening(
     observations: Observations, sigma_position: float, sigma_orientation: float
 ) -> FloatArray:
     """Return W (6, 6, N) with W^T W the inverse covariance; zero rows for what is not measured."""
-    sigmas = np.repeat([sigma_position, sigma_orientation], 3)
-    covariance = np.tile(np.diag(sigmas**2), (len(observations), 1, 1))
-    if observations.covariance is not None:
-        own = ~np.isnan(observations.covariance[:, 0, 0])
-        covariance[own] = observations.covariance[own]
+    covariance = observations.covariances((sigma_position, sigma_orientation))
     covariance[~observations.oriented, 3:, :] = 0.0
     covariance[~observations.oriented, :, 3:] = 0.0
     covariance[~observations.oriented, 3:, 3:] = np.eye(3)

@@ -7,35 +7,77 @@ from __future__ import annotations
 import importlib
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from mmap import mmap
+from operator import itemgetter
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
 
 MAGIC = b'\x89MCAP0\r\n'
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+CHUNK_INDEX, STATISTICS = 0x08, 0x0B
 MESSAGE_HEAD = 22
 """Bytes before the data of a message."""
 _HEAD = struct.Struct('<BQ')  # kind and size
 _LOGGED = struct.Struct('<HIQ')  # channel, sequence and log time
 _CHUNK = struct.Struct('<QQQI')  # first and last log time, uncompressed size and checksum
 
+FOOTER = 37
+"""Bytes of the last record, with the place of the index, and of the magic after it."""
+MODULES = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
 Channel = TypeVar('Channel')
+Content: TypeAlias = 'bytes | mmap'
 
 
-def records(content: bytes, start: int = 0) -> Iterator[tuple[int, bytes]]:
+LARGEST_CHUNK = 64_000_000
+"""Bytes of a chunk when it is unpacked; recorders make chunks of one to ten million."""
+LARGEST_RATIO = 1000
+"""How much larger than its file a recording can be when all of it is unpacked, chunks aside."""
+
+
+def is_indexed(file: Path) -> bool:
+    """Tell whether a file ends with an index of its chunks, or says all about its topics."""
+    size = file.stat().st_size
+    with file.open('rb') as content:
+        content.seek(max(0, size - FOOTER))
+        try:
+            (begin,) = struct.unpack_from('<Q', content.read(FOOTER), _HEAD.size)
+        except struct.error:
+            return False
+        kinds = set()
+        while 0 < begin <= size - FOOTER:
+            content.seek(begin)
+            kind, length = _HEAD.unpack(content.read(_HEAD.size))
+            kinds.add(kind)
+            begin += _HEAD.size + length
+    return CHUNK_INDEX in kinds or {STATISTICS, SCHEMA} <= kinds
+
+
+def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, content) of the records, those in chunks included.
 
     Raises
     ------
     EOFError
         When the last one is cut off, after what it holds.
+    ValueError
+        When a chunk is within another one, or there is more in them than any recording holds.
 
     """
+    left = LARGEST_CHUNK + LARGEST_RATIO * len(content)
     while start < len(content):
         kind, size = _HEAD.unpack_from(content, start)
         start += _HEAD.size
         record = content[start : start + size]
         if kind == CHUNK:
-            yield from records(_unpacked(record))
+            if nested:
+                raise ValueError('a chunk is within a chunk')
+            unpacked = _unpacked(record)
+            left -= len(unpacked)
+            if left < 0:
+                raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+            yield from records(unpacked, nested=True)
         elif len(record) == size:
             yield kind, record
         if len(record) < size:
@@ -43,8 +85,10 @@ def records(content: bytes, start: int = 0) -> Iterator[tuple[int, bytes]]:
         start += size
 
 
-def logged(chunk: bytes, channels: Mapping[int, Channel]) -> Iterator[tuple[Channel, bytes]]:
-    """Yield the messages on some channels of a chunk, in the order in which they were logged.
+def logged(
+    chunk: bytes, channels: Mapping[int, Channel]
+) -> tuple[list[tuple[int, Channel, bytes]], Exception | None]:
+    """Return the messages on some channels of a chunk, in the order of their log times.
 
     Parameters
     ----------
@@ -53,11 +97,17 @@ def logged(chunk: bytes, channels: Mapping[int, Channel]) -> Iterator[tuple[Chan
     channels : mapping
         By their numbers.
 
+    Returns
+    -------
+    found : list
+        Log time, channel and data of each.
+    problem : Exception or None
+        What is wrong with a record, before which these messages stand.
+
     Raises
     ------
     ValueError
-        When the chunk does not have its size and checksum; when a record in it is damaged, after
-        the messages before it.
+        When the chunk does not have its size and checksum.
 
     """
     chunk = chunk[_HEAD.size :]
@@ -65,21 +115,36 @@ def logged(chunk: bytes, channels: Mapping[int, Channel]) -> Iterator[tuple[Chan
     content = _unpacked(chunk)
     if len(content) != size or checksum not in (0, zlib.crc32(content)):
         raise ValueError('a chunk does not have its size and checksum')
-    times, found, problem = [], [], None
+    found, problem = [], None
     try:
-        for kind, record in records(content):
+        for kind, record in records(content, nested=True):
             if kind == MESSAGE:
                 key, _, time = _LOGGED.unpack_from(record)
                 if key in channels and begin <= time <= end:
-                    times.append(time)
-                    found.append((channels[key], record[MESSAGE_HEAD:]))
-    except (EOFError, struct.error) as err:
-        problem = err
-    if times != sorted(times):
-        found = [found[k] for k in sorted(range(len(times)), key=times.__getitem__)]
-    yield from found
-    if problem is not None:
-        raise ValueError('a record in a chunk is damaged') from problem
+                    found.append((time, channels[key], record[MESSAGE_HEAD:]))
+    except (EOFError, ValueError, struct.error) as err:
+        problem = ValueError('a record in a chunk is damaged')
+        problem.__cause__ = err
+    found.sort(key=itemgetter(0))
+    return found, problem
+
+
+def unindexed(
+    content: Content, channels: Mapping[int, Channel]
+) -> Iterator[tuple[Channel, bytes]]:
+    """Yield the messages on some channels of a file as they stand in it."""
+    for kind, record in records(content, len(MAGIC)):
+        if kind == DATA_END:
+            return
+        if kind == MESSAGE:
+            (key,) = struct.unpack_from('<H', record)
+            if key in channels:
+                yield channels[key], record[MESSAGE_HEAD:]
+
+
+def unpacked_size(chunk: bytes) -> int:
+    """Return how large the content of a chunk is said to be; the record is with kind and size."""
+    return int(_CHUNK.unpack_from(chunk, _HEAD.size)[2])
 
 
 def string(record: bytes, start: int) -> str:
@@ -88,23 +153,49 @@ def string(record: bytes, start: int) -> str:
     return record[start + 4 : start + 4 + size].decode()
 
 
+def unpacked(data: bytes, compression: str, largest: int) -> bytes:
+    """Return what is packed in some bytes; of one that is cut off what there is.
+
+    Raises
+    ------
+    ValueError
+        When it is larger than `largest` bytes.
+    OSError
+        When the compression is not known.
+
+    """
+    found = _unpack(data, compression, largest + 1) if compression else data
+    if len(found) > largest:
+        raise ValueError(f'it unpacks to more than the {largest} bytes that it may have')
+    return found
+
+
 def _unpacked(chunk: bytes) -> bytes:
+    size = _CHUNK.unpack_from(chunk)[2]
+    if size > LARGEST_CHUNK:
+        raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_CHUNK}')
     compression = string(chunk, _CHUNK.size)
-    return _decompressor(compression)(chunk[_CHUNK.size + 12 + len(compression) :])
+    return unpacked(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
 
 
-def _decompressor(name: str) -> Callable[[bytes], bytes]:
-    """Return what decompresses a chunk; the modules are those that rosbags brings."""
-    if not name:
-        return bytes
-    known = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
-    for module in known.get(name, ()):
-        try:
-            found = importlib.import_module(module)
-        except ImportError:
-            continue
-        if module == 'zstandard':  # its plain function wants the size in the head of the frame
-            found = found.ZstdDecompressor().decompressobj()
-        decompress: Callable[[bytes], bytes] = found.decompress
-        return decompress
-    raise OSError(f'no module to decompress {name}')
+def open_zstd(file: Path) -> Any:
+    """Return a packed file, to read what is in it."""
+    return _module('zstd').open(file, 'rb')
+
+
+def _unpack(data: bytes, name: str, most: int) -> bytes:
+    """Return so many bytes at most."""
+    module = _module(name)
+    if name == 'lz4':
+        return bytes(module.LZ4FrameDecompressor().decompress(data, most))
+    if hasattr(module, 'ZstdCompressionDict'):  # zstandard
+        return bytes(module.ZstdDecompressor().stream_reader(data).read(most))
+    return bytes(module.ZstdDecompressor().decompress(data, most))
+
+
+def _module(compression: str) -> Any:
+    """Return what unpacks a compression: one of the modules that rosbags brings."""
+    for name in MODULES.get(compression, ()):
+        with suppress(ImportError):
+            return importlib.import_module(name)
+    raise OSError(f'no module to decompress {compression}')

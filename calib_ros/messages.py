@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
-from calib_ros.values import QUATERNION_TOLERANCE
+from calib_ros.values import LARGEST as LARGEST
+from calib_ros.values import QUATERNION_TOLERANCE, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
-LARGEST = 1e6
-"""Largest number [m or rad] that is measured; some devices send the largest float for none."""
+TRANSFORM = 'geometry_msgs/msg/TransformStamped'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 
 class MessageError(InputError):
@@ -152,11 +153,16 @@ DECODERS: dict[str, Callable[[Any], Reading]] = {
     'geometry_msgs/msg/PoseStamped': pose_stamped,
     'geometry_msgs/msg/PoseWithCovarianceStamped': pose_with_covariance,
     'geometry_msgs/msg/PointStamped': point_stamped,
-    'geometry_msgs/msg/TransformStamped': transform_stamped,
+    TRANSFORM: transform_stamped,
     'nav_msgs/msg/Odometry': odometry,
     'sensor_msgs/msg/Range': distance,
 }
 """Types of measurements."""
+
+
+def frame_name(name: str) -> str:
+    """Return the name of a frame without the slash that older programs write before it."""
+    return name.removeprefix('/')
 
 
 def stamp(time: Any) -> int:
@@ -199,10 +205,7 @@ def _checked_covariance(data: bytes) -> tuple[float, ...] | None:
     covariance = np.frombuffer(data).reshape(6, 6)
     if not covariance.any():
         return None
-    if not np.isfinite(covariance).all():
-        raise MessageError('covariance with NaN or infinite values')
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-15):
-        raise MessageError('covariance not symmetric')
-    if np.linalg.eigvalsh(covariance)[0] <= 0.0:
-        raise MessageError('covariance not positive definite')
+    fault = covariance_fault(covariance)
+    if fault:
+        raise MessageError(fault)
     return tuple(covariance.ravel().tolist())

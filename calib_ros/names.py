@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from operator import itemgetter
 from typing import TypeAlias
@@ -18,6 +19,10 @@ Layout: TypeAlias = tuple[tuple[int, ...], Picker]
 
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
+USUAL = 20
+"""So many measurements in one frame make it the usual one of a device."""
+FEW = 0.1
+"""Share of measurements in other frames up to which they are stray ones; more is a mistake."""
 
 
 class JointNames:
@@ -70,42 +75,69 @@ class FrameNames:
     """The frames in which each device has measured; there should be one of each."""
 
     def __init__(self) -> None:
-        self._known: dict[str, list[str]] = {}
+        self._known: dict[str, Counter[str]] = {}
+        self._usual: dict[str, str] = {}
 
-    def check(self, device: str, frame_id: str, wanted: str) -> None:
-        """Note the frame of a measurement.
+    def check(self, device: str, frame_id: str, wanted: str, count: int = 1) -> None:
+        """Note the frame of some measurements.
 
         Raises
         ------
         MessageError
-            When it is not the one `wanted`, if any is, or cannot be told from others.
+            When it is not the one `wanted`, if any is, nor the usual one.
 
         """
         if wanted and frame_id != wanted:
             raise MessageError(f'in frame "{frame_id}", not in frame_id "{wanted}"')
         if not frame_id.isprintable():  # it shall be a cell of a table
             raise MessageError('in a frame whose name cannot be printed')
-        self.note(device, frame_id)
+        self.note(device, frame_id, count)
+        usual = self._usual.get(device, frame_id)
+        if frame_id != (wanted or usual):
+            raise MessageError(strange(frame_id, usual))
 
-    def note(self, device: str, frame_id: str) -> None:
-        """Note the frame of a measurement that was taken before."""
-        known = self._known.setdefault(device, [])
-        if frame_id not in known:
-            if len(known) == MOST_NAMES:
-                raise MessageError(f'in one of more than {MOST_NAMES} frames')
-            known.append(frame_id)
+    def note(self, device: str, frame_id: str, count: int = 1) -> None:
+        """Note the frame of measurements that were taken before."""
+        known = self._known.setdefault(device, Counter())
+        if frame_id not in known and len(known) == MOST_NAMES:
+            raise MessageError(f'in one of more than {MOST_NAMES} frames')
+        known[frame_id] += count
+        if known[frame_id] >= USUAL:
+            self._usual.setdefault(device, frame_id)
+
+    def usual(self, device: str) -> str | None:
+        """Return the usual frame of a device; None while few measurements have come."""
+        return self._usual.get(device)
+
+    def main(self, device: str) -> str | None:
+        """Return the usual frame of a device, or the most frequent one while few have come."""
+        known = self._known.get(device)
+        return self._usual.get(device) or (max(known, key=known.__getitem__) if known else None)
+
+    @property
+    def several(self) -> bool:
+        """Tell whether any device measured in several frames."""
+        return any(len(known) > 1 for known in self._known.values())
 
     @property
     def different(self) -> str:
-        """Return in words that one device measured in different frames; empty when none did."""
-        for names in self._known.values():
-            if len(names) > 1:
+        """Return in words that one device measured in different frames; empty when none did.
+
+        A few measurements in others do not count.
+        """
+        for known in self._known.values():
+            if known.total() - max(known.values()) > FEW * known.total():
                 return (
-                    f'poses came in different frames ({", ".join(sorted(names))}), one is '
-                    'needed: set frame_id (--frame-id) to the one to use, or give each source a '
-                    'device of its own; then clear and measure again'
+                    f'poses came in different frames ({", ".join(sorted(known))}), one is '
+                    'needed: set frame_id (--frame-id) to the one to use, or start again with a '
+                    'device of its own for each source'
                 )
         return ''
+
+
+def strange(frame_id: str, usual: str) -> str:
+    """Return in words that a measurement is not in the frame in which others are."""
+    return f'in frame "{frame_id}", not in "{usual}" as others'
 
 
 def _picker(index: Sequence[int]) -> Picker:

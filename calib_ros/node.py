@@ -31,6 +31,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
+from rclpy.time_source import CLOCK_TOPIC
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
@@ -42,7 +43,7 @@ from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.guide import Guide
 from calib_ros.inputs import Inputs, deserialised
-from calib_ros.intake import Stream, feed
+from calib_ros.intake import Stream, feed, measured
 from calib_ros.keeper import Exportable, Keeper, Published
 from calib_ros.messages import JOINT_STATE
 from calib_ros.parameters import changed, declare_all, load_robot
@@ -90,10 +91,14 @@ class CalibrationNode(Node):
             len(chain.joints),
             self._configuration,
         )
-        self.session = CalibrationSession(chain, given.settings, self._on_sample)
+        self.session = CalibrationSession(
+            chain, given.settings, self._on_sample, self._archive.remove
+        )
         self._last = 'nothing identified yet'
         self._observability = ''
         self._status_text = ''
+        self.lost = ''
+        """Why samples were lost at the end; empty when none were."""
         streams = self._streams()
         if given.resume:
             self._resume()
@@ -152,8 +157,9 @@ class CalibrationNode(Node):
         self._take_messages()
         self.session.finish()
         self._archive.close()
-        if self._archive.error:
-            self.get_logger().error(f'samples are lost: {self._archive.error}')
+        self.lost = self._archive.error
+        if self.lost:
+            self.get_logger().error(f'samples are lost: {self.lost}')
         self.destroy_node()
         return all(ended)
 
@@ -190,16 +196,34 @@ class CalibrationNode(Node):
         streams = [
             Stream(topic, JOINT_STATE) for topic in settings.joint_topics or ('joint_states',)
         ]
-        for source in parse_sources(settings.sources) or STANDARD:
-            kind = source.type or 'geometry_msgs/msg/PoseStamped'
-            streams.append(Stream(source.topic, kind, source))
-        return streams
+        sources = parse_sources(settings.sources) or STANDARD
+        return streams + measured(
+            sources, {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
+        )
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
         """Return the subscriptions that an executor serves: not the inputs, which a timer does."""
         inputs = getattr(self, '_inputs', ())  # rclpy asks while it makes the node
         return (each for each in super().subscriptions if each not in inputs)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
+    ) -> Subscription:
+        """Subscribe; a time that cannot be must not end the node."""
+        if topic == CLOCK_TOPIC:
+            callback = self._of_times(callback)
+        return super().create_subscription(msg_type, topic, callback, *args, **more)
+
+    def _of_times(self, callback: Callable[..., None]) -> Callable[..., None]:
+        def checked(message: Any) -> None:
+            if message.clock.sec < 0:
+                words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
+                self.get_logger().warning(words, once=True)
+            else:
+                callback(message)
+
+        return checked
 
     def _take_messages(self) -> None:
         """Take what has come in the order in which it came."""
@@ -229,7 +253,7 @@ class CalibrationNode(Node):
         """Return the problem and all that goes with it, as they are now."""
         self._take_messages()
         problem = self.session.problem()
-        samples = tuple(self.session.samples)
+        samples = tuple(self.session.usable)
         origin = {
             'robot_serial': self._given.serial,
             'topics': self._inputs.topics,
@@ -273,7 +297,7 @@ class CalibrationNode(Node):
         return True, f'sample {len(self.session.samples)} taken ({words})'
 
     def _on_remove_last(self, request: Any) -> tuple[bool, str]:
-        self._archive.remove(self.session.remove_last())
+        self.session.remove_last()
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
@@ -317,12 +341,13 @@ class CalibrationNode(Node):
         self._diagnostics.publish(status)
 
     def _publish_status(self) -> str:
-        """Return the status, which is published when it has changed."""
-        text = self.session.status()
+        """Return how the session goes; the status is published when it has changed."""
+        words = self.session.status()
+        text = f'{self._archive.trouble}{words}'
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
-        return text
+        return words
 
     def _answers(self) -> dict[str, Any]:
         """Return for the diagnostics what came of calls and requests."""
@@ -410,6 +435,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         handle_signals(signal.SIG_IGN)  # a second one must not interrupt the clean-up
         if node is not None:
             finished = node.close()
+            status = 1 if node.lost else status
         if executor is not None:
             executor.shutdown()
         rclpy.try_shutdown()

@@ -157,10 +157,7 @@ class Observations:
             )
         turned = np.swapaxes(self.rotations, 1, 2)
         positions = -np.einsum('nij,nj->ni', turned, self.positions)
-        covariance = self.covariance
-        if covariance is None and sigmas is not None:
-            diagonal = np.diag(np.repeat(np.square(sigmas), 3))
-            covariance = np.tile(diagonal, (len(self), 1, 1))
+        covariance = self.covariance if sigmas is None else self.covariances(sigmas)
         if covariance is not None:
             jacobian = np.zeros((len(self), 6, 6))
             jacobian[:, :3, :3] = -turned
@@ -168,6 +165,20 @@ class Observations:
             jacobian[:, 3:, 3:] = -turned
             covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
         return replace(self, positions=positions, rotations=turned, covariance=covariance)
+
+    def covariances(self, sigmas: tuple[float, float]) -> FloatArray:
+        """Return (N, 6, 6) the covariances, by `sigmas` [m, rad] where a measurement brought none.
+
+        One that is zero in all that concerns the rotation is that of the position alone.
+        """
+        given = np.diag(np.repeat(np.square(sigmas), 3))
+        found = np.tile(given, (len(self), 1, 1))
+        if self.covariance is not None:
+            own = ~np.isnan(self.covariance[:, 0, 0])
+            found[own] = self.covariance[own]
+            position_only = ~found[:, 3:].any(axis=(1, 2))
+            found[position_only, 3:, 3:] = given[3:, 3:]
+        return found
 
     def at(self, stamps_ns: NDArray[np.int64]) -> Observations:
         """Return the same pairs with other stamps (N,)."""

@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What commands share: options, settings from them, and files that must not be overwritten."""
+"""What commands share: options, settings from them, and the folder of their results."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib_ros.errors import InputError
+from calib_ros.files import whole_folder
 
 if TYPE_CHECKING:
     from calib_ros.settings import Settings
@@ -55,12 +57,10 @@ def settings_of(options: argparse.Namespace) -> Settings:
     return Settings(**given)
 
 
-def refuse_overwriting(options: argparse.Namespace, names: Iterable[str]) -> None:
-    """Refuse before any work is done, when files of these names are in the way."""
-    if options.out is None or options.force:
-        return
-    there = [name for name in names if (options.out / name).exists()]
-    if there:
-        raise InputError(
-            f'{options.out} holds {", ".join(there)} already: choose another folder or --force'
-        )
+def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContextManager[Path]:
+    """Return the folder --out to be made in a `with` block; see `whole_folder`.
+
+    Files of these names (glob patterns) are refused before any work is done, or replaced by
+    --force. Other files stay in the folder.
+    """
+    return whole_folder(options.out, names, overwrite=options.force)

@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the node is set to: parameters with their ranges, and the robot that they name.
 
-Every field of `Settings` is a parameter of the same name, with its text and its smallest value.
+Every field of `Settings` is a parameter of the same name, with its text and its smallest value;
+`arguments.py` lists the others.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -18,6 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.wait_for_message import wait_for_message
 from std_msgs.msg import String
 
+from calib_ros.arguments import BESIDE_SETTINGS
 from calib_ros.chain import Chain
 from calib_ros.config import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.errors import ConfigError, UnknownNameError
@@ -28,6 +30,14 @@ DESCRIPTION_WAIT = 10.0
 """Time [s] for which the node waits for the robot's description."""
 
 
+class FrameNames(NamedTuple):
+    """What the frames are called on /tf_static; nothing is published of one without a name."""
+
+    base: str
+    flange: str
+    target: str
+
+
 @dataclass(frozen=True)
 class Given:
     """What a node was started with; what else may change is read where it is used."""
@@ -36,8 +46,10 @@ class Given:
     links: dict[str, str | None]
     serial: str
     data_dir: Path | None
+    allowed_folders: tuple[Path, ...]
     resume: bool
     candidates: Path | None
+    frames: FrameNames
     settings: Settings
 
 
@@ -50,46 +62,28 @@ def declare_all(node: Node) -> Given:
         When a value cannot be, or a parameter was set that does not exist.
 
     """
-    chain = _declare(
-        node,
-        'chain',
-        '',
-        'chain file or URDF of the robot, the name of one that calib_ros ships, or '
-        'robot_description: the URDF on that topic',
-    )
-    links = {
-        name: _declare(node, name, '', f'of a URDF: {text}') or None
-        for name, text in (
-            ('base_link', 'where the arm starts; default: its root'),
-            ('tip_link', 'where the arm ends; default: tool0, flange or its only end'),
-        )
+    own = {
+        each.name: _declare(node, each.name, each.default, each.text, each.fixed)
+        for each in BESIDE_SETTINGS
     }
-    _declare(node, 'executor', 'events', 'events or single_threaded: how messages are taken')
-    serial = _declare(node, 'serial', '', 'serial number of the robot, for the record')
-    data_dir = _declare(
-        node, 'data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'
-    )
-    resume = _declare(node, 'resume', False, 'go on with the newest journal of this robot')
-    for name, default, text in (
-        ('target_filename', '', 'file that ~/save writes; default: a new one in data_dir'),
-        ('calibration_filename', '', 'file that ~/load reads; default: the newest saved'),
-        ('marker_scale', 200.0, 'residual vectors are drawn so many times as long'),
-    ):
-        _declare(node, name, default, text, read_only=False)
-    candidates = _declare(
-        node,
-        'candidates',
-        '',
-        'table of poses (q1 ... qn) for ~/next_pose to choose; default: any',
-    )
     settings = Settings(**{item.name: _declare_setting(node, item) for item in fields(Settings)})
     _refuse_unknown(node)
-    if not chain:
+    if not own['chain']:
         raise ConfigError(
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    return Given(chain, links, serial, _path(data_dir), resume, _path(candidates), settings)
+    return Given(
+        chain=own['chain'],
+        links={name: own[name] or None for name in ('base_link', 'tip_link')},
+        serial=own['serial'],
+        data_dir=_path(own['data_dir']),
+        allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
+        resume=own['resume'],
+        candidates=_path(own['candidates']),
+        frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
+        settings=settings,
+    )
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
@@ -134,15 +128,15 @@ def _declare(
     node: Node, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
 ) -> Any:
     descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
+    if isinstance(default, tuple):  # an empty list has no type in ROS, [''] has one
+        return _names(node.declare_parameter(name, [''], descriptor).value)
     return node.declare_parameter(name, default, descriptor).value
 
 
 def _declare_setting(node: Node, item: Any) -> Any:
     text, lower = item.metadata['text'], item.metadata.get('lower')
     fixed = item.name in STARTUP
-    if isinstance(item.default, tuple):  # an empty list has no type in ROS, [''] has one
-        return _names(_declare(node, item.name, [''], text, fixed))
-    if isinstance(item.default, str):
+    if isinstance(item.default, tuple | str):
         return _declare(node, item.name, item.default, text, fixed)
     if isinstance(item.default, int):
         span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)

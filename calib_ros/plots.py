@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from calib_ros.escapes import one_line
 from calib_ros.identification import Identification
 from calib_ros.placement import Placements
 from calib_ros.se3 import FloatArray
@@ -55,7 +56,8 @@ def before_after_png(result: Identification) -> bytes:
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     draw_errors(left, before, after)
     draw_distribution(right, before, after)
-    figure.suptitle(f'{result.chain.name}, judged by {result.validated_by}')
+    title = f'{one_line(result.chain.name)}, judged by {result.validated_by}'
+    figure.suptitle(title, parse_math=False)
     return _png(figure)
 
 

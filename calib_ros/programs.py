@@ -19,6 +19,7 @@ import numpy as np
 from calib_ros.compensation import Program
 from calib_ros.errors import InputError
 from calib_ros.se3 import FloatArray
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, parse_yaml, read_text
 from calib_ros.values import parse_number, parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
@@ -52,11 +53,9 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
         raise InputError(
             f'{path} must be a table (.csv with q1 ... qn) or a JointTrajectory (.yaml)'
         )
-    try:
-        text = path.read_text(encoding='utf-8-sig')
-    except (OSError, UnicodeDecodeError) as err:
-        raise InputError(f'cannot read {path}: {err}') from err
-    return readers[path.suffix.lower()](text, str(path), joints)
+    reader = readers[path.suffix.lower()]
+    largest = LARGEST_TABLE if reader is _read_csv else LARGEST_TEXT
+    return reader(read_text(path, largest, InputError), str(path), joints)
 
 
 def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
@@ -117,14 +116,7 @@ def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
 def _read_yaml(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
     import yaml
 
-    loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-    try:
-        documents = [each for each in yaml.load_all(text, loader) if each is not None]
-    except (yaml.YAMLError, ValueError) as err:
-        raise InputError(f'{where} is not valid YAML: {" ".join(str(err).split())}') from err
-    if len(documents) != 1:
-        raise InputError(f'{where} must hold one message, not {len(documents)}')
-    (message,) = documents
+    message = parse_yaml(text, where, InputError)
     names = message.get('joint_names') if isinstance(message, dict) else None
     points = message.get('points') if isinstance(message, dict) else None
     if not isinstance(names, list) or not isinstance(points, list) or not points:

@@ -17,6 +17,7 @@ from calib_ros import effects
 from calib_ros.calibration import Calibration
 from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import dump_chain, dump_yaml, nominal_record
+from calib_ros.escapes import in_markdown
 from calib_ros.identification import Identification, Noise
 from calib_ros.settings import Settings
 from calib_ros.validation import Comparison, ErrorFigures, Parameter
@@ -197,14 +198,23 @@ def unit(name: str) -> str:
 
 def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]) -> str:
     """Return the report that is kept with a calibration."""
-    lines = [f'# Calibration of {result.chain.name}', '', f'**{summary(result)}**', '']
-    lines += [f'- warning: {text}' for text in (*warnings, *result.remarks)]
-    lines += [f'- {key}: {value}' for key, value in samples.items() if value not in (0, {}, None)]
+    lines = [
+        f'# Calibration of {in_markdown(result.chain.name)}',
+        '',
+        f'**{in_markdown(summary(result))}**',
+        '',
+    ]
+    lines += [f'- warning: {in_markdown(each)}' for each in (*warnings, *result.remarks)]
+    lines += [
+        f'- {in_markdown(key)}: {in_markdown(value)}'
+        for key, value in samples.items()
+        if value not in (0, {}, None)
+    ]
     lines += [
         f'- converged: {"yes" if result.converged else "no"}, {result.iterations} iterations',
         f'- {result.rank} parameters fitted; {noise_in_words(result)}',
-        *(f'- {text}' for text in chance_in_words(result)),
-        *(f'- {text}' for text in priors_in_words(result)),
+        *(f'- {in_markdown(each)}' for each in chance_in_words(result)),
+        *(f'- {in_markdown(each)}' for each in priors_in_words(result)),
         '',
         '## Accuracy',
         '',
@@ -233,12 +243,12 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
         ]
         lines += ['', '| | before [mm] | with it [mm] | pays for itself |', '|---|---|---|---|']
         lines += [
-            f'| {v.what} | {v.rms_mm_before:.4f} | {v.rms_mm_after:.4f} | '
+            f'| {in_markdown(v.what)} | {v.rms_mm_before:.4f} | {v.rms_mm_after:.4f} | '
             f'{"yes" if v.pays else "no"} |'
             for v in result.verdicts
         ]
     lines += ['', '## What the poses determine', '']
-    lines += [f'- {text}' for text in identifiability_in_words(result)]
+    lines += [f'- {in_markdown(each)}' for each in identifiability_in_words(result)]
     lines += ['', '## Parameters', '']
     lines += ['Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.', '']
     lines += [
@@ -362,7 +372,7 @@ def _parameter_row(p: Parameter) -> str:
     within = '' if width is None else f'{1e3 * width:.4f}'
     offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
     note = '' if p.status == 'fitted' else p.status
-    return f'| {p.name} | {p.value:.9f} | {offset} | {std} | {within} | {note} |'
+    return f'| {in_markdown(p.name)} | {p.value:.9f} | {offset} | {std} | {within} | {note} |'
 
 
 def against_truth(result: Identification, truth: Chain) -> str:

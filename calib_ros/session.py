@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -22,7 +23,7 @@ from calib_ros.delays import Delay, Watch
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification import Identification
 from calib_ros.live import Estimate, LiveEstimate, barely_moved
-from calib_ros.names import FrameNames, JointNames
+from calib_ros.names import FrameNames, JointNames, strange
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
 from calib_ros.samples import Sample, collect, named
@@ -30,6 +31,7 @@ from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
 from calib_ros.settings import Settings
 from calib_ros.sources import Source
+from calib_ros.strays import JOINTS, POSES, STRAY, Gate
 from calib_ros.track import Stamps
 from calib_ros.validation import ErrorFigures
 
@@ -39,6 +41,9 @@ LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
 SILENT_NS = 5_000_000_000
 """Time after which joints of which nothing is heard, while others are, count as silent."""
+LEAST_FAR = 1.0
+"""Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
+what has not come yet; joint states up to `max_gap` apart belong together."""
 EARLY = 0.03
 """Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
 delay. Of what then shows the arm leaving, most is left out as spikes; the rest moves the mean by
@@ -69,6 +74,8 @@ class CalibrationSession:
     settings : Settings
     on_sample : callable, optional
         Called with every sample as soon as it is taken.
+    on_removed : callable, optional
+        Called with every sample that is taken back.
 
     """
 
@@ -77,10 +84,12 @@ class CalibrationSession:
         chain: Chain,
         settings: Settings | None = None,
         on_sample: Callable[[Sample], None] | None = None,
+        on_removed: Callable[[Sample], None] | None = None,
     ) -> None:
         self.chain = chain
         self.settings = settings or Settings()
         self.on_sample = on_sample or (lambda sample: None)
+        self.on_removed = on_removed or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
         count = len(chain.joints)
         if len(self.joint_names) != count or len(set(self.joint_names)) != count:
@@ -112,11 +121,15 @@ class CalibrationSession:
         self._dropped: Counter[str] = Counter()
         self._unused: Counter[str] = Counter()
         self._notes: Counter[str] = Counter()
-        self._newest = {'joints': 0, 'poses': 0}
+        self._newest = {JOINTS: 0, POSES: 0}
         self._looked_ns = 0
+        far = max(self.settings.lateness + self.settings.max_gap, LEAST_FAR)
+        self._gate: Gate[Callable[[], None]] = Gate(far)
+        self._delay_ns = round(1e9 * self.settings.delay)
         self._frames = FrameNames()
         self._names = JointNames(self.joint_names)
         self._live = LiveEstimate(self.problem_of)
+        self._once: set[tuple[str, str]] = set()
 
     def change(self, settings: Settings) -> None:
         """Go on with other settings; the buffers and samples stay.
@@ -164,13 +177,31 @@ class CalibrationSession:
             self.latest = (reading.stamp_ns, values)
         if not self.recording:
             self._unused['joints: not recording'] += 1
-        else:
-            self._watch_order('joints', reading.stamp_ns)
-            self._look_for_delay(reading.stamp_ns)
-            if complete and self._watch is not None:
-                self._watch_clocks(reading.stamp_ns, values)
-            self._collector.add_joints(columns, reading.stamp_ns, values)
-            self._take()
+            return
+        add = partial(self._add_joints, columns, reading.stamp_ns, values)
+        self._admit(JOINTS, reading.stamp_ns, add)
+
+    def _add_joints(
+        self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]
+    ) -> None:
+        """Keep joint values."""
+        self._watch_order(JOINTS, stamp_ns)
+        self._look_for_delay(stamp_ns)
+        if self._watch is not None and len(columns) == len(self.chain.joints):
+            self._watch_clocks(stamp_ns, values)
+        self._collector.add_joints(columns, stamp_ns, values)
+        self._take()
+
+    def _admit(self, kind: str, time_ns: int, add: Callable[[], None]) -> None:
+        """Keep what came at a time of the joints' clock, now or when its stamp is known good."""
+        if self._gate.passes(kind, time_ns):
+            add()
+            return
+        admitted, moved = self._gate.admit(kind, time_ns, add)
+        for each in admitted:
+            if moved and each.time_ns < self._collector.track.horizon_ns:
+                self._collector.start_anew()
+            each.item()
 
     def uneventful(self, readings: messages.JointReadings, among: int) -> NDArray[np.bool_]:
         """Return (N,) which joint readings would only be kept, until others make more of them.
@@ -186,6 +217,7 @@ class CalibrationSession:
             return nothing
         stamps = readings.stamps_ns
         quiet = self._collector.uneventful(columns, stamps, among)
+        quiet &= self._gate.quiet(JOINTS, stamps)
         quiet &= (np.abs(values) <= messages.LARGEST).all(axis=1)
         if self._collector.holding:
             since = stamps - self._looked_ns
@@ -193,6 +225,14 @@ class CalibrationSession:
         if self._watch is not None and len(columns) == len(self.chain.joints):
             quiet &= self._watch.uneventful(stamps)
         return quiet
+
+    def uneventful_poses(self, source: Source, stamps: Stamps) -> NDArray[np.bool_]:
+        """Return (N,) which measurements, at stamps (N,), would only be kept."""
+        if not self.recording:
+            return np.ones(len(stamps), dtype=bool)
+        if not (self.settings.frame_id or self._frames.usual(source.device)):
+            return np.zeros(len(stamps), dtype=bool)
+        return self._gate.quiet(POSES, stamps - self._delay_ns)
 
     def keep(
         self,
@@ -210,7 +250,7 @@ class CalibrationSession:
             self.received['joints'] += len(stamps)
             self._collector.extend_joints(columns, stamps, values)
             parts.append((where, stamps, values))
-        self._watch_orders('joints', [part[:2] for part in parts])
+        self._watch_orders(JOINTS, [part[:2] for part in parts])
         whole = [part for part in parts if part[2].shape[1] == len(self.chain.joints)]
         if whole:
             stamps, values = _in_order(whole)
@@ -218,7 +258,7 @@ class CalibrationSession:
             if self._watch is not None:
                 self._watch.extend_joints(stamps, values)
         used = [(where, s, each) for where, s, each in measured if self._keep_readings(s, each)]
-        self._watch_orders('poses', [(where, each.stamps_ns) for where, _, each in used])
+        self._watch_orders(POSES, [(where, each.stamps_ns) for where, _, each in used])
         seen = [
             (where, each.stamps_ns, _padded(each.numbers[:, :7], 7))
             for where, source, each in used
@@ -234,10 +274,7 @@ class CalibrationSession:
         if not self.recording:
             self._unused['poses: not recording'] += count
             return False
-        try:
-            self._frames.check(source.device, readings.frame_id, self.settings.frame_id)
-        except messages.MessageError as err:
-            self._dropped[f'poses: {err}'] += count
+        if not self._is_in_frame(source.device, readings.frame_id, count):
             return False
         key = _stream(source, readings.frame_id, readings.child, readings.distance)
         self._collector.extend(key, readings.stamps_ns, readings.numbers)
@@ -259,19 +296,36 @@ class CalibrationSession:
         if not self.recording:
             self._unused['poses: not recording'] += 1
             return
-        try:
-            self._frames.check(source.device, reading.frame_id, self.settings.frame_id)
-        except messages.MessageError as err:
-            self._dropped[f'poses: {err}'] += 1
+        if not self._is_in_frame(source.device, reading.frame_id):
             return
-        self._watch_order('poses', reading.stamp_ns)
         key = _stream(source, reading.frame_id, reading.child, reading.distance is not None)
+        self._admit(
+            POSES, reading.stamp_ns - self._delay_ns, partial(self._add_pose, key, reading)
+        )
+
+    def _add_pose(self, key: StreamKey, reading: messages.Reading) -> None:
+        """Keep a measurement."""
+        self._watch_order(POSES, reading.stamp_ns)
         if self._watch is not None and reading.position is not None and not key.eye_in_hand:
             self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
 
+    def _is_in_frame(self, device: str, frame_id: str, count: int = 1) -> bool:
+        """Tell whether measurements are in the frame of their device; count them if not."""
+        before = self._frames.usual(device)
+        try:
+            self._frames.check(device, frame_id, self.settings.frame_id, count)
+        except messages.MessageError as err:
+            self._dropped[f'poses: {err}'] += count
+            return False
+        if self._frames.usual(device) != before:
+            self._leave_out_strange()
+        return True
+
     def finish(self) -> None:
         """Make samples of everything that still waits; nothing more will come."""
+        for each in self._gate.release():
+            each.item()
         self._look_for_delay(None)
         self._collector.finish()
         self._take()
@@ -299,6 +353,7 @@ class CalibrationSession:
         self._unused['poses: of a sample that was taken back'] += sample.count
         self._collector.forget(sample)
         self._live.restart()
+        self.on_removed(sample)
         return sample
 
     def restore(self, samples: Sequence[Sample]) -> None:
@@ -310,10 +365,60 @@ class CalibrationSession:
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
             if sample.frame_id:
-                self._frames.note(sample.device, sample.frame_id)
+                self._frames.note(sample.device, sample.frame_id, sample.count)
         self._collector.remember(samples)
         self.samples = [*samples, *self.samples]
+        self._leave_out_strange()
         self._live.restart()
+
+    @property
+    def usable(self) -> list[Sample]:
+        """Return the samples in the frame of their device, `frame_id` or the usual one.
+
+        Those of targets that were measured once are left out where others were more often: they
+        tell nothing about the arm, and hundreds of them would take minutes.
+        """
+        wanted = self.settings.frame_id
+        found = self.samples
+        if wanted or self._frames.several:
+            found = [each for each in found if self._frame_of(each, wanted) == each.frame_id]
+        counts = Counter((each.device, each.target) for each in found if not each.validation)
+        once = {key for key, count in counts.items() if count == 1}
+        if once != self._once:  # the list does not only grow
+            self._once = once
+            self._live.restart()
+        if not once or len(once) == len(counts):
+            return found
+        return [each for each in found if (each.device, each.target) not in once]
+
+    def _frame_of(self, sample: Sample, wanted: str = '') -> str:
+        """Return in which frame a sample should be; some do not tell in which they are."""
+        return (
+            sample.frame_id and (wanted or self._frames.main(sample.device))
+        ) or sample.frame_id
+
+    def _leave_out_strange(self) -> None:
+        """Take back samples in strange frames, the first ones say, if there are only a few."""
+        for sample in tuple(self.samples):
+            if self._is_strange(sample):
+                self.samples.remove(sample)
+                self._live.restart()
+                self.on_removed(sample)
+
+    def _is_strange(self, sample: Sample) -> bool:
+        """Tell whether a sample is one of a few in a frame of their own; count it if so."""
+        if self.settings.frame_id or not self._frames.several or self._frames.different:
+            return False
+        frame_id = self._frame_of(sample)
+        strays = sample.frame_id != frame_id
+        if strays:
+            self._dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
+        return strays
+
+    @property
+    def _different(self) -> str:
+        """Return in words that one device measured in different frames, if it matters."""
+        return '' if self.settings.frame_id else self._frames.different
 
     @property
     def state(self) -> str:
@@ -333,28 +438,35 @@ class CalibrationSession:
     def account(self) -> Account:
         """Return what became of the messages so far."""
         fitted = [sample.joints for sample in self.samples if not sample.validation]
+        usable = self.usable
         distinct = len(fitted)
         if self.settings.mode != 'continuous' and fitted:
             distinct = len(np.unique(configurations(np.array(fitted))))
         collector = self._collector
-        dropped = self._dropped + collector.dropped
+        notes = self._notes + collector.notes
+        if len(usable) < len(self.samples):
+            notes['samples left out, in another frame or of a target measured once'] += len(
+                self.samples
+            ) - len(usable)
+        strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._gate.dropped.items()})
+        dropped = self._dropped + collector.dropped + strays
         return Account(
             self.received['joints'],
             self.received['poses'],
-            collector.waiting,
+            collector.waiting + self._gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
             dict(sorted((self._unused + collector.unused).items())),
             dict(sorted(dropped.items())),
-            dict(sorted((self._notes + collector.notes).items())),
+            dict(sorted(notes.items())),
             self._names.foreign,
         )
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what an engineer should know about the measurements."""
-        return tuple(filter(None, (self._frames.different, self._disagreement)))
+        return tuple(filter(None, (self._different, self._disagreement)))
 
     @property
     def _disagreement(self) -> str:
@@ -373,11 +485,11 @@ class CalibrationSession:
     @property
     def estimate(self) -> Estimate | None:
         """Return what the samples so far tell; None while they are too few."""
-        return self._live.update(self.samples)
+        return self._live.update(self.usable)
 
     def status(self) -> str:
         """Return in words how far the samples have come."""
-        fitted = [sample for sample in self.samples if not sample.validation]
+        fitted = [sample for sample in self.usable if not sample.validation]
         words = [f'{len(fitted)} samples']
         estimate = self.estimate
         wanted = self.settings.wanted_accuracy
@@ -411,9 +523,10 @@ class CalibrationSession:
         self._look_for_delay(None)
         self._collector.flush()
         self._take()
-        if self._frames.different:
-            raise InputError(self._frames.different)
-        return self.problem_of(self.samples)
+        if self._different:
+            raise InputError(self._different)
+        self._leave_out_strange()
+        return self.problem_of(self.usable)
 
     def problem_of(self, samples: Sequence[Sample]) -> Problem:
         """Return samples as a problem.
@@ -499,15 +612,16 @@ class CalibrationSession:
         self._take()
         settings = self.settings
         sigmas = (settings.sigma_position, settings.sigma_orientation)
-        return self.calibration.judged(self.samples, sigmas)
+        return self.calibration.judged(self.usable, sigmas)
 
     # Details
 
     def _take(self) -> None:
         """Keep the samples that the collector has made."""
         for sample in self._collector.take():
-            self.samples.append(sample)
-            self.on_sample(sample)
+            if not self._is_strange(sample):
+                self.samples.append(sample)
+                self.on_sample(sample)
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
         """Note stamps that go backwards; samples go by stamps, so nothing is lost by it."""
@@ -521,6 +635,8 @@ class CalibrationSession:
             return
         stamps = np.concatenate([each for _, each in parts])
         stamps = stamps[np.argsort(np.concatenate([where for where, _ in parts]))]
+        last = stamps[-1] - (self._delay_ns if stream == POSES else 0)
+        self._gate.passed(stream, int(last))
         newest = np.maximum.accumulate(np.append(self._newest[stream], stamps))
         back = int((stamps < newest[:-1]).sum())
         if back:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -18,6 +19,9 @@ STARTUP = (
     *('joint_topics', 'joint_names'),
 )
 """Settings that a running node cannot change."""
+
+MOST_ENTRIES, LONGEST_ENTRY = 1000, 1000
+"""Entries of a list, and characters of each, that are taken."""
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
@@ -72,7 +76,7 @@ class Settings:
     sources: tuple[str, ...] = _setting(
         (),
         'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
-        'target, eye_in_hand, validation',
+        'target, eye_in_hand, validation; of /tf with parent and child',
     )
     joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
     wanted_accuracy: float = _setting(
@@ -126,7 +130,20 @@ class Settings:
         for item in fields(self):
             lower = item.metadata.get('lower')
             value = getattr(self, item.name)
+            if isinstance(item.default, tuple):
+                _check_list(item.name, value)
             if lower is not None and not math.isfinite(value):
                 raise ConfigError(f'{item.name} must be a finite number, not {value}')
             if lower is not None and value < lower:
                 raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
+
+
+def _check_list(name: str, entries: Sequence[str]) -> None:
+    """Refuse lists that are too long to be meant: what is done with them may take for ever."""
+    if len(entries) > MOST_ENTRIES:
+        raise ConfigError(f'{name} has {len(entries)} entries, at most {MOST_ENTRIES} are taken')
+    longest = max(map(len, entries), default=0)
+    if longest > LONGEST_ENTRY:
+        raise ConfigError(
+            f'{name} has an entry of {longest} characters, at most {LONGEST_ENTRY} are taken'
+        )

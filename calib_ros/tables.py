@@ -10,21 +10,28 @@ one table.
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
 from calib_ros import se3
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.escapes import from_cell, to_cell
 from calib_ros.observations import Observations
 from calib_ros.samples import Frames, Sample, collect
 from calib_ros.se3 import FloatArray
-from calib_ros.values import QUATERNION_TOLERANCE, cell_number
+from calib_ros.texts import LARGEST_TABLE, Row, decoded, read_bytes, read_rows
+from calib_ros.values import (
+    LARGEST,
+    LARGEST_SIGMA,
+    QUATERNION_TOLERANCE,
+    cell_integer,
+    cell_number,
+    covariance_fault,
+)
 
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
@@ -33,7 +40,10 @@ FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 SPLITS = ('', 'train', 'test', 'removed')
 MOST_LINES = 5
 """Lines that an error names."""
-Row: TypeAlias = Mapping[str, str | None]
+LARGEST_RATE = 1e12
+"""Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
+MOST_FRAMES = 100
+"""Sessions, devices and targets of a table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +146,8 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row.append('' if sample.distance is None else repr(sample.distance))
     covariance = sample.covariance
     row += numbers(None if covariance is None else covariance[tuple(np.transpose(UPPER))], 21)
-    row += [sample.device, sample.target, sample.frame_id, '1' if sample.eye_in_hand else '']
+    row += [to_cell(name) for name in (sample.device, sample.target, sample.frame_id)]
+    row.append('1' if sample.eye_in_hand else '')
     row += [repr(sample.delay), str(sample.count), repr(sample.spread), sample.session]
     return [*row, split or ('test' if sample.validation else 'train')]
 
@@ -170,16 +181,23 @@ class _Reader:
     def samples(self, rows: Sequence[tuple[int, Row]]) -> tuple[Sample, ...]:
         """Return the samples of rows with their lines, without those that were taken back."""
         found: dict[tuple[object, ...], Sample] = {}
+        frames: set[tuple[str, str, str]] = set()
         for line, row in rows:
             sample = self.sample(line, row)
+            frames.add((sample.session, sample.device, sample.target))
+            if len(frames) > MOST_FRAMES:
+                raise InputError(
+                    f'{self._path}, line {line}: more than {MOST_FRAMES} sessions, devices and '
+                    'targets; each has a frame to be fitted'
+                )
             what = (
                 *(sample.stamp_ns, sample.session, sample.device, sample.target),
                 *(sample.eye_in_hand, sample.distance is None),
             )
             if row.get('split') == 'removed':  # the last one, to fit or held out
-                same = [key for key in found if key[:-1] == what]
-                for key in same[-1:]:
-                    del found[key]
+                same = [key for key in ((*what, False), (*what, True)) if key in found]
+                if same:
+                    del found[max(same, key=lambda key: self._lines[found[key]])]
                 continue
             key = (*what, sample.validation)
             if key in found:
@@ -227,14 +245,14 @@ class _Reader:
             velocity=self._optional(line, row, 'v'),
             acceleration=self._optional(line, row, 'a'),
             session=row.get('session') or '',
-            device=row.get('device') or '',
-            target=row.get('target') or '',
-            frame_id=row.get('frame_id') or '',
+            device=from_cell(row.get('device') or ''),
+            target=from_cell(row.get('target') or ''),
+            frame_id=from_cell(row.get('frame_id') or ''),
             eye_in_hand=self._flag(line, row, 'eye_in_hand'),
             validation=split == 'test',
             delay=self._number(line, row, 'delay') if row.get('delay') else 0.0,
             count=self._integer(line, row, 'count') if row.get('count') else 1,
-            spread=self._number(line, row, 'spread') if row.get('spread') else 0.0,
+            spread=self._number(line, row, 'spread', math.inf) if row.get('spread') else 0.0,
         )
         signs = self._optional(line, row, 's')
         if signs is not None:
@@ -273,8 +291,14 @@ class _Reader:
         covariance = None
         if row.get(COVARIANCE[0]):
             covariance = np.zeros((6, 6))
-            covariance[tuple(np.transpose(UPPER))] = self._numbers(line, row, COVARIANCE)
+            variances = self._numbers(line, row, COVARIANCE, LARGEST_SIGMA**2)
+            covariance[tuple(np.transpose(UPPER))] = variances
             covariance += np.triu(covariance, 1).T
+            mask = np.repeat([1.0, 0.0 if quat is None else 1.0], 3)  # what was measured
+            fault = covariance_fault(covariance * np.outer(mask, mask))
+            if fault:
+                raise InputError(f'{self._path}, line {line}: c11 ... c66: {fault}')
+            covariance = covariance if covariance.any() else None
         rotation = None if quat is None else se3.from_quat(quat)
         return replace(plain, position=position, rotation=rotation, covariance=covariance)
 
@@ -295,13 +319,15 @@ class _Reader:
         names = [f'{letter}{k + 1}' for k in range(self._joints)]
         if not any(row.get(name) for name in names):
             return None
-        return self._numbers(line, row, names)
+        return self._numbers(line, row, names, LARGEST if letter == 'q' else LARGEST_RATE)
 
-    def _numbers(self, line: int, row: Row, names: Sequence[str]) -> FloatArray:
-        return np.array([self._number(line, row, name) for name in names])
+    def _numbers(
+        self, line: int, row: Row, names: Sequence[str], largest: float = LARGEST
+    ) -> FloatArray:
+        return np.array([self._number(line, row, name, largest) for name in names])
 
-    def _number(self, line: int, row: Row, name: str) -> float:
-        return cell_number(row.get(name), f'{self._path}, line {line}: {name}')
+    def _number(self, line: int, row: Row, name: str, largest: float = LARGEST) -> float:
+        return cell_number(row.get(name), f'{self._path}, line {line}: {name}', largest)
 
     def _flag(self, line: int, row: Row, name: str) -> bool:
         text = row.get(name) or ''
@@ -310,10 +336,7 @@ class _Reader:
         return FLAGS[text]
 
     def _integer(self, line: int, row: Row, name: str) -> int:
-        text = row.get(name) or ''
-        if not text.lstrip('-').isdigit():
-            raise InputError(f'{self._path}, line {line}: {name} must be an integer, not {text!r}')
-        return int(text)
+        return cell_integer(row.get(name) or '', f'{self._path}, line {line}: {name}')
 
 
 def _in_words(lines: Sequence[int]) -> str:
@@ -326,19 +349,13 @@ def _read(
     path: Path, journal: Sequence[str]
 ) -> tuple[Sequence[str], list[tuple[int, Row]], tuple[str, ...]]:
     """Return header, rows with their lines, and warnings; `journal` is the header of one."""
-    try:
-        data = path.read_bytes()
-        whole = data
-        if data.startswith(','.join(journal).encode()):
-            whole = data[: data.rfind(b'\n') + 1]
-        text = io.StringIO(whole.decode('utf-8-sig'), newline='')
-        reader = csv.DictReader(text, strict=True)
-        rows: list[tuple[int, Row]] = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as err:
-        raise InputError(f'cannot read {path}: {err}') from err
-    header = reader.fieldnames or []
+    data = whole = read_bytes(path, LARGEST_TABLE, InputError)
+    if data.startswith(','.join(journal).encode()):
+        whole = data[: data.rfind(b'\n') + 1]
+    header, rows = read_rows(decoded(whole, str(path), InputError), path)
     if len(whole) < len(data):
-        return header, rows, (f'{path}: line {reader.line_num + 1} was cut off and is left out',)
+        line = whole.count(b'\n') + 1
+        return header, rows, (f'{path}: line {line} was cut off and is left out',)
     return header, rows, ()
 
 

@@ -37,6 +37,8 @@ POSES = 1000
 """Random poses at which a corrected URDF, read back, is held against the arm."""
 EXACT = 1e-9
 """Largest difference [m or 1] of poses by a corrected chain and by the URDF written from it."""
+MOST_JOINTS = 50
+"""Joints of a chain; each is five parameters to fit."""
 FAR = 0.2
 """Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
 
@@ -74,6 +76,11 @@ def chain_from_urdf(
     path = robot.path(base_link, tip_link)
     poses = robot.poses(path[0].parent)
     moving = [joint for joint in path if joint.moves]
+    if len(moving) > MOST_JOINTS:
+        raise ConfigError(
+            f'{len(moving)} joints move between the links, more than {MOST_JOINTS}: choose '
+            'base_link and tip_link nearer to each other'
+        )
     places = [poses[joint.child] for joint in moving]
     axes = [place[:3, :3] @ joint.axis for place, joint in zip(places, moving, strict=True)]
     tip = poses[path[-1].child]

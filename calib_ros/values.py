@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 
@@ -13,9 +14,23 @@ from calib_ros.se3 import FloatArray
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
+LARGEST = 1e6
+"""Largest number [m or rad] that is measured or set; some devices send the largest float for
+none."""
+LONGEST_NAME = 200
+LARGEST_STAMP = 2**63 - 1
+SMALLEST_SIGMA, LARGEST_SIGMA = 1e-9, 1e6
+"""Standard deviations [m or rad] between which a covariance is believed."""
+DEPENDENT = 1e-12
+"""Least eigenvalue of a correlation matrix from which on it counts as positive definite."""
 
 
-def parse_number(value: object, where: str, error: type[CalibrationError] = ConfigError) -> float:
+def parse_number(
+    value: object,
+    where: str,
+    error: type[CalibrationError] = ConfigError,
+    largest: float = LARGEST,
+) -> float:
     """Return a finite number from YAML or a table; `where` names it in the error."""
     try:  # YAML 1.1 reads 1e-3, without a dot, as a string
         number = float(value) if isinstance(value, int | float | str) else math.nan
@@ -23,7 +38,19 @@ def parse_number(value: object, where: str, error: type[CalibrationError] = Conf
         number = math.nan
     if isinstance(value, bool) or not math.isfinite(number):
         raise error(f'{where} must be a finite number, not {value!r}')
+    if abs(number) > largest:
+        raise error(f'{where} must be at most {largest:g}, not {number:g}')
     return number
+
+
+def parse_name(value: object, where: str) -> str:
+    """Return a name that can stand in a line of a table, a comment or a path."""
+    name = str(value)
+    if not name.isprintable() or len(name) > LONGEST_NAME:
+        raise ConfigError(
+            f'{where} must be printable and have at most {LONGEST_NAME} characters, not {name!r}'
+        )
+    return name
 
 
 def parse_numbers(
@@ -35,7 +62,7 @@ def parse_numbers(
     return np.array([parse_number(item, where, error) for item in value])
 
 
-def cell_number(text: str | None, where: str) -> float:
+def cell_number(text: str | None, where: str, largest: float = LARGEST) -> float:
     """Return the number in a cell of a table; None where the row ends before it."""
     try:
         number = float(text or 'blank')
@@ -44,4 +71,38 @@ def cell_number(text: str | None, where: str) -> float:
     if not math.isfinite(number):
         found = 'the row ends before it' if text is None else f'not {text!r}'
         raise InputError(f'{where} must be a number, {found}')
+    if abs(number) > largest:
+        raise InputError(f'{where} must be at most {largest:g}, not {number:g}')
     return number
+
+
+def cell_integer(text: str, where: str) -> int:
+    """Return the integer in a cell of a table; it has 64 bits at most."""
+    number = int(text) if re.fullmatch(r'-?[0-9]{1,19}', text) else LARGEST_STAMP + 1
+    if abs(number) > LARGEST_STAMP:
+        raise InputError(f'{where} must be an integer of 64 bits, not {text!r}')
+    return number
+
+
+def covariance_fault(covariance: FloatArray) -> str:
+    """Return what is wrong with a covariance (6, 6) of a measured pose; empty when nothing is.
+
+    Zeros alone mean that none was measured. Zeros in all that concerns the rotation mean that it
+    was not measured, or that its covariance is not known (trackers of positions).
+    """
+    if not np.isfinite(covariance).all():
+        return 'covariance with NaN or infinite values'
+    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-15):
+        return 'covariance not symmetric'
+    if not covariance.any():
+        return ''
+    known = covariance if covariance[3:].any() else covariance[:3, :3]
+    variances = np.diag(known)
+    if (variances <= 0.0).any():
+        return 'covariance not positive definite'
+    sigmas = np.sqrt(variances)
+    if sigmas.min() < SMALLEST_SIGMA or sigmas.max() > LARGEST_SIGMA:
+        return f'covariance with a sigma not within {SMALLEST_SIGMA:g} and {LARGEST_SIGMA:g}'
+    if np.linalg.eigvalsh(known / np.outer(sigmas, sigmas))[0] <= DEPENDENT:
+        return 'covariance not positive definite'
+    return ''

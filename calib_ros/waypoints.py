@@ -7,7 +7,6 @@ Joint values are in q1 ... qn [rad or m], poses in x y z [m] and qx qy qz qw.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from calib_ros.chain import Chain
 from calib_ros.errors import InputError
 from calib_ros.inverse import limits
 from calib_ros.se3 import FloatArray
+from calib_ros.texts import LARGEST_TABLE, read_rows, read_text
 from calib_ros.values import QUATERNION_TOLERANCE, cell_number
 
 BEYOND = 1e-3
@@ -93,13 +93,7 @@ def csv_of(columns: Sequence[str], values: FloatArray) -> str:
 
 def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int], Sequence[str]]:
     """Return the values (N, C) of some columns, the line of each row, and the header."""
-    try:
-        with path.open(encoding='utf-8-sig', newline='') as file:
-            reader = csv.DictReader(file, strict=True)
-            rows = [(reader.line_num, row) for row in reader]
-    except (OSError, UnicodeDecodeError, csv.Error) as err:
-        raise InputError(f'cannot read {path}: {err}') from err
-    header = reader.fieldnames or []
+    header, rows = read_rows(read_text(path, LARGEST_TABLE, InputError), path)
     missing = [name for name in columns if name not in header]
     if missing:
         raise InputError(

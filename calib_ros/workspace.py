@@ -25,12 +25,13 @@ from calib_ros import se3
 from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.config import load_calibration
 from calib_ros.differential import ErrorModel
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.identifiability import structurally_independent
 from calib_ros.identification import Identification
 from calib_ros.leastsquares import Samples, System, minimise
 from calib_ros.se3 import FloatArray
 from calib_ros.simulation import measure
+from calib_ros.texts import read_text
 
 Model: TypeAlias = Literal['corrected', 'nominal']
 MODELS: tuple[Model, ...] = get_args(Model)
@@ -90,15 +91,21 @@ class CalibratedArm:
         if not path.is_dir():
             return arm
         try:
-            document: dict[str, Any] = json.loads((path / 'result.json').read_text())
-            names = tuple(document['covariance']['names'])
+            document: dict[str, Any] = json.loads(read_text(path / 'result.json'))
+            names = tuple(map(str, document['covariance']['names']))
             covariance = np.array(document['covariance']['matrix'], dtype=float)
             residual = 1e-3 * float(document['validation']['after']['rms_mm'])
-        except (OSError, ValueError, KeyError, TypeError) as err:
+            if covariance.shape != (len(names),) * 2 or not np.isfinite(covariance).all():
+                raise ValueError(f'its matrix is not one of finite numbers for {len(names)} names')
+            if not 0.0 <= residual < np.inf:
+                raise ValueError('its RMS error is none')
+        except (CalibrationError, ValueError, LookupError, TypeError, ArithmeticError) as err:
             raise InputError(
                 f'{path / "result.json"} holds no covariance: identify again, or give '
                 f'{path / "calibration.yaml"} alone ({type(err).__name__}: {err})'
             ) from err
+        except RecursionError as err:
+            raise InputError(f'{path / "result.json"} is nested too deep') from err
         return replace(arm, names=names, covariance=covariance, residual=residual)
 
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:

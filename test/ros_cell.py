@@ -264,6 +264,7 @@ def free_domain():
 
 
 def stamp_ns(message):
+    message = getattr(message, 'transforms', [message])[0]
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 

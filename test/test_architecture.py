@@ -14,17 +14,18 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 
 ORDER = [
     {'errors'},
-    {'se3', 'files', 'mcap'},
-    {'effects', 'description', 'values'},
+    {'escapes', 'files', 'mcap', 'se3', 'texts'},
+    {'effects', 'values'},
+    {'description'},
     {'chain', 'settings'},
-    {'urdf'},
+    {'arguments', 'urdf'},
     {'config', 'differential', 'observations'},
     {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
     {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
-    {'account', 'following', 'names', 'robust', 'waypoints'},
+    {'account', 'following', 'names', 'robust', 'strays', 'transforms', 'waypoints'},
     {'compensation'},
     {'collector', 'export', 'frames', 'journal', 'programs'},
-    {'archive', 'problem'},
+    {'archive', 'problem', 'vendors'},
     {'chance', 'evidence', 'live', 'noise'},
     {'misfits', 'region', 'rounding', 'steps'},
     {'suspicions', 'validation'},
@@ -33,21 +34,34 @@ ORDER = [
     {'candidates', 'placement', 'verification'},
     {'planning', 'plots', 'session', 'testposes'},
     {'intake', 'report'},
+    {'topics'},
     {'replay'},
     {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
-    {'commands', 'diagnostics', 'guide', 'keeper'},
+    {'broadcast', 'commands', 'diagnostics', 'guide'},
+    {'keeper'},
     {'cli', 'node'},
 ]
 LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {'node', 'deferred', 'diagnostics', 'guide', 'inputs', 'keeper', 'outgoing', 'parameters'}
+ROS = {
+    'node',
+    'broadcast',
+    'deferred',
+    'diagnostics',
+    'guide',
+    'inputs',
+    'keeper',
+    'outgoing',
+    'parameters',
+}
 ONLY = {
     'rclpy': ROS,
     'sensor_msgs': ROS,
+    'tf2_msgs': ROS,
     'geometry_msgs': ROS,
     'trajectory_msgs': ROS,
     'rosbags': {'replay'},
     'matplotlib': {'plots'},
-    'yaml': {'config', 'export', 'programs'},
+    'yaml': {'arguments', 'config', 'export', 'programs', 'texts', 'vendors'},
 }
 
 

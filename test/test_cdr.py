@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros import messages
-from calib_ros.cdr import decode, readings
+from calib_ros.cdr import decode, readings, trajectory_size
 from calib_ros.messages import DECODERS, JOINT_STATE
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -191,3 +191,27 @@ def test_what_a_decoder_refuses_is_left_to_it(kind, numbers, child, seconds):
         assert batch.row(1) == read(kind, [blob])[0]
     with pytest.raises(messages.MessageError):
         read(kind, [bad])
+
+
+def trajectory(frame_id, names, points):
+    duration = TYPES['builtin_interfaces/msg/Duration'](0, 0)
+    row, none = np.zeros(len(names)), np.zeros(0)
+    point = TYPES['trajectory_msgs/msg/JointTrajectoryPoint'](row, none, none, none, duration)
+    kind = 'trajectory_msgs/msg/JointTrajectory'
+    message = TYPES[kind](header(1, 2, frame_id), names, [point] * points)
+    return [bytes(STORE.serialize_cdr(message, kind, little_endian=e)) for e in (True, False)]
+
+
+@given(NAMES, st.lists(NAMES, max_size=8), st.integers(0, 20))
+def test_the_size_of_a_trajectory_is_known_without_decoding_it(frame_id, names, points):
+    for data in trajectory(frame_id, names, points):
+        assert trajectory_size(data) == (len(names), points)
+        for end in range(len(data)):
+            found = trajectory_size(data[:end])
+            assert found[0] in (0, len(names))
+            assert found[1] in (0, points)
+
+
+def test_a_trajectory_that_names_joints_without_end_is_not_gone_through():
+    little, _ = trajectory('', [''] * 20_000, 3)
+    assert trajectory_size(little) == (20_000, 0)

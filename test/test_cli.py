@@ -288,8 +288,12 @@ def test_demo_shows_the_whole_way(run, tmp_path):
     status, _, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
     assert status == 1
     assert '--force' in err
+    for note in ('notes.txt', 'bag/notes.txt'):
+        (tmp_path / 'demo' / note).write_text('mine')
     again = run('demo', '--poses', 20, '--out', tmp_path / 'demo', '--force')
     assert again == (0, out, '')
+    for note in ('notes.txt', 'bag/notes.txt'):
+        assert (tmp_path / 'demo' / note).read_text() == 'mine'
 
 
 def test_demo_of_another_robot(run, tmp_path):
@@ -399,7 +403,9 @@ def test_a_damaged_bag_warns_and_says_so_in_the_report(run, tmp_path):
     (file,) = bag.glob('*.mcap')
     file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
     out = tmp_path / 'out'
-    status, said, err = run('identify', bag, '--chain', 'ur5e', '--out', out, '--json')
+    given = ('identify', bag, '--chain', 'ur5e', '--json', '--out')
+    assert run(*given, tmp_path / 'refused')[0] == 3
+    status, said, err = run(*given, out, '--largest-loss', '0.5')
     assert status == 0
     assert err.startswith('warning: ')
     assert err.count('\n') == 1

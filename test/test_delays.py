@@ -162,3 +162,25 @@ def test_find_delay_goes_by_positions_where_there_are_no_orientations(rng):
     _, motion, _ = true_cell(3)
     *arguments, _ = speeds(0.123, 30.0, rng, motion)
     assert find_delay(*arguments, None).seconds == pytest.approx(0.123, abs=3e-2)
+
+
+def test_a_far_stamp_costs_no_time_and_no_memory(rng, monkeypatch):
+    """Of one in both streams the speeds would be looked at every 5 ms up to it."""
+    _, motion, _ = true_cell(3)
+    chain, *arrays = speeds(0.1, 30.0, rng, motion)
+    looked_at = []
+    arange = np.arange
+
+    def counting(*arguments):
+        found = arange(*arguments)
+        looked_at.append(len(found))
+        return found
+
+    for k in (0, 2):
+        arrays[k] = np.append(arrays[k], START + 10_000_000 * 10**9)
+    for k in (1, 3, 4):
+        arrays[k] = np.concatenate([arrays[k], arrays[k][:1]])
+    monkeypatch.setattr(np, 'arange', counting)
+    assert find_delay(chain, *arrays) is None
+    assert looked_at
+    assert max(looked_at) <= 100_000

@@ -123,7 +123,7 @@ def test_what_a_table_cannot_say_is_said_at_its_head():
 
 def test_a_file_that_differs_is_refused(monkeypatch):
     nominal, chain = corrected('ur10e')
-    monkeypatch.setattr(export, '_xyz_rpy', lambda matrix: dict.fromkeys(KEYS, 0.0))
+    monkeypatch.setattr(export, 'xyz_rpy', lambda matrix: dict.fromkeys(KEYS, 0.0))
     with pytest.raises(ExportError, match=r'kinematics\.yaml, read back, differs'):
         exports(chain, nominal)
 

@@ -60,6 +60,9 @@ def shift(rng, stops=14):
     quats = to_quat(seen.rotations)
     found = []
 
+    def stray(stamp_ns):
+        return stamp_ns + (int(rng.choice([-(10**13), -(10**10), 10**10, 10**13])))
+
     def come(stamp_ns, message):
         late = rng.exponential(0.05) + (rng.random() < 0.02) * rng.uniform(0.0, 3.0)
         found.append((stamp_ns * 1e-9 + late, message))
@@ -68,13 +71,15 @@ def shift(rng, stops=14):
         row = values[k].copy()
         row[2] = np.nan if rng.random() < RARE else row[2]
         given = 0 if rng.random() < RARE else stamp
+        given = stray(given) if rng.random() < RARE else given
         order = rng.permutation(6) if rng.random() < RARE else np.arange(6)
         come(stamp, joints(JOINTS, given, [ARM.joint_names[i] for i in order], row[order]))
         if k % 3 == 0:
             come(stamp, joints(GRIPPER, stamp, ['finger'], [0.1]))
         frame_id = 'elsewhere' if rng.random() < RARE else 'world'
         place = seen.positions[k] * (np.nan if rng.random() < RARE else 1.0)
-        come(stamp, pose(stamp + 300_000, place, quats[k], frame_id))
+        given = stray(stamp) if rng.random() < RARE else stamp
+        come(stamp, pose(given + 300_000, place, quats[k], frame_id))
         if k % 2 == 0:
             come(stamp, point(stamp, seen.positions[k]))
     found.sort(key=lambda item: item[0])
@@ -121,6 +126,32 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     many.finish()
     assert outcome(one) == outcome(many)
     assert one.samples
+
+
+@pytest.mark.parametrize('off', [10_000, 10_000_000])
+def test_two_stray_stamps_in_a_batch_cost_two_messages(rng, off):
+    stamps, values, _ = drive(ARM.random_joints(10, rng), Cell(joint_rate=100.0), START)
+    seen = measure(ARM, values, rng, 5e-5, 2e-4)
+    quats = to_quat(seen.rotations)
+    sane = []
+    for k, stamp in enumerate(stamps.tolist()):
+        sane.append(joints(JOINTS, stamp, ARM.joint_names, values[k]))
+        sane.append(pose(stamp, seen.positions[k], quats[k]))
+    far = int(stamps[len(stamps) // 2]) + off * 1_000_000_000
+    stray = [joints(JOINTS, far, ARM.joint_names, values[0]), pose(far, np.zeros(3), quats[0])]
+    half = len(sane) // 2
+    sessions = CalibrationSession(ARM), CalibrationSession(ARM)
+    for session, messages in zip(
+        sessions, (sane, [*sane[:half], *stray, *sane[half:]]), strict=True
+    ):
+        assert feed(session, messages, STORE.deserialize_cdr) == []
+        session.finish()
+    expected, found = map(outcome, sessions)
+    assert found[1:] == expected[1:]
+    cause = 'stamp far from those before and after'
+    more = {f'joints: {cause}': 1, f'poses: {cause}': 1}
+    assert found[0].dropped == expected[0].dropped | more
+    assert found[0].samples == 10
 
 
 def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):

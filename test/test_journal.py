@@ -20,7 +20,7 @@ from calib_ros.samples import Sample
 from calib_ros.tables import read_journal, read_table
 
 JOINTS = 3
-floats = st.floats(allow_nan=False, allow_infinity=False, width=64)
+floats = st.floats(-1e6, 1e6)  # what a session takes
 vectors = st.lists(floats, min_size=JOINTS, max_size=JOINTS).map(np.array)
 names = st.text(st.characters(exclude_categories=['C', 'Z'], include_characters=' '), max_size=8)
 
@@ -68,7 +68,7 @@ def samples(draw):
         validation=draw(st.booleans()),
         delay=draw(floats),
         count=draw(st.integers(1, 10**6)),
-        spread=draw(floats),
+        spread=draw(st.floats(0.0, allow_infinity=False, allow_nan=False)),
     )
 
 

@@ -4,16 +4,22 @@
 
 import struct
 import sys
+import tracemalloc
 import zlib
+from io import BytesIO
 from types import SimpleNamespace
 
 import lz4.frame
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.rosbag2.reader import zstd
 
-from calib_ros.mcap import CHANNEL, CHUNK, MESSAGE, logged, records
+from calib_ros.mcap import CHANNEL, CHUNK, LARGEST_CHUNK, MESSAGE, logged, records
+
+try:
+    from rosbags.rosbag2.reader import zstd
+except ImportError:  # what older ones bring
+    import zstandard as zstd
 
 COMPRESSORS = {'': bytes, 'lz4': lz4.frame.compress, 'zstd': zstd.compress}
 TIMES = st.integers(0, 20)
@@ -48,22 +54,25 @@ CONTENT = b''.join(message(*each) for each in MESSAGES)
 def test_messages_come_in_the_order_of_their_log_times(compression, checked, given_, limits):
     begin, end = sorted(limits)
     content = record(CHANNEL, b'any') + b''.join(message(*each) for each in given_)
-    found = list(logged(chunk(content, compression, checked, begin, end), {1: 'a', 3: 'c'}))
+    given_chunk = chunk(content, compression, checked, begin, end)
+    found, problem = logged(given_chunk, {1: 'a', 3: 'c'})
+    assert problem is None
     wanted = [each for each in given_ if each[0] != 2 and begin <= each[1] <= end]
     wanted.sort(key=lambda each: each[1])
-    assert found == [({1: 'a', 3: 'c'}[channel], data) for channel, _, data in wanted]
+    names = {1: 'a', 3: 'c'}
+    assert found == [(time, names[channel], data) for channel, time, data in wanted]
 
 
 @pytest.mark.parametrize('compression', sorted(COMPRESSORS))
 def test_a_chunk_with_a_wrong_byte_is_refused(compression):
     good = chunk(CONTENT, compression)
-    whole = list(logged(good, {1: 1, 2: 2, 3: 3}))
-    assert len(whole) == 4
+    whole = logged(good, {1: 1, 2: 2, 3: 3})
+    assert len(whole[0]) == 4
     for place in range(25, len(good)):  # from the size on
         bad = bytearray(good)
         bad[place] ^= 0x55
         try:
-            found = list(logged(bytes(bad), {1: 1, 2: 2, 3: 3}))
+            found = logged(bytes(bad), {1: 1, 2: 2, 3: 3})
         except Exception:
             continue
         # Bytes that no reader needs, such as the checksum that a compressor adds.
@@ -74,32 +83,61 @@ def test_a_chunk_that_is_cut_off_is_refused():
     good = chunk(CONTENT, checked=False)
     for length in range(len(good)):
         with pytest.raises((ValueError, struct.error)):
-            list(logged(good[:length], {1: 1}))
+            logged(good[:length], {1: 1})
 
 
 def test_the_messages_before_a_damaged_one_are_used():
-    found = logged(chunk(CONTENT[:-2]), {1: 'a', 3: 'c'})
-    assert [next(found), next(found)] == [('a', b'one'), ('a', b'')]
-    with pytest.raises(ValueError, match='a record in a chunk is damaged'):
-        next(found)
+    found, problem = logged(chunk(CONTENT[:-2]), {1: 'a', 3: 'c'})
+    assert found == [(5, 'a', b'one'), (7, 'a', b'')]
+    assert 'a record in a chunk is damaged' in str(problem)
 
 
 def test_an_unknown_compression_is_named():
     named = chunk(CONTENT, 'zstd').replace(b'zstd', b'brot')
     with pytest.raises(OSError, match='decompress brot'):
-        next(logged(named, {1: 1}))
+        logged(named, {1: 1})
 
 
 def test_the_zstd_of_older_rosbags_will_do(monkeypatch):
     class Decompressor:
-        def decompressobj(self):
-            return SimpleNamespace(decompress=zstd.decompress)
+        def stream_reader(self, data):
+            return BytesIO(zstd.decompress(data))
 
     for module in ('compression.zstd', 'backports.zstd'):
         monkeypatch.setitem(sys.modules, module, None)
-    named = SimpleNamespace(ZstdDecompressor=Decompressor)
+    named = SimpleNamespace(ZstdDecompressor=Decompressor, ZstdCompressionDict=None)
     monkeypatch.setitem(sys.modules, 'zstandard', named)
-    assert list(logged(chunk(CONTENT, 'zstd'), {3: 'c'})) == [('c', b'three')]
+    assert logged(chunk(CONTENT, 'zstd'), {3: 'c'}) == ([(7, 'c', b'three')], None)
+
+
+@pytest.mark.parametrize('compression', ['lz4', 'zstd'])
+@pytest.mark.parametrize('said', [100, LARGEST_CHUNK, 1 << 40])
+def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_refused(compression, said):
+    bomb = bytearray(chunk(bytes(LARGEST_CHUNK + 1000), compression))
+    bomb[25:33] = struct.pack('<Q', said)
+    assert len(bomb) < 1_000_000
+    tracemalloc.start()
+    with pytest.raises(ValueError, match='more than'):
+        logged(bytes(bomb), {1: 1})
+    with pytest.raises(ValueError, match='more than'):
+        list(records(bytes(bomb)))
+    assert tracemalloc.get_traced_memory()[1] < 2.5 * LARGEST_CHUNK
+    tracemalloc.stop()
+
+
+def test_chunks_within_chunks_are_refused():
+    nested = chunk(chunk(CONTENT))
+    with pytest.raises(ValueError, match='a chunk is within a chunk'):
+        list(records(nested))
+    found, problem = logged(nested, {1: 1})
+    assert found == []
+    assert problem is not None
+
+
+def test_many_chunks_are_not_more_than_any_recording_holds():
+    bomb = chunk(record(0x0A, bytes(LARGEST_CHUNK // 2)), 'zstd') * 3
+    with pytest.raises(ValueError, match='times its size'):
+        list(records(bomb))
 
 
 def test_records_of_chunks_come_among_the_others():

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros import se3
@@ -20,7 +20,7 @@ from calib_ros.cli import main
 from calib_ros.config import load_chain
 from calib_ros.journal import Journal
 from calib_ros.messages import JOINT_STATE
-from calib_ros.replay import STORAGES, replay
+from calib_ros.replay import replay
 from calib_ros.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.simulation import Cell, drive, faulty, random_frame
@@ -264,7 +264,7 @@ def record(path, cell, count, storage='mcap'):
             for stamp, value in zip(at.tolist(), seen, strict=True):
                 events.append((stamp, topic, of(stamp, value)))
     events.sort(key=lambda event: event[0])
-    with Writer(path, version=9, storage_plugin=STORAGES[storage]) as writer:
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         connections = {
             topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
             for topic, kind in {topic: each.__msgtype__ for _, topic, each in events}.items()

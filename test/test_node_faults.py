@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped
 from rclpy.node import Node
@@ -29,6 +30,7 @@ from ros_cell import (
     true_arm,
     values_of,
 )
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -228,12 +230,65 @@ def test_the_last_stop_is_kept_at_the_end(tmp_path, recording):
     assert len(samples_in(tmp_path)) == STOPS
 
 
+# The first run
+
+
+@contextmanager
+def fresh_home(monkeypatch, tmp_path):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.delenv('ROS_HOME', raising=False)
+    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
+    yield tmp_path / '.ros' / 'calib_ros'
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize('default', [True, False])
+def test_the_first_run_of_an_account_loses_nothing(
+    monkeypatch, tmp_path, recording, default, number
+):
+    with fresh_home(monkeypatch, tmp_path) as folder:
+        given = {}
+        if not default:
+            folder = tmp_path / 'not' / 'yet' / 'there'
+            given = {'data_dir': folder}
+        with cell_and_child(**given) as (cell, child):
+            status = cell.listen(String, '/calibration_node/status')
+            cell.play(part(recording, 0.0, 12.0))
+            cell.spin_until(lambda: status and status[-1].data.startswith('10 samples'))
+            if number == signal.SIGKILL:
+                child.kill()
+            else:
+                assert child.end(number) == 0, child.output
+            assert 'memory only' not in child.output
+        kept = samples_in(folder)
+        assert len(kept) == (10 if number == signal.SIGKILL else 12)
+        with cell_and_child(resume='true', **given) as (_, child):
+            assert f'resumed {len(kept)} samples' in child.wait_for('ready to calibrate')
+    expected = direct(recording)
+    expected.finish()
+    for one, other in zip(kept, expected.samples[: len(kept)], strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        np.testing.assert_array_equal(one.position, other.position)
+
+
+@pytest.mark.parametrize('folder', ['/proc/nope', '/dev/null/nope'])
+def test_a_node_that_could_keep_no_samples_does_not_start(folder):
+    with Child(chain='ur10e', data_dir=folder) as child:
+        assert child.end() == 1
+    lines = [line for line in child.output.splitlines() if 'calibration_node:' in line]
+    assert len(lines) == 1
+    assert f'samples cannot be kept in {folder}' in lines[0]
+    assert 'set data_dir' in lines[0]
+    assert 'Traceback' not in child.output
+
+
 # A full disk
 
 
 def test_a_full_disk(tmp_path, recording):
     with cell_and_child(data_dir=tmp_path) as (cell, child):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        status = cell.listen(String, '/calibration_node/status')
         cell.play(part(recording, 0.0, 6.0))
         cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
         cell.spin_until(lambda: len(samples_in(tmp_path)) == 4)
@@ -248,6 +303,8 @@ def test_a_full_disk(tmp_path, recording):
             assert said in heard[-1].status[0].message
 
         level(DiagnosticStatus.ERROR, 'samples are in memory only')
+        cell.spin_until(lambda: status[-1].data.startswith('samples are in memory only: '))
+        assert heard[-1].status[0].message.count('in memory only') == 1
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
         answer = cell.call('clear')
@@ -264,6 +321,7 @@ def test_a_full_disk(tmp_path, recording):
         ]
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
         level(DiagnosticStatus.OK, 'samples')
+        cell.spin_until(lambda: 'memory' not in status[-1].data)
         assert len(samples_in(tmp_path)) == STOPS
         assert cell.call('save').success
         assert child.end(signal.SIGINT) == 0
@@ -416,7 +474,8 @@ def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
 
 def test_poses_in_different_frames_are_refused(cell, recording):
     some = pose_messages(recording.poses)
-    some[40].header.frame_id = 'camera'
+    for message in some[40:70]:
+        message.header.frame_id = 'camera'
     words = cell.listen(String, 'calibration_node/status')
     cell.play(topics(recording, measured_pose=some))
     cell.spin_until(lambda: words and 'different frames (camera, tracker)' in words[-1].data)
@@ -424,6 +483,41 @@ def test_poses_in_different_frames_are_refused(cell, recording):
     assert not answer.success
     assert 'different frames (camera, tracker)' in answer.message
     assert 'set frame_id' in answer.message
+    assert cell.set_parameters({'frame_id': 'tracker'})[0].successful
+    answer = cell.call('identify')  # the advice helps, at once
+    assert answer.success, answer.message
+
+
+def test_one_stray_frame_does_not_stop_the_cell(cell, recording):
+    some = pose_messages(recording.poses)
+    some[40].header.frame_id = 'camera'
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.play(topics(recording, measured_pose=some))
+    said = 'poses: in frame "camera", not in "tracker" as others'
+    cell.spin_until(lambda: heard and f'dropped {said}' in values_of(heard[-1]))
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+
+
+def test_stray_stamps_are_told_and_cost_nothing_else(cell, recording):
+    joints, poses = topics(recording).values()
+    for messages, where in ((joints, 600), (poses, 40)):
+        messages[where].header.stamp.sec += 10_000_000
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    arm = cell.publisher(JointState, 'joint_states')
+    cell.play({'joint_states': joints[:600], 'measured_pose': poses[:40]})
+    arm.publish(joints[600])
+    cell.publisher(PoseStamped, 'measured_pose').publish(poses[40])
+    cell.spin_until(lambda: cell.node.session.received == {'joints': 601, 'poses': 41})
+    cell.play({'joint_states': joints[601:], 'measured_pose': poses[41:]})
+    cause = 'stamp far from those before and after'
+    keys = {f'dropped joints: {cause}', f'dropped poses: {cause}'}
+    cell.spin_until(lambda: heard and keys <= set(values_of(heard[-1])))
+    assert any('messages are dropped' in message.status[0].message for message in heard)
+    assert {values_of(heard[-1])[key] for key in keys} == {'1'}
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    assert len(cell.node.session.samples) == STOPS
 
 
 def test_poses_in_another_frame_than_frame_id_are_dropped(monkeypatch, tmp_path, recording):
@@ -592,3 +686,36 @@ def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, record
         missing = sent + 3001 - first - told()[0]
         flood()  # DDS may tell the rest of a loss with the next one only
         cell.spin_until(lambda: told()[1] >= missing)
+
+
+# Requests that are too large
+
+
+def test_a_list_without_end_is_refused(cell):
+    for entries, said in (
+        ([f'joint_{k}.a' for k in range(100_000)], 'fixed has 100000 entries, at most 1000'),
+        (['x' * 100_000], 'an entry of 100000 characters'),
+    ):
+        (result,) = cell.set_parameters({'fixed': entries})
+        assert not result.successful
+        assert said in result.reason
+        assert len(result.reason) <= 400
+    assert cell.node.session.settings.fixed == ()
+
+
+def test_a_negative_time_does_not_end_the_node(tmp_path, recording):
+    with cell_and_child(data_dir=tmp_path, use_sim_time='true') as (cell, child):
+        clock = cell.publisher(Clock, '/clock')
+        for seconds in (-1, -(2**31), 5):
+            clock.publish(Clock(clock=Time(sec=seconds)))
+        stamps = cell.listen(DiagnosticArray, '/diagnostics', 10)
+
+        def follows():  # only the last message is kept for one who is slow
+            clock.publish(Clock(clock=Time(sec=-3)))
+            clock.publish(Clock(clock=Time(sec=7)))
+            return stamps and stamps[-1].header.stamp.sec == 7
+
+        cell.spin_until(follows)
+        assert child.end(signal.SIGTERM) == 0
+    assert 'negative times on /clock are not used' in child.output
+    assert 'Traceback' not in child.output

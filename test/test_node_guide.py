@@ -324,6 +324,30 @@ def test_trajectories_that_cannot_be_corrected_are_refused(calibrated, corrected
     assert len(corrected) == 1
 
 
+@pytest.mark.parametrize(
+    ('message', 'said'),
+    [
+        (
+            JointTrajectory(points=[JointTrajectoryPoint()] * 60_000),
+            'refused: 60000 points, at most 50000 are taken',
+        ),
+        (
+            JointTrajectory(points=[JointTrajectoryPoint(effort=[0.0] * 2_600_000)]),
+            'bytes, at most 20000000 are taken',
+        ),
+        (JointTrajectory(joint_names=['j'] * 20_000), 'refused: 20000 joints, at most 1000'),
+    ],
+    ids=['points', 'bytes', 'joints'],
+)
+def test_trajectories_that_are_too_large_are_not_even_decoded(cell, monkeypatch, message, said):
+    decoded = []
+    monkeypatch.setattr(guide_module, 'deserialize_message', lambda *_: decoded.append(1))
+    cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory').publish(message)
+    cell.spin_until(lambda: cell.node._guide._last_trajectory)
+    assert said in cell.node._guide._last_trajectory
+    assert not decoded
+
+
 def test_another_calibration_corrects_otherwise(calibrated, corrected):
     q = path(5)[0]
     send(calibrated, trajectory(q))

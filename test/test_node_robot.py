@@ -24,6 +24,7 @@ TABLES = {
     'kinematics.yaml',
     'dh_without_beta.csv',
     'joint_offsets.csv',
+    'ur_kinematics.yaml',
 }
 
 

@@ -15,10 +15,19 @@ import pytest
 import yaml
 
 import calib_ros
+from calib_ros.arguments import BESIDE_SETTINGS, PARAMETERS
 from calib_ros.settings import Settings
 
 ROOT = Path(__file__).parents[1]
-CONFIG = ('config/calibration_node.yaml', 'config/calibration.rviz')
+JAZZY = {
+    *('builtin_interfaces', 'diagnostic_aggregator', 'diagnostic_msgs', 'geometry_msgs', 'launch'),
+    *('launch_ros', 'nav_msgs', 'rcl_interfaces', 'rclpy', 'robot_state_publisher', 'rviz2'),
+    *('sensor_msgs', 'std_msgs', 'std_srvs', 'tf2_msgs', 'trajectory_msgs', 'visualization_msgs'),
+}
+"""Packages of Jazzy: rosdep installs their Debian packages, ros-jazzy-NAME."""
+INSTALLED = tuple(f'config/{name}' for name in ('calibration_node.yaml', 'calibration.rviz'))
+INSTALLED += ('config/diagnostics.yaml', 'launch/calibration.launch.py', 'launch/cell.launch.py')
+INSTALLED += ('security/policy.xml',)
 
 
 @pytest.mark.parametrize('arguments', [[], ['--symlink-install']])
@@ -38,7 +47,7 @@ def test_colcon_build_puts_everything_where_ros2_looks(tmp_path, arguments):
     prefix = tmp_path / 'install' / 'calib_ros'
     share = prefix / 'share' / 'calib_ros'
     assert (prefix / 'share/ament_index/resource_index/packages/calib_ros').is_file()
-    for name in ('package.xml', 'launch/calibration.launch.py', *CONFIG):
+    for name in ('package.xml', *INSTALLED):
         assert (share / name).is_file()
     robots = {path.name for path in (ROOT / 'config/robots').iterdir()}
     assert {path.name for path in (share / 'config/robots').iterdir()} == robots
@@ -66,7 +75,8 @@ def test_versions_agree():
 def test_package_xml_names_everything_that_is_imported():
     package = ET.parse(ROOT / 'package.xml').getroot()
     declared = {element.text for element in package.iter('exec_depend')}
-    keys = {'yaml': 'python3-yaml', 'rosbags': 'python3-rosbags-pip'}
+    declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
+    keys = {'yaml': 'python3-yaml'}
     keys |= {name: f'python3-{name}' for name in ('numpy', 'scipy', 'matplotlib')}
     sources = [*(ROOT / 'calib_ros').glob('*.py'), *(ROOT / 'launch').glob('*.py')]
     for source in sources:
@@ -79,9 +89,28 @@ def test_package_xml_names_everything_that_is_imported():
                     assert keys.get(top, top) in declared, f'{source.name} imports {top}'
 
 
+def test_rosdep_finds_everything_on_ubuntu():
+    """rosdep refuses keys that it would have to install by pip: PEP 668."""
+    package = ET.parse(ROOT / 'package.xml').getroot()
+    keys = {each.text for each in package if each.tag.endswith('depend')}
+    apt = ('hypothesis', 'matplotlib', 'numpy', 'pytest', 'scipy', 'yaml')
+    assert keys - JAZZY == {f'python3-{name}' for name in apt}
+
+
+def test_the_oldest_versions_are_those_that_pip_may_install():
+    text = (ROOT / 'setup.py').read_text()
+    bounds = dict(re.findall(r"'(\w+)>=([\d.]+)'", text))
+    oldest = (ROOT / 'test/oldest.txt').read_text()
+    pins = re.findall(r'^(\w+)==([\d.]+)(?:; python_version (\S+))?', oldest, re.MULTILINE)
+    assert {name: pin for name, pin, marker in pins if marker in ('', '<')} == bounds
+    assert [name for name, _, marker in pins if marker == '>='] == ['matplotlib']
+
+
 def test_the_parameter_file_states_the_defaults():
     content = yaml.safe_load((ROOT / 'config/calibration_node.yaml').read_text())
     stated = content['/**']['ros__parameters']
+    for each in BESIDE_SETTINGS:
+        assert stated[each.name] == (each.default if each.default != () else [''])
     for item in fields(Settings):
         if isinstance(item.default, tuple):
             assert stated[item.name] == ['']
@@ -105,7 +134,7 @@ def test_rviz_shows_what_the_node_publishes():
         assert latched['Durability Policy'] == 'Transient Local'
 
 
-def test_the_document_of_the_node_lists_every_setting():
+def test_the_document_of_the_node_lists_every_parameter():
     text = (ROOT / 'docs/node.md').read_text()
-    for item in fields(Settings):
-        assert f'`{item.name}`' in text, item.name
+    for name in PARAMETERS:
+        assert f'`{name}`' in text, name

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -124,6 +125,89 @@ def test_restored_samples_know_their_frame():
     drive(made, UR5E.random_joints(2, np.random.default_rng(1)), [tracker()])  # in 'tracker'
     with pytest.raises(InputError, match=r'different frames \(tracker, world\)'):
         made.problem()
+
+
+def renamed(tracked, frames):
+    """Return a source whose measurements by their number are in other frames."""
+    source, kind, seen = tracked
+    counter = itertools.count()
+
+    def make(stamp, row):
+        message = seen(stamp, row)
+        message.header.frame_id = frames.get(next(counter), message.header.frame_id)
+        return message
+
+    return source, kind, make
+
+
+@pytest.mark.parametrize('where', [0, 10, 100])
+def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
+    """Also of the first measurement, which would make a sample of its own."""
+    configurations = UR5E.random_joints(16, np.random.default_rng(1))
+    made, expected, removed = CalibrationSession(UR5E), CalibrationSession(UR5E), []
+    made.on_removed = removed.append
+    drive(made, configurations, [renamed(tracker(), {where: 'stray'})])
+    drive(expected, configurations, [tracker()])
+    made.finish()
+    expected.finish()
+    if where:  # the first comes in the time in which the arm has just stopped
+        assert made.account().dropped['poses: in frame "stray", not in "tracker" as others'] == 1
+    assert 'different frames' not in made.status()
+    assert made.identify().accepted
+    assert made.problem().world_frame == 'tracker'
+    assert {sample.frame_id for sample in made.samples} == {'tracker'}
+    assert not removed  # none had been made before the usual frame was known
+    assert len(made.samples) == len(expected.samples)
+
+
+def test_a_sample_in_a_stray_frame_goes_when_the_usual_one_is_known():
+    """One measurement for each stop: that in another frame is a sample, and on the disk."""
+    made, removed = session(), []
+    made.on_removed = removed.append
+    given = samples(30, frame_id='tracker')
+    stray = replace(given[0], frame_id='stray')
+    made.restore([stray, *given[1:5]])
+    with pytest.raises(InputError, match=r'different frames \(stray, tracker\)'):
+        made.problem()  # one of five may be right
+    assert made.samples[0] is stray
+    made.restore(given[5:])
+    made.problem()
+    assert removed == [stray]
+    assert stray not in made.samples
+    assert made.account().dropped == {'poses: in frame "stray", not in "tracker" as others': 1}
+    assert made.identify().accepted
+
+
+def test_frame_id_helps_at_once_when_frames_differ():
+    made = session(samples(30, frame_id='left'), samples(20, seed=6, start=100, frame_id='right'))
+    with pytest.raises(InputError, match='set frame_id'):
+        made.identify()
+    assert len(made.samples) == 50
+    made.change(replace(made.settings, frame_id='right'))
+    assert made.identify().accepted
+    assert made.problem().world_frame == 'right'
+    assert sum(len(each) for each in made.problem().sets) == 20
+    made.change(replace(made.settings, frame_id='left'))
+    assert sum(len(each) for each in made.problem().sets) == 30
+    assert len(made.samples) == 50
+
+
+def test_targets_that_were_measured_once_are_left_out():
+    """Each would bring six parameters and tell nothing about the arm."""
+    good = samples(20, target='ball')
+    junk = [
+        each for k in range(300) for each in samples(1, seed=k, start=100 + k, target=f'junk {k}')
+    ]
+    made = session(junk[:150], good, junk[150:])
+    assert [len(each) for each in made.problem().sets] == [20]
+    assert made.status().startswith('20 samples')
+    assert made.identify().accepted
+    left_out = 'samples left out, in another frame or of a target measured once'
+    assert made.account().notes[left_out] == 300
+    made.restore(samples(1, seed=0, start=1000, target='junk 0'))  # seen again
+    assert len(made.problem().sets) == 2
+    assert made.estimate is not None
+    assert session(samples(1, target='one')).problem().sets  # the only ones are better than none
 
 
 def test_frames_without_end_are_not_remembered():

@@ -716,13 +716,17 @@ def test_the_last_row_needs_a_fixed_joint_behind(kind, rng):
     np.testing.assert_allclose(found, chain.forward(q), rtol=0.0, atol=EXACT)
 
 
-def test_an_origin_in_an_entity_is_refused():
-    text = '<!DOCTYPE robot [<!ENTITY o "<origin xyz=\'1 0 0\'/>">]>' + SCARA.replace(
-        '<origin xyz="0.4 0.0 0.05" rpy="0.0 0.0 0.0"/>', '&o;'
-    )
-    chain = chain_from_urdf(text)
-    with pytest.raises(ConfigError, match='origin of joint "elbow" is an XML entity'):
-        corrected_urdf(text, chain.with_offsets({'shoulder.a': 1e-3}))
+@pytest.mark.parametrize(
+    'head',
+    [
+        '<!DOCTYPE robot [<!ENTITY o "<origin xyz=\'1 0 0\'/>">]>',
+        '<?xml version="1.0"?>\n<!doctype robot>',
+        '<!DOCTYPE robot [' + '<!ELEMENT a (' * 100_000 + ']>',
+    ],
+)
+def test_a_doctype_is_refused_before_the_parser_sees_it(head):
+    with pytest.raises(ConfigError, match='DOCTYPE'):
+        chain_from_urdf(head + SCARA)
 
 
 # ---- from the URDF, by measurements, to the corrected URDF

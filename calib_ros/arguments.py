@@ -1,0 +1,234 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node can be told at its start: its parameters, and launch arguments made of them.
+
+Launch arguments are strings. `ros_arguments` makes command line arguments of a node of them, each
+by the type of its parameter: `serial:=0012` stays text. No ROS is imported here: the launch files
+and the node read the same list.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.settings import Settings
+
+NODE = 'calibration_node'
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of the node: its default, what it is for, whether it can change."""
+
+    name: str
+    default: Any
+    text: str
+    fixed: bool = True
+
+
+BESIDE_SETTINGS = (
+    Parameter(
+        'chain',
+        '',
+        'chain file or URDF of the robot, the name of one that calib_ros ships, or '
+        'robot_description: the URDF on that topic',
+    ),
+    Parameter('base_link', '', 'of a URDF: where the arm starts; default: its root'),
+    Parameter(
+        'tip_link', '', 'of a URDF: where the arm ends; default: tool0, flange or its only end'
+    ),
+    Parameter('executor', 'events', 'events or single_threaded: how messages are taken'),
+    Parameter('serial', '', 'serial number of the robot, for the record'),
+    Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
+    Parameter(
+        'allowed_folders',
+        (),
+        'folders in which ~/save and ~/load may use files besides data_dir; default: none',
+    ),
+    Parameter('resume', False, 'go on with the newest journal of this robot'),
+    Parameter(
+        'target_filename', '', 'file in data_dir that ~/save writes; default: a new one', False
+    ),
+    Parameter(
+        'calibration_filename',
+        '',
+        'file in data_dir that ~/load reads; default: the newest',
+        False,
+    ),
+    Parameter('marker_scale', 200.0, 'residual vectors are drawn so many times as long', False),
+    Parameter(
+        'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'
+    ),
+    Parameter(
+        'base_frame',
+        '',
+        "frame of the arm's base that is published on /tf_static in the frame of the "
+        'measurements; default: none',
+    ),
+    Parameter(
+        'flange_frame',
+        '',
+        "frame of the arm's flange in which the target is published on /tf_static; default: none",
+    ),
+    Parameter('target_frame', 'target', 'name of the target on /tf_static'),
+)
+PARAMETERS = {
+    each.name: each
+    for each in (
+        *BESIDE_SETTINGS,
+        *(Parameter(item.name, item.default, item.metadata['text']) for item in fields(Settings)),
+        Parameter('use_sim_time', False, 'time is that of /clock', False),
+    )
+}
+"""All parameters of the node by name, in the order in which they are declared."""
+REMAPPED = {
+    'joint_states': 'topic of the joint states; default: joint_states',
+    'measured_pose': 'topic of the measured poses; default: measured_pose',
+}
+"""Launch arguments that remap a topic of the same name."""
+PLACED = {
+    'namespace': 'namespace of the node and of its topics',
+    'params_file': 'parameter file of the node; what is given here as well comes before it',
+}
+
+
+def launch_arguments() -> dict[str, str]:
+    """Return the launch arguments of the node with what they are for.
+
+    All are empty by default: what is not given is not passed, so that the parameter file, and
+    the node's own defaults, hold.
+    """
+    texts = {each.name: _described(each) for each in PARAMETERS.values()}
+    return {**texts, **PLACED, **REMAPPED}
+
+
+def ros_arguments(given: Mapping[str, str]) -> list[str]:
+    """Return ROS arguments of the node for launch arguments; those that are empty are not passed.
+
+    The parameter file comes first: of a parameter that is set twice, ROS takes the later one.
+
+    Raises
+    ------
+    ConfigError
+        When a value is not of the type of its parameter.
+    InputError
+        When there is no parameter file.
+
+    """
+    words = []
+    if given.get('params_file'):
+        path = Path(given['params_file']).expanduser()
+        if not path.is_file():
+            raise InputError(f'params_file: there is no file {path}')
+        words = ['--params-file', str(path)]
+    for parameter in PARAMETERS.values():
+        text = given.get(parameter.name, '')
+        if text:
+            words += ['-p', f'{parameter.name}:={_as_yaml(parameter, text)}']
+    for topic in REMAPPED:
+        if given.get(topic):
+            words += ['-r', f'{topic}:={given[topic]}']
+    return words
+
+
+def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str]) -> None:
+    """Refuse launch arguments that do not exist: `ros2 launch` takes them and does nothing.
+
+    Parameters
+    ----------
+    command : sequence of str
+        The command line: `ros2 launch PACKAGE FILE name:=value ...`.
+    launch_file : str
+        The name of the launch file; where the command names another one, which includes this,
+        its arguments are not looked at.
+    known : sequence of str
+        The names of arguments that exist.
+
+    Raises
+    ------
+    UnknownNameError
+        When there is one.
+
+    """
+    names = [Path(word).name for word in command]
+    if launch_file not in names:
+        return
+    for word in command[names.index(launch_file) + 1 :]:
+        name, given, _ = word.partition(':=')
+        if given and name not in known:
+            raise UnknownNameError('launch argument', name, known)
+
+
+def switched(given: Mapping[str, str], name: str) -> bool:
+    """Return the value of a launch argument that switches something on or off."""
+    import yaml
+
+    value = yaml.safe_load(given[name])
+    if not isinstance(value, bool):
+        raise ConfigError(f'launch argument "{name}" must be true or false, not "{given[name]}"')
+    return value
+
+
+def rviz_config(text: str, namespace: str, fixed_frame: str = '') -> str:
+    """Return a configuration of RViz for the node in a namespace, and for another fixed frame."""
+    import yaml
+
+    document = yaml.safe_load(text)
+    manager = document['Visualization Manager']
+    above = ''.join(f'/{part}' for part in namespace.split('/') if part)
+    for display in manager['Displays']:
+        for key in ('Topic', 'Description Topic'):
+            if key in display:
+                display[key]['Value'] = above + display[key]['Value']
+    if fixed_frame:
+        manager['Global Options']['Fixed Frame'] = fixed_frame
+    edited: str = yaml.safe_dump(document, sort_keys=False)
+    return edited
+
+
+def _described(parameter: Parameter) -> str:
+    default = parameter.default
+    if isinstance(default, bool):
+        return f'{parameter.text}; default: {str(default).lower()}'
+    if default in ('', ()):
+        return parameter.text
+    return f'{parameter.text}; default: {default}'
+
+
+def _as_yaml(parameter: Parameter, text: str) -> str:
+    """Return the text of a launch argument as YAML of the type of its parameter."""
+    import yaml
+
+    default = parameter.default
+    if isinstance(default, str):
+        return _quoted(text)
+    if isinstance(default, bool):
+        return str(switched({parameter.name: text}, parameter.name)).lower()
+    if isinstance(default, tuple):
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:  # such as *.a=0.001, an alias without an anchor
+            value = text
+        names = value if isinstance(value, list) else [text]
+        if all(isinstance(name, str) for name in names):
+            return f'[{", ".join(_quoted(name) for name in names)}]'
+        expected = "a list of texts such as ['*.a=0.001', '*.alpha=0.001']"
+    else:
+        whole = isinstance(default, int)
+        try:
+            return str(int(text) if whole else float(text))
+        except ValueError:
+            expected = 'a whole number' if whole else 'a number'
+    raise ConfigError(f'launch argument "{parameter.name}" must be {expected}, not "{text}"')
+
+
+def _quoted(text: str) -> str:
+    """Return a text as a YAML scalar in double quotes, on one line."""
+    import yaml
+
+    quoted: str = yaml.safe_dump(text, default_style='"', allow_unicode=True, width=2**31)
+    return quoted.strip()

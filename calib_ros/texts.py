@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Text files, tables and YAML, within limits.
+
+A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
+with any number of digits. The stream of its events is looked at before anything is made of it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from calib_ros.errors import CalibrationError, ConfigError, InputError
+
+Row: TypeAlias = Mapping[str, str | None]
+
+LARGEST_TEXT = 10_000_000
+"""Bytes of a chain file, calibration, URDF or YAML program."""
+LARGEST_TABLE = 100_000_000
+"""Bytes of a table."""
+MOST_COLUMNS = 1000
+"""Columns of a table."""
+DEEPEST = 20
+"""Levels of nested YAML."""
+MOST_NODES = 500_000
+"""Values in a YAML document with its aliases written out; a long text counts as several."""
+LONGEST_NUMBER = 64
+"""Characters of an unquoted number; a longer one is text."""
+
+
+def read_text(
+    path: Path,
+    largest: int = LARGEST_TEXT,
+    error: type[CalibrationError] = ConfigError,
+    what: str = '',
+) -> str:
+    """Return the text of a file, which `what` describes, without a byte order mark.
+
+    Raises
+    ------
+    CalibrationError
+        Of the type `error`, when it cannot be read, is too large or is not UTF-8.
+
+    """
+    return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
+
+
+def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: str = '') -> bytes:
+    """Return the content of a file, as `read_text` does."""
+    try:
+        with path.open('rb') as file:
+            data = file.read(largest + 1)
+    except OSError as err:
+        raise error(f'cannot read {what}{path}: {err}') from err
+    if len(data) > largest:
+        raise error(f'{what}{path} is larger than {largest // 10**6} MB: is it the right file?')
+    return data
+
+
+def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
+    """Return bytes as text."""
+    try:
+        return data.decode('utf-8-sig')
+    except UnicodeDecodeError as err:
+        raise error(f'cannot read {where}: {err}') from err
+
+
+def read_rows(text: str, path: Path) -> tuple[Sequence[str], list[tuple[int, Row]]]:
+    """Return the header of a table, and its rows with their lines; cells may be missing.
+
+    Raises
+    ------
+    InputError
+        When it is no table, or has more columns than any.
+
+    """
+    reader = csv.DictReader(io.StringIO(text, newline=''), strict=True)
+    try:
+        header = reader.fieldnames or []
+        if len(header) > MOST_COLUMNS:
+            raise InputError(f'{path} has {len(header)} columns, more than {MOST_COLUMNS}')
+        return header, [(reader.line_num, row) for row in reader]
+    except csv.Error as err:
+        raise InputError(f'cannot read {path}: {err}') from err
+
+
+def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:
+    """Return the content of a YAML document, None of an empty one; `where` names it in errors.
+
+    Raises
+    ------
+    CalibrationError
+        Of the type `error`, when it is not valid, is several, has a key twice, or is too large or
+        too deep with its aliases written out.
+
+    """
+    import yaml
+
+    if len(text) > LARGEST_TEXT:
+        raise error(f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right one?')
+    try:
+        _check(yaml.parse(text, _loader()), where, error)
+        documents = [each for each in yaml.load_all(text, _loader()) if each is not None]
+    except CalibrationError:
+        raise
+    except Exception as err:  # explicit tags fail in many ways
+        raise error(f'{where} is not valid YAML: {" ".join(str(err).split())}') from err
+    if len(documents) > 1:
+        raise error(f'{where} must hold one YAML document, not {len(documents)}')
+    return documents[0] if documents else None
+
+
+@cache
+def _loader() -> Any:
+    """Return the loader: the fast one if there is one; long numbers stay text."""
+    import yaml
+
+    class Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+        """Makes numbers of reasonable length only: their conversion is quadratic."""
+
+    for kind in ('int', 'float'):
+        convert = getattr(Loader, f'construct_yaml_{kind}')
+
+        def number(loader: Any, node: Any, convert: Any = convert) -> Any:
+            return convert(loader, node) if len(node.value) <= LONGEST_NUMBER else node.value
+
+        Loader.add_constructor(f'tag:yaml.org,2002:{kind}', number)
+    return Loader
+
+
+class _Open:
+    """A list or mapping of which the end has not come yet."""
+
+    def __init__(self, anchor: str | None, keyed: bool) -> None:
+        self.anchor = anchor
+        self.nodes, self.height = 1, 0
+        self.keyed = keyed
+        self.keys: set[str] = set()
+        self.at_key = keyed
+
+
+def _check(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
+    """Refuse what would not fit into memory, or is not meant."""
+    above: list[_Open] = []
+    anchors: dict[str, tuple[int, int]] = {}
+    for event in events:
+        kind = type(event).__name__
+        if kind in ('SequenceStartEvent', 'MappingStartEvent'):
+            above.append(_Open(event.anchor, kind == 'MappingStartEvent'))
+            nodes, height = 0, 0
+        elif kind == 'ScalarEvent':
+            nodes, height = 1 + len(event.value) // 20, 0
+            if event.anchor:
+                anchors[event.anchor] = (nodes, height)
+        elif kind == 'AliasEvent':
+            if event.anchor not in anchors:
+                raise error(f'{where}: alias "{event.anchor}" stands for nothing before it')
+            nodes, height = anchors[event.anchor]
+        elif kind in ('SequenceEndEvent', 'MappingEndEvent'):
+            ended = above.pop()
+            nodes, height = ended.nodes, ended.height
+            if ended.anchor:
+                anchors[ended.anchor] = (nodes, height)
+        else:
+            anchors.clear()
+            continue
+        if len(above) + height > DEEPEST:
+            raise error(f'{where} is nested deeper than {DEEPEST} levels')
+        if not nodes or not above:
+            continue
+        parent = above[-1]
+        parent.nodes += nodes
+        parent.height = max(parent.height, height + 1)
+        if parent.nodes > MOST_NODES:
+            raise error(f'{where} has more than {MOST_NODES} values')
+        if parent.at_key and kind == 'ScalarEvent' and event.value != '<<':
+            if event.value in parent.keys:
+                raise error(f'{where}: key "{event.value}" comes twice')
+            parent.keys.add(event.value)
+        if parent.keyed:
+            parent.at_key = not parent.at_key

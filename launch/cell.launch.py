@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Start all of a calibration cell beside the robot's own driver.
+
+    ros2 launch calib_ros cell.launch.py urdf:=robot.urdf tracker:=my_driver/tracker_node
+
+The node, robot_state_publisher with the URDF, RViz, an aggregator of diagnostics, and the driver
+of the measuring device, whose topic of poses is remapped. A node that was killed is started again
+and goes on with its samples; one that ended by itself is not.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
+from launch.actions import (
+    DeclareLaunchArgument,
+    LogInfo,
+    OpaqueFunction,
+    RegisterEventHandler,
+    TimerAction,
+)
+from launch.event_handlers import OnProcessExit
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from calib_ros.arguments import (
+    NODE,
+    launch_arguments,
+    refuse_unknown,
+    ros_arguments,
+    rviz_config,
+    switched,
+)
+from calib_ros.errors import ConfigError
+
+CONFIG = Path(__file__).parents[1] / 'config'
+OURS = {
+    'urdf': (
+        '',
+        'URDF of the robot, for robot_state_publisher; the chain too if nothing else names it',
+    ),
+    'tracker': ('', 'driver of the measuring device as PACKAGE/EXECUTABLE; default: none'),
+    'tracker_topic': ('pose', 'topic of poses of that driver, remapped to measured_pose'),
+    'rviz': ('true', 'start RViz'),
+    'fixed_frame': ('', 'fixed frame of RViz; default: frame_id, or tracker'),
+    'diagnostics': ('true', 'start the aggregator of diagnostics'),
+    'respawn_delay': ('2.0', 'time after which a node that was killed is started again [s]'),
+}
+ARGUMENTS = {name: ('', text) for name, text in launch_arguments().items()} | OURS
+
+
+def calibration(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
+    """Return the node, and what starts it again with its samples when it was killed."""
+    node = Node(
+        package='calib_ros',
+        executable=NODE,
+        name=NODE,
+        namespace=given['namespace'] or None,
+        ros_arguments=ros_arguments(given),
+        output='screen',
+    )
+
+    def on_exit(event: Any, context: LaunchContext) -> list[LaunchDescriptionEntity]:
+        if event.returncode >= 0 or context.is_shutdown:  # it has said why, or was told to end
+            return []
+        again = calibration(given | {'resume': 'true'})
+        delay = float(given['respawn_delay'])
+        return [
+            LogInfo(msg=f'{NODE} was killed (signal {-event.returncode}): it goes on'),
+            TimerAction(period=delay, actions=again),
+        ]
+
+    return [RegisterEventHandler(OnProcessExit(target_action=node, on_exit=on_exit)), node]
+
+
+def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    """Return all that belongs to the cell, as given."""
+    refuse_unknown(sys.argv, Path(__file__).name, [*ARGUMENTS])
+    given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    namespace = given['namespace'] or None
+    joint_states = given['joint_states'] or 'joint_states'
+    measured_pose = given['measured_pose'] or 'measured_pose'
+    started: list[LaunchDescriptionEntity] = []
+    if given['urdf']:
+        text = Path(given['urdf']).expanduser().read_text(encoding='utf-8')
+        if not given['chain'] and not given['params_file']:
+            given['chain'] = 'robot_description'
+        started.append(
+            Node(
+                package='robot_state_publisher',
+                executable='robot_state_publisher',
+                namespace=namespace,
+                parameters=[{'robot_description': ParameterValue(text, value_type=str)}],
+                remappings=[('joint_states', joint_states)],
+                output='screen',
+            )
+        )
+    if given['tracker']:
+        package, _, executable = given['tracker'].partition('/')
+        if not executable:
+            raise ConfigError(f'tracker must be PACKAGE/EXECUTABLE, not "{given["tracker"]}"')
+        started.append(
+            Node(
+                package=package,
+                executable=executable,
+                namespace=namespace,
+                remappings=[(given['tracker_topic'], measured_pose)],
+                output='screen',
+            )
+        )
+    if switched(given, 'diagnostics'):
+        started.append(
+            Node(
+                package='diagnostic_aggregator',
+                executable='aggregator_node',
+                parameters=[str(CONFIG / 'diagnostics.yaml')],
+                output='screen',
+            )
+        )
+    if switched(given, 'rviz'):
+        shown = rviz_config(
+            (CONFIG / 'calibration.rviz').read_text(encoding='utf-8'),
+            given['namespace'],
+            given['fixed_frame'] or given['frame_id'],
+        )
+        with tempfile.NamedTemporaryFile(
+            'w', suffix='.rviz', encoding='utf-8', delete=False
+        ) as file:
+            file.write(shown)
+        started.append(Node(package='rviz2', executable='rviz2', arguments=['-d', file.name]))
+    return [*started, *calibration(given)]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Declare the arguments and start the cell."""
+    declared = [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=start)])

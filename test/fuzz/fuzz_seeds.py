@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Write the seeds of the corpus: a small valid input or more for each target."""
+
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from fuzz_targets import ARM, CORPUS, MARK
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros.config import dump_chain, nominal_record
+from calib_ros.messages import DECODERS, JOINT_STATE
+from calib_ros.samples import Sample
+from calib_ros.tables import cells, columns
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+T = STORE.types
+POSE = 'geometry_msgs/msg/PoseStamped'
+URDF = """<robot name="arm">
+  <link name="base"/><link name="upper">
+  <inertial><origin xyz="0 0 1"/><mass value="2"/></inertial></link>
+  <link name="tool0"/>
+  <joint name="a" type="revolute"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 0.3" rpy="0 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3"/></joint>
+  <joint name="b" type="prismatic"><parent link="upper"/><child link="tool0"/>
+    <origin xyz="0.4 0 0" rpy="1.57 0 0"/><axis xyz="0 1 0"/><limit lower="-1" upper="1"/></joint>
+</robot>
+"""
+TRAJECTORY = """header: {frame_id: ''}
+joint_names: [a, b, c]
+points:
+- {positions: [0.1, 0.2, 0.3], velocities: [0.0, 0.0, 0.0], time_from_start: {sec: 1, nanosec: 0}}
+- positions:
+  - 0.2
+  - 0.3
+  - 0.1
+  velocities: [0.0, 1e-3, 0.0]
+---
+"""
+OPTIONS = (
+    '--sigma-position\n0.001\n--fixed\na.a',
+    '--priors\n*.a=0.001',
+    '--mode\ncontinuous',
+    '--sources\n/pose type=PoseStamped device=t',
+    '--model\nratio+backlash',
+    '--folds\n3',
+)
+
+
+def header(stamp):
+    return T['std_msgs/msg/Header'](T['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9)), 't')
+
+
+def made(kind, k):
+    stamp = k * 10**7
+    if kind == JOINT_STATE:
+        none = np.zeros(0)
+        return T[kind](
+            header(stamp), ['a', 'b', 'c'], np.array([0.1, 0.2, k // 40 * 0.1]), none, none
+        )
+    point, turn = (
+        T['geometry_msgs/msg/Point'](1.0, 2.0, 3.0),
+        T['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
+    )
+    pose = T['geometry_msgs/msg/Pose'](point, turn)
+    covered = T['geometry_msgs/msg/PoseWithCovariance'](pose, np.diag([1e-8] * 6).ravel())
+    vector = T['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0)
+    still = T['geometry_msgs/msg/TwistWithCovariance'](
+        T['geometry_msgs/msg/Twist'](vector, vector), np.zeros(36)
+    )
+    rest = {
+        POSE: (pose,),
+        'geometry_msgs/msg/PoseWithCovarianceStamped': (covered,),
+        'geometry_msgs/msg/PointStamped': (point,),
+        'geometry_msgs/msg/TransformStamped': (
+            'target',
+            T['geometry_msgs/msg/Transform'](vector, turn),
+        ),
+        'nav_msgs/msg/Odometry': ('target', covered, still),
+        'sensor_msgs/msg/Range': (0, 0.0, 0.0, 9.0, 1.5, 0.0),
+    }[kind]
+    return T[kind](header(stamp), *rest)
+
+
+def serialised(kind, k):
+    return bytes(STORE.serialize_cdr(made(kind, k), kind))
+
+
+def bag(path, storage, mode, count):
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if mode:
+        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        known = {
+            kind: writer.add_connection(f'/{kind[:4]}', kind, typestore=STORE)
+            for kind in (JOINT_STATE, POSE)
+        }
+        for k in range(1, count):
+            for kind, connection in known.items():
+                writer.write(connection, k, serialised(kind, k))
+
+
+def put(name, number, data):
+    folder = CORPUS / name
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f'seed{number}').write_bytes(data if isinstance(data, bytes) else data.encode())
+
+
+def main():
+    position, covariance = np.array([1.0, 2.0, 3.0]), np.diag([1e-8] * 6)
+    samples = [
+        Sample(
+            k * 10**9,
+            np.array([0.1 * k, 0.2, 0.3]),
+            position=position,
+            rotation=np.eye(3),
+            covariance=covariance if k % 2 else None,
+            approach=np.ones(3),
+            device='d',
+            target=f't{k % 2}',
+            validation=k == 3,
+        )
+        for k in range(1, 5)
+    ]
+    rows = '\n'.join(','.join(cells(sample)) for sample in samples)
+    whole = ','.join(columns(3)) + '\n' + rows + '\n'
+    put('journal', 0, whole)
+    put('table', 0, whole)
+    put('table', 1, 'q1,q2,q3,x,y,z,split\n0.1,0.2,0.3,1,2,3,train\n0.2,0.2,0.3,1,2,3,test\n')
+    put('table', 2, 'q1,q2,q3,distance,session,device\n0.1,0.2,0.3,1.5,A,w\n0.2,0.2,0.3,1.6,A,w\n')
+    put('table', 3, 'q1,q2,q3,location,socket\n0.1,0.2,0.3,L,1\n0.2,0.2,0.3,L,2\n')
+    put('waypoints', 0, 'q1,q2,q3\n0.1,0.2,0.3\n')
+    put('waypoints', 1, 'x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n')
+    put(
+        'program_csv',
+        0,
+        'name,q1,q2,q3,s1,s2,s3\nP1,0.1,0.2,0.3,1,-1,0\n"P,2",0.2,0.2,0.3,1,1,1\n',
+    )
+    put('program_yaml', 0, TRAJECTORY)
+    put('chain', 0, dump_chain(ARM.with_effects(('a.ratio',))))
+    put(
+        'chain',
+        1,
+        'convention: modified\njoints:\n- &j {name: a, a: 0, alpha: 0, d: 0, theta: 0}\n'
+        '- {<<: *j, name: b}\n'
+        'tool: {xyz: [0, 0, 1e-1], quat_xyzw: [0, 0, 0, 1], fixed: true}\n',
+    )
+    record = {
+        'accepted': True,
+        'rms_mm_after': 0.1,
+        'world_frame': 't',
+        'nominal': nominal_record(ARM),
+    }
+    put('calibration', 0, dump_chain(ARM.with_offsets({'a.d': 1e-3}), record))
+    put(
+        'result',
+        0,
+        json.dumps(
+            {
+                'covariance': {'names': ['a.d', 'b.a'], 'matrix': [[1e-8, 0], [0, 1e-8]]},
+                'validation': {'after': {'rms_mm': 0.1}},
+            }
+        ),
+    )
+    put('urdf', 0, URDF)
+    for k, text in enumerate(OPTIONS):
+        put('settings', k, text)
+    put('command', 0, 'identify\n--csv\ntable.csv\n--chain\nur10e\n--out\nout')
+    put('command', 1, 'chain\nur10e')
+    put('command', 2, 'verify\nm.csv\n--chain\nur10e\n--calibration\nc\n--tolerance\n0.1')
+    put('command', 3, 'workspace\nresult\n--chain\nur10e\n--out\no\n--joint-box\n1\n2')
+    put(
+        'message',
+        0,
+        MARK.join(
+            bytes([k % 7]) + serialised([JOINT_STATE, *DECODERS][k % 7], 20 + k) for k in range(14)
+        ),
+    )
+    put('message', 1, MARK.join(b'\0' + serialised(JOINT_STATE, k) for k in range(1, 9)))
+    with tempfile.TemporaryDirectory() as name:
+        for k, (storage, mode) in enumerate(
+            [('mcap', None), ('mcap', 'STORAGE'), ('sqlite3', None)]
+        ):
+            path = Path(name) / 'bag'
+            bag(path, storage, mode, 12)
+            (file,) = (each for each in path.iterdir() if each.suffix in ('.mcap', '.db3'))
+            put('bag_mcap' if storage == 'mcap' else 'bag_sqlite3', k, file.read_bytes())
+            if k == 0:
+                put('metadata', 0, (path / 'metadata.yaml').read_text())
+            for each in path.iterdir():
+                each.unlink()
+            path.rmdir()
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,440 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Files that stand for more than they hold, and numbers that no robot has."""
+
+import itertools
+import json
+import shutil
+import sqlite3
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from calib_ros.chain import Chain, Joint
+from calib_ros.cli import main
+from calib_ros.config import dump_chain, parse_chain
+from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
+from calib_ros.identification import identify
+from calib_ros.mcap import LARGEST_CHUNK
+from calib_ros.messages import MessageError, measured_covariance
+from calib_ros.observations import Observations
+from calib_ros.problem import Problem
+from calib_ros.programs import read_program
+from calib_ros.replay import Recording, Replayed, replay, write_bag
+from calib_ros.salvage import recorded
+from calib_ros.session import CalibrationSession
+from calib_ros.simulation import measure
+from calib_ros.tables import COVARIANCE, read_journal, read_table
+from calib_ros.texts import LARGEST_TABLE, parse_yaml
+from calib_ros.urdf import chain_from_urdf
+
+ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
+HEAD = 'convention: standard\njoints:\n- {name: a, a: 0, alpha: 0, d: 0, theta: '
+
+
+# ---- messages of errors
+
+
+@pytest.mark.parametrize(
+    'err',
+    [
+        ConfigError('x' * 10_000),
+        UnknownNameError('key', 'k' * 10**6, [f'name_{k}' for k in range(20_000)]),
+        InputError('short'),
+    ],
+)
+def test_messages_are_short(err):
+    assert len(str(err)) <= LONGEST
+
+
+def test_a_long_message_keeps_what_is_wrong_and_what_to_do():
+    text = str(ConfigError(f'key "{"k" * 9999}" is unknown: remove it'))
+    assert text.startswith('key "kkk')
+    assert text.endswith('is unknown: remove it')
+
+
+def test_the_command_line_cuts_what_the_system_says(capsys):
+    assert main(['identify', '--csv', 'x' * 5000, '--chain', 'ur10e']) == 1
+    assert len(capsys.readouterr().err) <= LONGEST + len('calib_ros: \n')
+
+
+# ---- YAML
+
+BOMBS = {
+    'aliases': 'a: &a [x, x, x, x, x, x, x, x, x]\n'
+    + ''.join(
+        f'{b}: &{b} [{", ".join([f"*{a}"] * 9)}]\n' for a, b in itertools.pairwise('abcdefgh')
+    ),
+    'aliases of a text': f'a: &a {"x" * 9000}\nb: &b [{", ".join(["*a"] * 900)}]\nc: [*b, *b]',
+    'depth': 'name: ' + '[' * 100_000,
+    'depth by aliases': ''.join(f'{k}: &k{k + 1} [*k{k}]\n' for k in range(1, 50)).replace(
+        '[*k1]', '[x]'
+    ),
+    'itself': 'name: &a [*a]',
+    'tags': 'name: !!timestamp soon',
+    'empty tag': 'name: !!int ""',
+    'keys': 'name: a\nname: b',
+}
+
+
+@pytest.mark.parametrize('bomb', BOMBS)
+def test_yaml_that_stands_for_more_is_refused(tmp_path, bomb):
+    with pytest.raises(ConfigError):
+        parse_chain(BOMBS[bomb])
+    path = tmp_path / 'p.yaml'
+    path.write_text(BOMBS[bomb])
+    with pytest.raises(InputError):
+        read_program(path, ['a'])
+
+
+@pytest.mark.parametrize(
+    'number', ['0x' + 'f' * 100_000, '9' * 100_000, '1' + ':59' * 30_000, '1e160', '-1e7']
+)
+def test_numbers_beyond_all_robots_are_refused(number):
+    with pytest.raises(ConfigError, match='theta must be'):
+        parse_chain(HEAD + number + '}')
+
+
+def test_aliases_that_save_writing_are_read():
+    text = 'convention: standard\njoints:\n- &j {name: a, a: 1, alpha: 0, d: 0, theta: 0}\n'
+    text += '- {<<: *j, name: b}\n'
+    assert parse_chain(text).joints[1] == Joint('b', a=1.0)
+
+
+@pytest.mark.parametrize('text', ['a: &x 1\nb: [*x, 2.5, "07", 1e3, 0x10]', '- {a: [{b: c}]}\n'])
+def test_other_yaml_is_read_as_ever(text):
+    assert parse_yaml(text, 'text') == yaml.safe_load(text)
+
+
+def test_a_chain_of_too_many_joints_is_refused():
+    rows = '\n'.join(f'- {{name: j{k}, a: 0, alpha: 0, d: 0, theta: 0}}' for k in range(51))
+    with pytest.raises(ConfigError, match='51 joints are more than 50'):
+        parse_chain(f'convention: standard\njoints:\n{rows}')
+
+
+@pytest.mark.parametrize('name', ['"ur\\n10"', '"a\\u2028b"', 'x' * 300])
+def test_names_that_break_a_line_are_refused(name):
+    with pytest.raises(ConfigError, match='must be printable'):
+        parse_chain(dump_chain(ARM).replace('name: arm', f'name: {name}'))
+    with pytest.raises(ConfigError, match='must be printable'):
+        parse_chain(dump_chain(ARM).replace('name: a,', f'name: {name},'))
+
+
+def test_a_limit_as_large_as_none_is_none():
+    assert parse_chain(HEAD + '0, lower: -1e308, upper: 1e308}').joints[0].lower is None
+
+
+# ---- URDF
+
+
+def urdf(links, kind='fixed', axis='0 0 1', name='r'):
+    text = [f'<robot name="{name}">', *(f'<link name="l{k}"/>' for k in range(links))]
+    for k in range(links - 1):
+        moves = kind if k else 'continuous'
+        text.append(
+            f'<joint name="j{k}" type="{moves}"><parent link="l{k}"/><child link="l{k + 1}"/>'
+            f'<axis xyz="{axis}"/></joint>'
+        )
+    return '\n'.join([*text, '</robot>'])
+
+
+def test_the_most_links_are_read_and_more_refused():
+    assert len(chain_from_urdf(urdf(10_000)).joints) == 1
+    with pytest.raises(ConfigError, match='more than 10000 links'):
+        chain_from_urdf(urdf(10_001))
+    with pytest.raises(ConfigError, match='more than 50'):
+        chain_from_urdf(urdf(60, 'continuous'))
+
+
+@pytest.mark.parametrize('axis', ['1e-320 0 0', '0 0 0', '1e-10 0 1e-10'])
+def test_an_axis_without_direction_is_refused(axis):
+    with pytest.raises(ConfigError, match='has no direction'):
+        chain_from_urdf(urdf(2, axis=axis))
+
+
+def test_a_long_axis_is_a_direction():
+    assert chain_from_urdf(urdf(2, axis='0 1e5 1e5')).joint_names == ('j0',)
+
+
+def test_a_robot_with_a_line_break_in_its_name_is_refused():
+    with pytest.raises(ConfigError, match='must be printable'):
+        chain_from_urdf(urdf(2, name='a&#10;b'))
+
+
+# ---- tables
+
+
+def table(tmp_path, cells, quaternion=True):
+    turned = ',qx,qy,qz,qw' if quaternion else ''
+    lines = [f'q1,q2,x,y,z{turned},{",".join(COVARIANCE)}']
+    for k in range(3):
+        turned = ',0,0,0,1' if quaternion else ''
+        lines.append(f'0.{k},0.2,1,2,3{turned},' + ','.join(map(str, cells)))
+    path = tmp_path / 'table.csv'
+    path.write_text('\n'.join(lines))
+    return path
+
+
+def upper(matrix):
+    return matrix[np.triu_indices(6)]
+
+
+POSITION_ONLY = np.diag([4e-8, 1e-8, 1e-8, 0.0, 0.0, 0.0])
+
+
+def test_a_covariance_of_zeros_is_none(tmp_path):
+    assert read_table(table(tmp_path, np.zeros(21)), 2).fitted[0].covariance is None
+
+
+@pytest.mark.parametrize('quaternion', [True, False])
+def test_a_covariance_of_the_position_alone_weights_only_that(tmp_path, quaternion):
+    read = read_table(table(tmp_path, upper(POSITION_ONLY), quaternion), 2)
+    found = read.fitted[0].covariances((1e-4, 3e-4))
+    np.testing.assert_allclose(found[0], np.diag([4e-8, 1e-8, 1e-8, 9e-8, 9e-8, 9e-8]))
+    assert measured_covariance(POSITION_ONLY) == tuple(POSITION_ONLY.ravel())
+
+
+def test_a_camera_with_a_covariance_of_the_position_alone(tmp_path):
+    found = []
+    for rotation in (0.0, 9e-8):
+        covariance = POSITION_ONLY + np.diag([0.0] * 3 + [rotation] * 3)
+        path = table(tmp_path, upper(covariance))
+        read = read_table(path, 2, sigmas=(1e-4, 3e-4), eye_in_hand=True)
+        found.append(read.fitted[0].covariance)
+    np.testing.assert_allclose(*found, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    'bad',
+    [
+        np.diag([1e-8, 1e-8, 0.0, 1e-8, 1e-8, 1e-8]),
+        np.diag([1e-8, 1e-8, -1e-8, 1e-8, 1e-8, 1e-8]),
+        np.diag([1e-8, 1e-8, 1e-8, 1e-8, 1e-8, 0.0]),
+        np.full((6, 6), 1e-8),
+        1e-8 * np.eye(6) + np.eye(6, k=1) + np.eye(6, k=-1),
+        1e-300 * np.eye(6),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused_everywhere(tmp_path, bad):
+    with pytest.raises(InputError, match=r'line 2: c11 \.\.\. c66: covariance'):
+        read_table(table(tmp_path, upper(bad)), 2)
+    with pytest.raises(MessageError, match='covariance'):
+        measured_covariance(bad)
+
+
+def test_a_covariance_of_the_position_alone_is_identified(rng):
+    arm = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
+    q = arm.random_joints(30, rng)
+    plain = measure(arm.with_offsets({'b.a': 1e-3}), q, rng, 1e-5, 1e-4)
+    found = []
+    for rotation in (0.0, 1e-8):
+        covariance = np.tile(np.diag([1e-10] * 3 + [rotation] * 3), (30, 1, 1))
+        problem = Problem(arm, replace(plain, covariance=covariance), sigma_orientation=1e-4)
+        found.append(identify(problem).chain.value('b.a'))
+    assert found[0] == pytest.approx(found[1], abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('column', 'cell'),
+    [
+        *(('stamp_ns', each) for each in ('²', '9223372036854775808', '9' * 5000, '1.5', '--1')),
+        *(('x', each) for each in ('1e160', '-1e7', 'nan', '²')),
+        ('q1', '1e300'),
+    ],
+)
+def test_cells_beyond_all_robots_are_named_with_their_line(tmp_path, column, cell):
+    row = {'stamp_ns': '7', 'q1': '0', 'q2': '0', 'x': '1', 'y': '2', 'z': '3'} | {column: cell}
+    path = tmp_path / 'table.csv'
+    path.write_text(f'{",".join(row)}\n{",".join(row.values())}\n')
+    for read in (read_table, read_journal):
+        with pytest.raises(InputError, match=f'line 2: {column} must be'):
+            read(path, 2)
+
+
+def test_a_header_of_too_many_columns_is_refused(tmp_path):
+    path = tmp_path / 'table.csv'
+    path.write_text(','.join(f'c{k}' for k in range(100_000)) + '\n1' * 100_000)
+    with pytest.raises(InputError, match='100000 columns'):
+        read_table(path, 2)
+
+
+def test_many_rows_that_were_taken_back_take_no_longer_than_others(tmp_path):
+    rows = [f'{k},0,0,1,2,3,{split}' for k in range(20_000) for split in ('', 'removed')]
+    path = tmp_path / 'table.csv'
+    path.write_text('\n'.join(['stamp_ns,q1,q2,x,y,z,split', *rows, '1,0,0,1,2,3,']))
+    assert len(read_table(path, 2).samples) == 1
+
+
+def test_too_many_devices_are_refused(tmp_path):
+    path = tmp_path / 'table.csv'
+    path.write_text('q1,q2,x,y,z,device\n' + '\n'.join(f'0,0,1,2,3,d{k}' for k in range(200)))
+    with pytest.raises(InputError, match='line 102: more than 100 sessions'):
+        read_table(path, 2)
+
+
+def test_a_file_larger_than_any_table_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / 'table.csv'
+    with path.open('wb') as file:
+        file.truncate(LARGEST_TABLE + 1)
+    with pytest.raises(InputError, match='larger than 100 MB'):
+        read_table(path, 2)
+
+
+# ---- bags
+
+
+def session():
+    return CalibrationSession(ARM)
+
+
+@pytest.fixture(params=['sqlite3', 'mcap'])
+def bag(tmp_path, request, rng):
+    poses = Observations.from_arrays(rng.normal(size=(20, 2)), rng.normal(size=(20, 3)))
+    write_bag(
+        tmp_path / 'bag', Recording.of_dwells(('a', 'b'), poses, np.zeros(20, bool)), request.param
+    )
+    return tmp_path / 'bag'
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'\xff\xfe\x00',
+        b'rosbag2_bagfile_information:\n  message_count: many\n',
+        b'rosbag2_bagfile_information:\n  message_count: ' + b'9' * 5000 + b'\n',
+        b'[' * 100_000,
+        BOMBS['aliases'].encode(),
+    ],
+)
+def test_with_any_metadata_the_messages_are_read(bag, content):
+    (bag / 'metadata.yaml').write_bytes(content)
+    assert recorded(bag) is None
+    taken = session()
+    replayed = replay(bag, taken)
+    assert len(taken.samples) == 20
+    assert replayed.read == 120
+
+
+SCHEMA = (
+    'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, '
+    'offered_qos_profiles TEXT)',
+    'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
+    'data BLOB)',
+)
+ENDLESS = 'WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT'
+
+
+@pytest.mark.parametrize(
+    'statements',
+    [
+        (
+            SCHEMA[0],
+            f'CREATE VIEW messages AS {ENDLESS} id, 1 AS topic_id, 0 AS timestamp, '
+            'zeroblob(1000000) AS data FROM n',
+        ),
+        (f"CREATE VIEW topics AS {ENDLESS} id, 'a' AS name, 'b' AS type FROM n", SCHEMA[1]),
+        (SCHEMA[0], SCHEMA[1].replace('data BLOB', 'data AS (zeroblob(1000000000))')),
+        (SCHEMA[0], SCHEMA[1].replace(' PRIMARY KEY', '')),
+    ],
+)
+def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, statements):
+    path = tmp_path / 'bag.db3'
+    with sqlite3.connect(path) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    connection.close()
+    with pytest.raises(InputError, match='is not what a recorder makes'):
+        replay(path, session())
+
+
+@pytest.mark.parametrize('bag', ['sqlite3'], indirect=True)
+def test_messages_without_data_are_lost_and_no_more(bag):
+    (file,) = bag.glob('*.db3')
+    with sqlite3.connect(file) as connection:
+        (sql,) = connection.execute(
+            "SELECT sql FROM sqlite_master WHERE name='messages'"
+        ).fetchone()
+        connection.execute('PRAGMA writable_schema=ON')
+        loose = sql.replace('BLOB NOT NULL', 'BLOB')
+        connection.execute("UPDATE sqlite_master SET sql=? WHERE name='messages'", (loose,))
+    connection.close()
+    with sqlite3.connect(file) as connection:
+        connection.execute('UPDATE messages SET data=NULL WHERE id=7')
+    connection.close()
+    replayed = replay(bag, session())
+    assert (replayed.recorded, replayed.read) == (120, 119)
+    assert 'without data' in replayed.warnings[0]
+
+
+@pytest.mark.parametrize('bag', ['mcap'], indirect=True)
+def test_a_chunk_that_unpacks_to_more_costs_its_messages_only(bag):
+    (file,) = bag.glob('*.mcap')
+    content = bytearray(file.read_bytes())
+    place = content.index(b'\x06', 8)
+    while struct.unpack_from('<Q', content, place + 1)[0] > len(content):
+        place = content.index(b'\x06', place + 1)
+    content[place + 25 : place + 33] = struct.pack('<Q', LARGEST_CHUNK + 1)
+    file.write_bytes(bytes(content))
+    replayed = replay(bag, session())
+    assert replayed.read < replayed.recorded
+    assert 'lost' in replayed.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ('recorded_', 'read', 'largest', 'refused'),
+    [
+        (100, 100, 0.1, ''),
+        (100, 91, 0.1, ''),
+        (100, 80, 0.1, '20% of the messages could not be read'),
+        (100, 80, 0.25, ''),
+        (None, 80, 0.1, 'not known'),
+        (None, 80, 1.0, ''),
+    ],
+)
+def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, refused):
+    account = session().account()
+    found = Replayed(recorded_, read).refusals(account, largest)
+    assert bool(found) == bool(refused)
+    assert all(refused in reason and '--largest-loss' in reason for reason in found)
+
+
+@pytest.mark.parametrize(
+    ('cause', 'refused'),
+    [
+        ('poses: zero stamp', True),
+        ('poses: later than lateness allows', True),
+        ('poses: same stamp twice', False),
+        ('poses: NaN or infinite position', False),
+    ],
+)
+def test_messages_dropped_for_their_stamps_count_as_lost(cause, refused):
+    account = replace(session().account(), poses=100, dropped={cause: 50})
+    assert bool(Replayed(100, 100).refusals(account, 0.1)) == refused
+
+
+def test_identify_says_what_it_read_and_refuses_half_a_bag(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(['simulate', 'bag', '--chain', 'ur10e', '--poses', '40']) == 0
+    whole = ['identify', 'bag', '--chain', 'ur10e']
+    assert main([*whole, '--out', 'whole']) == 0
+    out = capsys.readouterr().out
+    document = json.loads((tmp_path / 'whole' / 'result.json').read_text())
+    count = document['samples']['recorded']
+    assert document['samples']['read'] == count > 0
+    assert f'read {count} of {count} messages' in out
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    shutil.copytree('bag', 'half')
+    content = file.read_bytes()
+    (tmp_path / 'half' / file.name).write_bytes(content[: len(content) * 6 // 10])
+    assert main(['identify', 'half', '--chain', 'ur10e', '--out', 'refused']) == 3
+    document = json.loads((tmp_path / 'refused' / 'result.json').read_text())
+    assert not document['accepted']
+    assert 'could not be read' in document['refusals'][0]
+    assert not (tmp_path / 'refused' / 'calibration.yaml').exists()
+    loss = ['--largest-loss', '0.9', '--out', 'taken']
+    main(['identify', 'half', '--chain', 'ur10e', *loss])
+    document = json.loads((tmp_path / 'taken' / 'result.json').read_text())
+    assert not any('could not be read' in text for text in document['refusals'])
