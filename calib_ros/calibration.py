@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from calib_ros.chain import Chain
 from calib_ros.errors import InputError
 from calib_ros.identification import Identification
+from calib_ros.region import Region
 from calib_ros.samples import Frames, Sample, collect, named
 from calib_ros.validation import ErrorFigures, compare
 
@@ -21,7 +22,7 @@ class Calibration:
     `before` is the nominal chain with fitted frames, where it was identified here; `rms_mm` is
     the error that it was judged to have, and `known` holds the samples that were there by then.
     `result` is the identification that it comes from, and `frames` holds the names that the
-    frames had there, if it was here.
+    frames had there, if it was here. `region` tells where it may be used, where that is known.
     """
 
     chain: Chain
@@ -31,6 +32,7 @@ class Calibration:
     known: frozenset[Sample]
     result: Identification | None = None
     frames: Frames | None = None
+    region: Region | None = None
 
     def judged(
         self, samples: Sequence[Sample], sigmas: tuple[float, float]

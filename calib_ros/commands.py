@@ -317,6 +317,8 @@ def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
     task = _task(options, arm, rng)
     survey = workspace.survey(arm, options.poses, rng)
     words = workspace.in_words(survey)
+    if arm.region is not None:
+        words += f'\nThe calibration is {arm.region.in_words()}.\n'
     contents: dict[str, str | bytes] = {
         'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
         'workspace.png': plots.workspace_png(survey),
@@ -409,7 +411,7 @@ def _compensate(options: argparse.Namespace) -> int:
     nominal = load_chain(options.chain)
     arm = CalibratedArm.read(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
-    compensator = Compensator(nominal, arm.after, tuple(options.tool), **limits)
+    compensator = Compensator(nominal, arm.after, tuple(options.tool), **limits, region=arm.region)
     source = read_program(options.program, nominal.joint_names)
     corrected, result = compensate_program(compensator, source.program)
     if result.refusals:

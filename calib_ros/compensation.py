@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from calib_ros.chain import Chain
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.following import Follower
+from calib_ros.region import Region
 from calib_ros.se3 import FloatArray
 
 EXACT, COMPROMISE = 1e-6, 0.02
@@ -69,6 +70,8 @@ class Compensator:
     largest_change : float
         Largest change of the correction between successive samples, relative to the move between
         them. Beyond it the correction jumps.
+    region : Region, optional
+        Where the calibration may be used; samples elsewhere are refused.
 
     """
 
@@ -81,6 +84,7 @@ class Compensator:
     largest_orientation_error: float | None = None
     orientation_weight: float | None = None
     largest_change: float = 0.5
+    region: Region | None = None
 
     def __post_init__(self) -> None:
         """Refuse chains that are not of one robot, and limits that are none."""
@@ -228,6 +232,7 @@ def compensate(
         damped=solution.damped,
         refusals=(),
     )
+    result = _refused(result, _outside(compensator, result))
     result = _refused(result, _unreached(compensator, result))
     return _refused(result, _jumps(compensator, result))
 
@@ -299,6 +304,25 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'
     return text
+
+
+def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
+    """Return the samples at which the calibration may not be used."""
+    region = compensator.region
+    if region is None or region.whole:
+        return []
+    errors = region.sigma(result.command)
+    outside = np.flatnonzero(errors > region.limit)
+    share = 100.0 * len(outside) / len(errors)
+    return [
+        Refusal(
+            k,
+            f'outside the region of the calibration, like {share:.0f} % of the program: expected '
+            f'error {1e3 * errors[k]:.3f} mm, at most {1e3 * region.limit:.3f} mm is allowed; '
+            'identify again with poses near it',
+        )
+        for k in outside.tolist()
+    ]
 
 
 def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
@@ -391,7 +415,9 @@ def _refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     """Return the result with further samples refused, their joint values set to NaN."""
     joints = result.joints.copy()
     joints[[refusal.sample for refusal in more]] = np.nan
-    refusals = sorted([*result.refusals, *more], key=lambda refusal: refusal.sample)
+    known = {refusal.sample for refusal in result.refusals}
+    new = [refusal for refusal in more if refusal.sample not in known]
+    refusals = sorted([*result.refusals, *new], key=lambda refusal: refusal.sample)
     return replace(result, joints=joints, refusals=tuple(refusals))
 
 

@@ -136,8 +136,10 @@ def calibration_record(text: str) -> dict[str, Any]:
     return record if isinstance(record, dict) else {}
 
 
-def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> Chain:
+def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> tuple[Chain, dict[str, Any]]:
     """Read the calibration of a nominal chain: its file, or the folder of an identification.
+
+    Return the corrected chain and the record of its origin.
 
     Raises
     ------
@@ -148,7 +150,7 @@ def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> Chain:
     file = Path(path)
     if file.is_dir():
         file /= 'calibration.yaml'
-    return parse_calibration(read_text(file), str(file), nominal)[0]
+    return parse_calibration(read_text(file), str(file), nominal)
 
 
 def parse_calibration(

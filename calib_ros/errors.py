@@ -7,7 +7,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-LONGEST = 1000
+LONGEST = 400
 """Characters of a message; what is quoted from a file may be of any length."""
 LIKELY = 1000
 """Alternatives, and characters of a name, among which a misspelt name is looked for."""

@@ -238,7 +238,7 @@ class Guide:
     def _compensator_of(self, calibration: Calibration) -> Compensator:
         """Return the compensator of a calibration, made anew for a new one."""
         if self._compensator is None or self._compensator[0] is not calibration:
-            made = Compensator(self._session.chain, calibration.chain)
+            made = Compensator(self._session.chain, calibration.chain, region=calibration.region)
             self._compensator = (calibration, made)
         return self._compensator[1]
 

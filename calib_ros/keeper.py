@@ -24,6 +24,7 @@ from calib_ros.export import exports
 from calib_ros.files import confined
 from calib_ros.identification import Identification
 from calib_ros.parameters import Given
+from calib_ros.region import region_of_record
 from calib_ros.samples import Sample
 from calib_ros.se3 import FloatArray
 from calib_ros.session import CalibrationSession
@@ -112,13 +113,14 @@ class Keeper:
             )
         text = _calibration_text(path)
         chain, record = parse_calibration(text, str(path), session.chain, session.settings)
+        region = region_of_record(record, chain, str(path))
         serial, ours = record.get('robot_serial'), self._given.serial
         if serial and ours and serial != ours:
             raise InputError(
                 f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
             )
         with self._lock:
-            session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''))
+            session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''), region)
             self._publish(chain, Published(text, ''))
         return path
 

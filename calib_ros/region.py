@@ -15,16 +15,19 @@ standard deviation of the predicted position, as far as the risk in each shell i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.chain import FRAME_KINDS
+from calib_ros.chain import DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.differential import ErrorModel
-from calib_ros.evidence import Posterior
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.evidence import ROUNDING, Posterior
+from calib_ros.leastsquares import BLOCK
 from calib_ros.observations import Observations
 from calib_ros.se3 import FloatArray
 
@@ -46,11 +49,15 @@ class Region:
 
     Attributes
     ----------
-    posterior : Posterior
-        What is known of the arm.
+    chain : Chain
+        The calibrated arm, with the effects considered.
+    names : tuple of str
+        Parameters, (P,) in all.
+    square : (P, P)
+        Expected squares of their errors.
     limit : float
-        Standard deviation [m] of predicted positions up to which the calibration is used;
-        infinite where it is used over the whole range of the joints.
+        Expected error [m] of predicted positions up to which the calibration is used; infinite
+        where it is used over the whole range of the joints.
     share : float
         Of the range of the joints in which it is used.
     base, tool : str
@@ -58,7 +65,9 @@ class Region:
 
     """
 
-    posterior: Posterior
+    chain: Chain
+    names: tuple[str, ...]
+    square: FloatArray
     limit: float
     share: float
     base: str = 'base'
@@ -66,15 +75,94 @@ class Region:
 
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
-        known = self.posterior
-        rows = ErrorModel(known.chain, known.names, self.base, self.tool).jacobian(joints)[:, :3]
-        return _length(rows, known.square)
+        model = ErrorModel(self.chain, self.names, self.base, self.tool)
+        starts = range(0, len(joints), BLOCK)
+        parts = [joints[first : first + BLOCK] for first in starts]
+        lengths = [_length(model.jacobian(part)[:, :3], self.square) for part in parts]
+        return np.concatenate(lengths) if lengths else np.zeros(0)
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
         """Tell (N,) at which joint values (N, n) the calibration may be used."""
         if np.isinf(self.limit):
             return np.ones(len(joints), dtype=bool)
         return np.asarray(self.sigma(joints) <= self.limit)
+
+    @property
+    def whole(self) -> bool:
+        """Tell whether it is the whole range of the joints."""
+        return bool(np.isinf(self.limit))
+
+    def in_words(self) -> str:
+        """Return where the calibration may be used."""
+        if self.whole:
+            return 'valid over the whole joint range'
+        where = f'{100.0 * self.share:.0f} % of the joint range' if self.share else ''
+        return (
+            f'valid near the measured poses only{", " * bool(where)}{where}: where the expected '
+            f'error is below {1e3 * self.limit:.3f} mm'
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values: the squares by the rows of their Cholesky factor."""
+        scale = np.sqrt(np.maximum(np.diag(self.square), 1e-300))
+        scaled = self.square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+        root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
+        return {
+            'limit': None if self.whole else self.limit,
+            'share': self.share,
+            'base': self.base,
+            'tool': self.tool,
+            'names': list(self.names),
+            'root': [' '.join(f'{x:.6e}' for x in row[: k + 1]) for k, row in enumerate(root)],
+        }
+
+
+def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
+    """Return the region of a calibrated chain from its record; None where it names none.
+
+    Raises
+    ------
+    ConfigError
+        When it is not what `Region.document` makes; `where` names it.
+
+    """
+    document = record.get('region')
+    if document is None:
+        return None
+    try:
+        names = tuple(str(name) for name in document['names'])
+        root = np.zeros((len(names), len(names)))
+        for k, row in enumerate(document['root']):
+            root[k, : k + 1] = [float(part) for part in row.split()]
+        chain = chain.with_effects([n for n in names if not _is_geometric(chain, n)])
+        ErrorModel(chain, names)
+        limit = document['limit']
+        region = Region(
+            chain,
+            names,
+            root @ root.T,
+            np.inf if limit is None else float(limit),
+            float(document['share']),
+            str(document['base']),
+            str(document['tool']),
+        )
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
+        raise ConfigError(
+            f'{where}: calibration.region is damaged ({type(err).__name__}): identify again'
+        ) from err
+    known = np.isfinite(region.square).all() and region.limit > 0.0 and 0.0 <= region.share <= 1.0
+    if not known or len(document['root']) != len(names):
+        raise ConfigError(f'{where}: calibration.region is damaged: identify again')
+    for frame in (region.base, region.tool):
+        if frame not in chain.frame_names:
+            raise UnknownNameError(
+                f'frame in {where}: calibration.region', frame, chain.frame_names
+            )
+    return region
+
+
+def _is_geometric(chain: Chain, name: str) -> bool:
+    return chain.owns_frame(name) or name.partition('.')[2] in DH_KINDS
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
@@ -100,7 +188,15 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         inner += shell
         limit = float(judge.sigma[shell[-1]])
     share = float(np.mean(far <= limit))
-    return Region(posterior, np.inf if share == 1.0 else limit, share, ends.base, ends.tool)
+    return Region(
+        posterior.chain,
+        posterior.names,
+        posterior.square,
+        np.inf if share == 1.0 else limit,
+        share,
+        ends.base,
+        ends.tool,
+    )
 
 
 def _length(rows: FloatArray, square: FloatArray) -> FloatArray:

@@ -19,6 +19,7 @@ from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import dump_chain, dump_yaml, nominal_record
 from calib_ros.escapes import in_markdown
 from calib_ros.identification import Identification, Noise
+from calib_ros.region import Region
 from calib_ros.settings import Settings
 from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
@@ -43,9 +44,8 @@ def summary(result: Identification) -> str:
     given = set(result.priors) - set(result.weak)
     if given:
         text += f'; priors on {len(given)} parameters'
-    sigma = sigma_over_range(result)['max']
-    if sigma > before.rms_mm:
-        text += f'; trust it only near the measured poses, elsewhere sigma is up to {sigma:.1f} mm'
+    if result.region is not None:
+        text += f'; {result.region.in_words()}'
     if result.weak:
         text += f'; hardly determined, held near nominal by priors: {", ".join(result.weak)}'
     weak = [name for name in weakly_determined(result) if name not in result.weak]
@@ -78,6 +78,7 @@ def provenance(result: Identification) -> dict[str, Any]:
         'rms_mm_after': round(after.rms_mm, 6),
         'not_identifiable': list(result.unidentifiable),
         'nominal': nominal_record(result.before),
+        'region': None if result.region is None else result.region.document(),
     }
 
 
@@ -169,6 +170,8 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'correlated': [list(pair) for pair in result.correlated()],
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),
+        'sizes': dict(result.posterior.sizes),
+        'region': None if result.region is None else region_figures(result.region),
         'priors': result.priors,
         'effects': dict(result.chain.effects),
         'verdicts': [asdict(verdict) for verdict in result.verdicts],
@@ -181,6 +184,12 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'numpy': np.__version__,
         },
     }
+
+
+def region_figures(region: Region) -> dict[str, Any]:
+    """Return where a calibration may be used, in figures; the limit is None for everywhere."""
+    limit = None if region.whole else 1e3 * region.limit
+    return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
 
 
 BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'

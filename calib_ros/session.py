@@ -26,6 +26,7 @@ from calib_ros.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.names import FrameNames, JointNames, strange
 from calib_ros.observations import Observations, configurations
 from calib_ros.problem import Problem
+from calib_ros.region import Region
 from calib_ros.samples import Sample, collect, named
 from calib_ros.se3 import FloatArray
 from calib_ros.selection import identify_model
@@ -572,9 +573,16 @@ class CalibrationSession:
                 known=frozenset(samples),
                 result=result,
                 frames=named(samples),
+                region=result.region,
             )
 
-    def load(self, chain: Chain, rms_mm: float | None = None, world_frame: str = '') -> None:
+    def load(
+        self,
+        chain: Chain,
+        rms_mm: float | None = None,
+        world_frame: str = '',
+        region: Region | None = None,
+    ) -> None:
         """Take a calibration from a file as the present one.
 
         Raises
@@ -588,7 +596,8 @@ class CalibrationSession:
                 f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
             )
-        self.calibration = Calibration(chain, None, world_frame, rms_mm, frozenset(self.samples))
+        known = frozenset(self.samples)
+        self.calibration = Calibration(chain, None, world_frame, rms_mm, known, region=region)
 
     def validate(self) -> tuple[ErrorFigures, ErrorFigures | None]:
         """Judge the calibration on the samples taken since; nothing is fitted.

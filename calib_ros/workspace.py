@@ -29,6 +29,7 @@ from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownN
 from calib_ros.identifiability import structurally_independent
 from calib_ros.identification import Identification
 from calib_ros.leastsquares import Samples, System, minimise
+from calib_ros.region import Region, region_of_record
 from calib_ros.se3 import FloatArray
 from calib_ros.simulation import measure
 from calib_ros.texts import read_text
@@ -54,6 +55,8 @@ class CalibratedArm:
         Parameters that were fitted, and their covariance; none when it is not known.
     residual : float
         RMS position error [m] on poses that were not fitted; 0 when it is not known.
+    region : Region, optional
+        Where the calibration may be used; None when it is not known.
 
     """
 
@@ -62,13 +65,19 @@ class CalibratedArm:
     names: tuple[str, ...] = ()
     covariance: FloatArray | None = None
     residual: float = 0.0
+    region: Region | None = None
 
     @classmethod
     def of(cls, result: Identification) -> CalibratedArm:
         """Return the arm of an identification."""
         figures = (result.validation or result.fitted).figures[1]
         return cls(
-            result.before, result.chain, result.names, result.covariance, 1e-3 * figures.rms_mm
+            result.before,
+            result.chain,
+            result.names,
+            result.covariance,
+            1e-3 * figures.rms_mm,
+            result.region,
         )
 
     @classmethod
@@ -86,8 +95,9 @@ class CalibratedArm:
             When the result beside it cannot be used.
 
         """
-        after = load_calibration(path, nominal)
-        arm = cls(_in_frames_of(nominal, after), after)
+        after, record = load_calibration(path, nominal)
+        region = region_of_record(record, after, str(path))
+        arm = cls(_in_frames_of(nominal, after), after, region=region)
         if not path.is_dir():
             return arm
         try:
@@ -116,7 +126,12 @@ class CalibratedArm:
         return np.linalg.norm(shift, axis=1), np.linalg.norm(turn, axis=1)
 
     def sigma(self, joints: FloatArray) -> FloatArray:
-        """Return the standard deviation (N,) [m] of predicted positions; NaN if not known."""
+        """Return the standard deviation (N,) [m] of predicted positions; NaN if not known.
+
+        With the region it is the expected error, effects that are not modelled included.
+        """
+        if self.region is not None:
+            return self.region.sigma(joints)
         return self._sigma(joints, slice(0, 3))
 
     def sigma_turned(self, joints: FloatArray) -> FloatArray:
@@ -262,7 +277,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Region:
+class Sector:
     """A part of the workspace in cylinder coordinates of the arm's base, and its RMS error [m].
 
     `radius`, `height` [m] and `azimuth` [rad] are the limits, the latter from the x axis.
@@ -281,7 +296,7 @@ RADII = ('close in', 'half way out', 'far out')
 HEIGHTS = ('low', 'at middle height', 'high')
 
 
-def regions(positions: FloatArray, errors: FloatArray) -> tuple[Region, ...]:
+def regions(positions: FloatArray, errors: FloatArray) -> tuple[Sector, ...]:
     """Return the regions of positions (N, 3) [m], that of the largest RMS error (N,) first.
 
     Radius and height are parted so that each third holds as many poses; azimuth in quadrants.
@@ -301,7 +316,7 @@ def regions(positions: FloatArray, errors: FloatArray) -> tuple[Region, ...]:
             continue
         middle = 0.5 * np.pi * side
         found.append(
-            Region(
+            Sector(
                 f'{RADII[ring]}, {HEIGHTS[level]}, {SIDES[side]}',
                 (float(edges[0][ring]), float(edges[0][ring + 1])),
                 (float(edges[1][level]), float(edges[1][level + 1])),
@@ -362,7 +377,7 @@ def in_words(survey: Survey) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _region_in_words(region: Region) -> str:
+def _region_in_words(region: Sector) -> str:
     (near, far), (low, high) = region.radius, region.height
     return (
         f'{region.words}: {1e3 * region.rms:.4f} mm (radius {near:.2f} to {far:.2f} m, '
