@@ -187,6 +187,12 @@ class Uncertainty:
         """Return the covariance (P, P) by all sources."""
         return np.asarray(self.parts.sum(axis=0))
 
+    @property
+    def overall(self) -> float:
+        """Return the degrees of freedom of all parameters together."""
+        variances = np.einsum('kpp,pp->k', self.parts, np.diag(1.0 / np.diag(self.covariance)))
+        return float(self.freedom_of(variances))
+
     def freedom_of(self, variances: FloatArray) -> FloatArray:
         """Return the degrees of freedom (...) of a sum of variances (K, ...) from the sources.
 
