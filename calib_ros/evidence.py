@@ -5,7 +5,7 @@
 Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there,
 and the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm are taken
 to be normal about zero, with one size for each group of parameters: lengths, angles, what drives
-do to a joint value (`ratio`, `sin_1`, ...), and what bends. The sizes s maximise the probability
+do to a joint value (`ratio`, `sin_1`, ...), and what bends or has play. The sizes s maximise the probability
 of the data, parameters integrated out (evidence; MacKay 1992):
 
     s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
@@ -40,7 +40,8 @@ from calib_ros.differential import ErrorModel
 from calib_ros.leastsquares import Samples, System, normal_equations
 from calib_ros.se3 import FloatArray
 
-TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'bending': 3e-4}
+BENDING = ('gravity', 'compliance', 'backlash')
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, **dict.fromkeys(BENDING, 3e-4)}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation)."""
@@ -48,7 +49,6 @@ TAILS = 3.0
 """Degrees of freedom of the prior."""
 SURE = 2.0
 """Standard deviations by which an offset that stands out is larger at first."""
-BENDING = ('gravity', 'compliance', 'backlash')
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, whether they are fitted or not."""
 SHOWN, REFUTED = 1.35, 3.0
@@ -73,7 +73,8 @@ def group_of(chain: Chain, name: str) -> str | None:
         return None
     if name.partition('.')[2] in DH_KINDS:
         return 'length' if is_length(name) else 'angle'
-    return 'bending' if effects.group_of(name) in BENDING else 'drive'
+    group = effects.group_of(name)
+    return group if group in BENDING else 'drive'
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +98,8 @@ class Posterior:
     sizes : mapping of str to float
         Size of the errors by group.
     doubted : (P,), (P, P)
-        Mean and covariance of the offsets if the device may have a scale of its own.
+        Mean and covariance of the offsets if the device may have a scale of its own, and if joint
+        values that were rounded are off.
 
     """
 
@@ -143,6 +145,7 @@ def posterior_of(
     noise: float,
     known: Mapping[str, float],
     more: Sequence[str] = (),
+    doubts: Mapping[str, float] | None = None,
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
@@ -160,6 +163,8 @@ def posterior_of(
         Priors [m or rad] that were given.
     more : sequence of str
         Effects to consider.
+    doubts : mapping of str to float
+        Parameters that something else than the arm moves as well, with its standard deviation.
 
     """
     chain = chain.with_effects(more)
@@ -169,8 +174,11 @@ def posterior_of(
     columns = tuple(dict.fromkeys([*every, *lengths]))
     normal = normal_equations(chain, columns, few)
     mixing = np.eye(len(columns), len(every))
+    beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
     if lengths:
-        mixing = np.column_stack([mixing, [lengths.get(name, 0.0) for name in columns]])
+        beside.append((lengths, SCALE))
+    for parts, _ in beside:
+        mixing = np.column_stack([mixing, [parts.get(name, 0.0) for name in columns]])
     matrix = share / noise**2 * (mixing.T @ normal.matrix @ mixing)
     gradient = share / noise**2 * (mixing.T @ normal.gradient)
     size = len(gradient)
@@ -181,7 +189,7 @@ def posterior_of(
     vector = matrix @ offsets + gradient
     groups = [None if name in known else group_of(chain, name) for name in every]
     groups += [None] * (size - len(every))
-    given = np.array([known.get(name, np.inf) for name in every] + [SCALE] * bool(lengths)) ** -2
+    given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
     stds, sizes = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     own = stds[: len(every)].tolist()

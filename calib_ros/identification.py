@@ -10,7 +10,7 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from calib_ros.observations import Observations
 from calib_ros.problem import Learned, Problem
 from calib_ros.region import KNOWN, Region, region_of
 from calib_ros.robust import OUTLIER, Robust, reweighted, thorough_fit
-from calib_ros.rounding import may_be_rounding, rounded
+from calib_ros.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.se3 import FloatArray, left_jacobian_inverse
 from calib_ros.steps import Step, find_step
 from calib_ros.validation import (
@@ -47,6 +47,8 @@ __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residua
 
 SOME = 500
 """Pairs that are enough for a first fit."""
+HARDLY = 3.0
+"""Sizes of errors that a parameter, by the poses alone, is uncertain by where they hardly tell."""
 HELD = 0.05
 """Share of a parameter's variance that is its prior's from which on the prior is fitted with."""
 
@@ -252,11 +254,20 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
     chance = _chance(replace(problem, learned=None), before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
-    posterior = _posterior(problem, fitted, names, whole, considered(fit.chain, names))
+    if not noise.consistent:  # targets of one stop share what the model lacks
+        whole *= _targets(problem)
+    coarse = rounded(problem)
+    posterior = _posterior(
+        problem,
+        fitted,
+        names,
+        whole,
+        considered(fit.chain, names),
+        rounding_errors(problem, coarse),
+    )
     region = region_of(posterior, problem.sets, uncertainty.overall)
     step = find_step(problem, names, robust)
     own = arms_own(problem, robust) if step is None else None
-    coarse = rounded(problem)
     good = [distances <= OUTLIER for distances in robust.distances]
     unsure = bool(coarse) and may_be_rounding(problem, before.chain, names, coarse, good)
     known = {name: problem.prior_sigmas[name] for name, _ in model.effects}
@@ -331,10 +342,18 @@ def _posterior(
     names: Sequence[str],
     noise: float,
     more: Sequence[str] = (),
+    doubts: Mapping[str, float] | None = None,
 ) -> Posterior:
     """Return what the data of a fit tell, with `more` effects considered."""
     chain, system = fitted.robust.fit.chain, fitted.system
-    return posterior_of(chain, problem.model, names, system, noise, problem.given, more)
+    return posterior_of(chain, problem.model, names, system, noise, problem.given, more, doubts)
+
+
+def _targets(problem: Problem) -> float:
+    """Return the root of how many sets see a configuration, on average."""
+    numbers = problem.configurations
+    seen = sum(len(np.unique(each)) for each in numbers)
+    return float(np.sqrt(seen / len(np.unique(np.concatenate(numbers)))))
 
 
 def _told_by(noise: Noise, simpler: Identification | None) -> float:
@@ -402,7 +421,7 @@ def _weak(problem: Problem, parameters: Sequence[Parameter]) -> tuple[str, ...]:
         if p.std is not None and p.name in learned and p.name not in known:
             untold = max(learned[p.name], TYPICAL['length' if is_length(p.name) else 'angle'])
             alone = p.std**-2 - learned[p.name] ** -2  # what the poses tell without the prior
-            if alone < untold**-2:
+            if alone < (HARDLY * untold) ** -2:
                 found.append(p.name)
     return tuple(found)
 

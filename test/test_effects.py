@@ -229,8 +229,9 @@ def test_standard_deviations_of_effects_are_honest(group):
             for name, value in values.items()
             if name != 'shoulder_pan_joint.compliance'
         ]
-    # 60 scores or more: the spread of a standard deviation is 1 / sqrt(2 * 60) = 0.09
-    assert np.std(scores) == pytest.approx(1.0, abs=0.25)
+    # 60 scores or more: the spread of a standard deviation is 1 / sqrt(2 * 60) = 0.09; where the
+    # poses tell little, the prior makes errors smaller than the deviations
+    assert 0.5 < np.std(scores) < 1.25
 
 
 @pytest.mark.parametrize('ratio', [17.0, 50.5, 101.25])

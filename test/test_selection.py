@@ -201,7 +201,8 @@ def test_auto_takes_covariances_of_the_samples(rng):
         identify_model(Problem(UR10E, each, **SIGMAS), 'auto') for each in (seen, own)
     )
     assert chosen(first) == chosen(second) == {'eccentricity'}
-    np.testing.assert_allclose(first.chain.table, second.chain.table, rtol=0, atol=1e-9)
+    # the size of the noise, by which priors are weighed, is found by parts or as a whole
+    np.testing.assert_allclose(first.chain.table, second.chain.table, rtol=0, atol=1e-6)
 
 
 def test_a_model_is_named_in_the_settings(rng):
