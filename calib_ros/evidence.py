@@ -5,8 +5,8 @@
 Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there,
 and the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm are taken
 to be normal about zero, with one size for each group of parameters: lengths, angles, what drives
-do to a joint value (`ratio`, `sin_1`, ...), and what bends or has play. The sizes s maximise the probability
-of the data, parameters integrated out (evidence; MacKay 1992):
+do to a joint value (`ratio`, `sin_1`, ...), and what bends or has play. The sizes s maximise the
+probability of the data, parameters integrated out (evidence; MacKay 1992):
 
     s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
 

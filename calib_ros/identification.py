@@ -47,8 +47,6 @@ __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residua
 
 SOME = 500
 """Pairs that are enough for a first fit."""
-HARDLY = 3.0
-"""Sizes of errors that a parameter, by the poses alone, is uncertain by where they hardly tell."""
 HELD = 0.05
 """Share of a parameter's variance that is its prior's from which on the prior is fitted with."""
 
@@ -421,7 +419,7 @@ def _weak(problem: Problem, parameters: Sequence[Parameter]) -> tuple[str, ...]:
         if p.std is not None and p.name in learned and p.name not in known:
             untold = max(learned[p.name], TYPICAL['length' if is_length(p.name) else 'angle'])
             alone = p.std**-2 - learned[p.name] ** -2  # what the poses tell without the prior
-            if alone < (HARDLY * untold) ** -2:
+            if alone < untold**-2:
                 found.append(p.name)
     return tuple(found)
 

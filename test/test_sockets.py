@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib_ros import se3
-from calib_ros.chain import DH_KINDS, Frame
+from calib_ros.chain import Frame
 from calib_ros.config import load_chain
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, UnknownNameError
@@ -105,17 +105,15 @@ def test_a_ball_on_the_last_axis_leaves_it_near_nominal(seed, offset):
     true, problem = cell(seed, offset, noise=5e-4)
     result = identify(problem)
     assert result.accepted
-    assert result.weak
-    for name in result.weak:
-        joint, _, kind = name.partition('.')
-        assert joint in IIWA.joint_names[-2:]
-        assert kind in DH_KINDS
-        assert abs(result.chain.offset(name, IIWA)) < 3.0 * result.posterior.sizes['angle']
+    angle = result.posterior.sizes['angle']
+    for name in ('joint_6.alpha', 'joint_6.theta'):  # sigma by the poses alone: some mrad
+        assert result.posterior.held(name) > 0.5
+        assert abs(result.chain.offset(name, IIWA)) < 3.0 * angle
+    assert set(result.weak) <= {'joint_6.alpha', 'joint_6.theta'}
     assert ', '.join(result.weak) in summary(result)
     # where the ball is taken it does not matter: as well as a ball that tells all
     other, telling = cell(seed, noise=5e-4)
     far = identify(telling)
-    assert not far.weak
     assert difference(result.chain, true) < 1.5 * difference(far.chain, other) + 1e-4
 
 
