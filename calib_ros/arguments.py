@@ -51,12 +51,16 @@ BESIDE_SETTINGS = (
     ),
     Parameter('resume', False, 'go on with the newest journal of this robot'),
     Parameter(
+        'autoload', False, 'publish the newest saved calibration of this robot at the start'
+    ),
+    Parameter(
         'target_filename', '', 'file in data_dir that ~/save writes; default: a new one', False
     ),
     Parameter(
         'calibration_filename',
         '',
-        'file in data_dir that ~/load reads; default: the newest',
+        'file in data_dir that is published at the start and that ~/load reads; default: the '
+        'newest, by autoload or ~/load',
         False,
     ),
     Parameter('marker_scale', 200.0, 'residual vectors are drawn so many times as long', False),

@@ -145,6 +145,10 @@ class CalibrationNode(Node):
             (TAKING_PERIOD, self._on_tick),
         ):
             self.create_timer(period, self._guarded(work), clock=steady)
+        self._load_at_start()
+
+    def announce(self) -> None:
+        """Say that the node is ready, once an executor serves it."""
         self.get_logger().info(
             f'ready to calibrate {self.session.chain.name}: joints '
             f'{", ".join(self.session.joint_names)}; samples are kept in {self._archive.folder}'
@@ -246,6 +250,25 @@ class CalibrationNode(Node):
             self.get_logger().warning(warning)
         if self._archive.journal is not None:
             self.get_logger().info(f'resumed {len(samples)} samples of {self._archive.journal}')
+
+    def _load_at_start(self) -> None:
+        """Publish the calibration of before if that is wanted, or say that there is one."""
+        path, wanted = self._keeper.at_start()
+        log = self.get_logger()
+        if wanted:
+            success, text = self._answer(lambda: self._on_load(None))
+            if success:
+                log.info(f'{text}: it is published')
+            else:
+                self._last = f'no calibration is published at the start: {text}'
+                log.error(self._last)
+        elif path is not None:
+            log.info(
+                f'no calibration is published yet. There is {path}: call ~/load, or start with '
+                'autoload:=true'
+            )
+        elif self._given.autoload:
+            log.info(f'autoload: there is no saved calibration in {self._archive.folder} yet')
 
     # Services
 
@@ -424,6 +447,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         executor = _executor(node.get_parameter('executor').value)
         handle_signals(on_signal)  # the events executor takes them when it is made
         executor.add_node(node)
+        node.announce()
         while not stop.is_set() and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
     except ExternalShutdownException:

@@ -48,6 +48,7 @@ class Given:
     data_dir: Path | None
     allowed_folders: tuple[Path, ...]
     resume: bool
+    autoload: bool
     candidates: Path | None
     frames: FrameNames
     settings: Settings
@@ -80,6 +81,7 @@ def declare_all(node: Node) -> Given:
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
         resume=own['resume'],
+        autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
         settings=settings,

@@ -19,6 +19,7 @@ from geometry_msgs.msg import (
     TransformStamped,
 )
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
@@ -46,7 +47,7 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
-from calib_ros.config import calibration_record, load_chain, parse_chain
+from calib_ros.config import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
 from calib_ros.replay import replay, write_bag
@@ -392,6 +393,68 @@ def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, re
             assert answer.success == loads, answer.message
             assert loads or 'the robot with serial "7", this is "8"' in answer.message
             assert (cell.node.session.calibration is not None) == loads
+
+
+@pytest.fixture(scope='module')
+def saved(tmp_path_factory, recording):
+    """Return a folder in which two calibrations are saved, and the path of the newest."""
+    folder = tmp_path_factory.mktemp('saved')
+    with Cell(chain='ur10e', data_dir=str(folder)) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        assert cell.call('save').success
+        assert cell.call('save').success
+    *_, newest = sorted(folder.glob('*Z.yaml'))
+    return folder, newest
+
+
+@pytest.mark.parametrize('named', [True, False])
+def test_the_calibration_is_published_again_after_a_restart(saved, named):
+    folder, newest = saved
+    path = sorted(folder.glob('*Z.yaml'))[0] if named else newest
+    given = {'calibration_filename': path.name} if named else {'autoload': True}
+    with Cell() as cell:
+        told = cell.listen(Log, '/rosout', 1000)
+        node = cell.start(chain='ur10e', data_dir=str(folder), **given)
+        texts = cell.listen(String, 'calibration_node/calibration')
+        cell.spin_until(lambda: texts)
+        assert texts[0].data == path.read_text()
+        assert node.session.calibration.world_frame == 'tracker'
+        cell.spin_until(lambda: any(f'loaded {path}' in each.msg for each in told))
+
+
+def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
+    folder, newest = saved
+    with Cell() as cell:
+        told = cell.listen(Log, '/rosout', 1000)
+        node = cell.start(chain='ur10e', data_dir=str(folder))
+        cell.spin_until(lambda: any(str(newest) in each.msg for each in told))
+        assert any('~/load' in each.msg for each in told)
+        assert node.session.calibration is None
+
+
+@pytest.mark.parametrize(
+    ('content', 'said'),
+    [(None, 'there is no file'), ('', 'is not a calibration'), ('puma', 'joints')],
+)
+def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
+    monkeypatch, tmp_path, recording, content, said
+):
+    """A node that did not start would take no samples, and a respawned one gives up."""
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    path = tmp_path / 'of_before.yaml'
+    if content is not None:
+        path.write_text(content and dump_chain(load_chain('puma560')))
+    given = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'calibration_filename': str(path)}
+    with Cell() as cell:
+        told = cell.listen(Log, '/rosout', 1000)
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        node = cell.start(**given)
+        cell.spin_until(lambda: any(said in m.msg and m.level == m.ERROR for m in told))
+        cell.spin_until(lambda: heard and said in values_of(heard[-1])['last identification'])
+        assert node.session.calibration is None
+        cell.play(topics(recording), node=node)
+        assert cell.call('identify').success
 
 
 def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording):
@@ -764,6 +827,7 @@ def test_a_wrong_parameter_ends_the_node_with_one_clear_line(parameters, said):
     with Child(**parameters) as child:
         assert child.end() == 1
         assert said in child.output
+        assert 'ready' not in child.output
         assert 'Traceback' not in child.output
 
 
