@@ -9,6 +9,8 @@ and the node read the same list.
 
 from __future__ import annotations
 
+import argparse
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -108,6 +110,25 @@ def launch_arguments() -> dict[str, str]:
     """
     texts = {each.name: _described(each) for each in PARAMETERS.values()}
     return {**texts, **PLACED, **REMAPPED}
+
+
+def usage(program: str) -> argparse.ArgumentParser:
+    """Return a parser of what is not for ROS: of --help alone, which lists the parameters."""
+    lines = ['parameters:']
+    for each in PARAMETERS.values():
+        text = textwrap.fill(
+            _described(each), 90, initial_indent=' ' * 6, subsequent_indent=' ' * 6
+        )
+        lines += [f'  {each.name}{"" if each.fixed else " *"}', text]
+    lines += ['', '* can change while the node runs: ros2 param set /' + program + ' NAME VALUE']
+    return argparse.ArgumentParser(
+        prog=program,
+        usage='%(prog)s --ros-args -p chain:=ur10e [-p NAME:=VALUE ...] [--params-file FILE]',
+        description='Calibrates a robot from its joint states and measured poses. Services, '
+        'topics and files: docs/node.md',
+        epilog='\n'.join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
 
 
 def ros_arguments(given: Mapping[str, str]) -> list[str]:

@@ -32,12 +32,14 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
+from rclpy.utilities import remove_ros_args
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros import outgoing, report
 from calib_ros.archive import Archive
+from calib_ros.arguments import NODE, usage
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import CalibrationError, ConfigError
@@ -138,7 +140,7 @@ class CalibrationNode(Node):
             (Trigger, '~/load', self._on_load),
             (SetBool, '~/record', self._on_record),
         ):
-            self.create_service(kind, name, self._answering(callback))
+            self.create_service(kind, name, self._answering(name, callback))
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
         for period, work in (
             (DIAGNOSTICS_PERIOD, self._on_second),
@@ -256,11 +258,10 @@ class CalibrationNode(Node):
         path, wanted = self._keeper.at_start()
         log = self.get_logger()
         if wanted:
-            success, text = self._answer(lambda: self._on_load(None))
-            if success:
-                log.info(f'{text}: it is published')
-            else:
-                self._last = f'no calibration is published at the start: {text}'
+            try:
+                log.info(f'{self._on_load(None)[1]}: it is published')
+            except Exception as err:  # whatever is wrong with a file, samples can be taken
+                self._last = f'no calibration is published at the start: {err}'
                 log.error(self._last)
         elif path is not None:
             log.info(
@@ -391,26 +392,32 @@ class CalibrationNode(Node):
 
         return guarded
 
-    def _answering(self, callback: Callable[[Any], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
+    def _answering(
+        self, name: str, callback: Callable[[Any], tuple[bool, str]]
+    ) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
             def work() -> tuple[bool, str]:
                 self._take_messages()
                 return callback(request)
 
-            response.success, response.message = self._answer(work)
+            response.success, response.message = self._answer(name, work)
             return response
 
         return answer
 
-    def _answer(self, work: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
-        """Run the work of a service; an error is its answer."""
+    def _answer(self, name: str, work: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
+        """Run the work of a service; an error is its answer. Who reads the log sees it, too."""
         try:
             success, text = work()
         except (CalibrationError, OSError) as err:
-            return False, str(err)
+            success, text = False, str(err)
         except Exception as err:
             self.get_logger().error(f'internal error: {traceback.format_exc()}')
-            return False, f'internal error, see the log: {err!r}'
+            success, text = False, f'internal error, see the log: {err!r}'
+        if not success:
+            self.get_logger().warning(f'{name}: {text}')
+        elif text:
+            self.get_logger().info(f'{name}: {text}')
         return bool(success), str(text)
 
 
@@ -428,6 +435,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
+    command = sys.argv if arguments is None else [NODE, *arguments]
+    usage(NODE).parse_args(remove_ros_args(command)[1:])
     stop = threading.Event()
 
     def on_signal(number: int, frame: Any) -> None:
@@ -442,7 +451,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     executor: Executor | None = None
     status, finished = 0, True
     try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
         node = CalibrationNode()
         executor = _executor(node.get_parameter('executor').value)
         handle_signals(on_signal)  # the events executor takes them when it is made

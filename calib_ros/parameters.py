@@ -104,6 +104,8 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     name, links = given.chain, given.links
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        topic = node.resolve_topic_name('robot_description')
+        node.get_logger().info(f'waiting for {topic}, {DESCRIPTION_WAIT:g} s at most')
         found, message = wait_for_message(
             String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
         )

@@ -47,6 +47,7 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
+from calib_ros.arguments import PARAMETERS
 from calib_ros.config import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
@@ -303,6 +304,22 @@ def test_errors_are_answers(cell, recording):
     few = cell.call('identify')
     assert not few.success
     assert '2 measured configurations are too few, at least 5' in few.message
+
+
+def test_answers_are_in_the_log_as_well(cell, recording):
+    told = cell.listen(Log, '/rosout', 1000)
+    cell.spin_until(lambda: told or cell.peer.get_publishers_info_by_topic('/rosout'))
+
+    def said(name, answer, level):
+        text = f'~/{name}: {answer.message}'
+        cell.spin_until(lambda: (text, level) in [(each.msg, each.level) for each in told])
+
+    for name in ('identify', 'export', 'capture', 'remove_last', 'validate', 'save', 'load'):
+        said(name, cell.call(name), Log.WARN)
+    said('record', cell.call('record', SetBool.Request(data=True)), Log.INFO)
+    cell.play(topics(recording))
+    for name in ('identify', 'export', 'save', 'load', 'remove_last', 'clear'):
+        said(name, cell.call(name), Log.INFO)
 
 
 def test_record_remove_last_and_clear(cell, recording):
@@ -829,6 +846,24 @@ def test_a_wrong_parameter_ends_the_node_with_one_clear_line(parameters, said):
         assert said in child.output
         assert 'ready' not in child.output
         assert 'Traceback' not in child.output
+
+
+def test_help_names_every_parameter_and_starts_nothing(capsys):
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--help'])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    for name in PARAMETERS:
+        assert f'\n  {name}' in out
+    assert '--ros-args -p chain:=ur10e' in out
+
+
+def test_words_that_are_not_for_ros_are_refused(capsys):
+    """ROS ignores them."""
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--serial', '7', '--ros-args', '-p', 'chain:=ur10e'])
+    assert caught.value.code == 2
+    assert 'unrecognized arguments: --serial 7' in capsys.readouterr().err
 
 
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):
