@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -44,13 +45,15 @@ from calib_ros.deferred import DeferredTrigger
 from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.guide import Guide
+from calib_ros.identification import Outlier
 from calib_ros.inputs import Inputs, deserialised
 from calib_ros.intake import Stream, feed
 from calib_ros.keeper import Exportable, Keeper, Published
 from calib_ros.messages import JOINT_STATE
 from calib_ros.parameters import changed, declare_all, load_robot
 from calib_ros.problem import Problem
-from calib_ros.samples import Sample
+from calib_ros.progress import Progress
+from calib_ros.samples import Sample, named
 from calib_ros.selection import identify_model
 from calib_ros.session import CalibrationSession, check_settings
 from calib_ros.sources import STANDARD, parse_sources
@@ -66,6 +69,8 @@ TAKING_PERIOD = 0.1
 a time, each in a cold cache, they cost three times as much."""
 DIAGNOSTICS_PERIOD = 1.0
 JOIN_TIMEOUT = 1.0
+STATUS_LENGTH = 120
+"""Most characters of the status: `ros2 topic echo` cuts texts at 128."""
 
 
 class Snapshot(NamedTuple):
@@ -74,8 +79,19 @@ class Snapshot(NamedTuple):
     problem: Problem
     model: str
     samples: tuple[Sample, ...]
+    numbers: dict[Sample, int]
     origin: dict[str, Any]
     configuration: str
+
+    def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
+        """Return the numbers by which the operator knows the samples that are outliers."""
+        frames = named(self.samples)
+        known = {(each.stamp_ns, *frames.of(each)): self.numbers[each] for each in self.samples}
+        sets = self.problem.sets
+        return {
+            each: known[each.stamp_ns, sets[each.set].base, sets[each.set].tool]
+            for each in outliers
+        }
 
 
 class CalibrationNode(Node):
@@ -97,6 +113,7 @@ class CalibrationNode(Node):
             chain, given.settings, self._on_sample, self._archive.remove
         )
         self._last = 'nothing identified yet'
+        self._progress = Progress('identifying')
         self._observability = ''
         self._status_text = ''
         self.lost = ''
@@ -132,6 +149,7 @@ class CalibrationNode(Node):
             self, '~/export', self._answer, self._to_export, self._keeper.export
         )
         for kind, name, callback in (
+            (Trigger, '~/cancel', self._on_cancel),
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/validate', self._on_validate),
@@ -287,12 +305,16 @@ class CalibrationNode(Node):
             'journal': str(self._archive.journal or ''),
         }
         model = self.session.settings.model
-        return Snapshot(problem, model, samples, origin, self._configuration())
+        numbers = {sample: k + 1 for k, sample in enumerate(self.session.samples)}
+        found = Snapshot(problem, model, samples, numbers, origin, self._configuration())
+        self._progress.begin()
+        return found
 
     def _run(self, given: Snapshot) -> tuple[bool, str]:
         """Identify, on a thread of its own; publish only what is accepted."""
-        result = identify_model(given.problem, given.model)
-        self._last = report.summary(result)
+        with self._progress.running():
+            result = identify_model(given.problem, given.model, self._progress)
+        self._last = report.summary(result, given.numbers_of(result.outliers))
         self._observability = report.observability_in_words(result)
         self._residuals.publish(
             outgoing.residual_markers(
@@ -309,6 +331,9 @@ class CalibrationNode(Node):
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
+
+    def _on_cancel(self, request: Any) -> tuple[bool, str]:
+        return self._progress.cancel()
 
     def _on_capture(self, request: Any) -> tuple[bool, str]:
         count, why = self.session.capture()
@@ -365,9 +390,10 @@ class CalibrationNode(Node):
         self._diagnostics.publish(status)
 
     def _publish_status(self) -> str:
-        """Return how the session goes; the status is published when it has changed."""
-        words = self.session.status()
-        text = f'{self._archive.trouble}{words}'
+        """Return how the session goes; its first words are published when they have changed."""
+        words = self.session.status(str(self._progress))
+        trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
+        text = textwrap.shorten(f'{trouble} {words}', STATUS_LENGTH, placeholder=' ...')
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))

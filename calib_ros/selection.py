@@ -14,7 +14,7 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,6 +42,10 @@ MOST_HARMONICS = 24
 SUBSET = 3000
 
 
+def _unheard(stage: str) -> None:
+    """Tell nobody which stage begins."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """The effects that pay for themselves, and the verdicts on all that were tried."""
@@ -50,24 +54,32 @@ class Selection:
     verdicts: tuple[Verdict, ...]
 
 
-def identify_model(problem: Problem, model: str) -> Identification:
+def identify_model(
+    problem: Problem, model: str, progress: Callable[[str], None] = _unheard
+) -> Identification:
     """Identify with the errors that `model` names; `auto` chooses by cross-validation.
 
-    A choice that cannot be fitted leaves the geometric result, with the verdicts.
+    A choice that cannot be fitted leaves the geometric result, with the verdicts. `progress` is
+    called with each stage that begins; what it raises ends the work.
     """
+    progress(f'model {"geometric" if model == "auto" else model}')
     result = identify(problem)
     if model != 'auto':
         return result
-    selection = choose_effects(problem, result)
+    selection = choose_effects(problem, result, progress)
     if selection.effects:
+        progress(f'model with {len(selection.effects)} effects')
         richer = identify(replace(problem, effects=selection.effects), result)
         if richer.converged:
             result = richer
     return replace(result, verdicts=selection.verdicts)
 
 
-def choose_effects(problem: Problem, geometric: Identification) -> Selection:
+def choose_effects(
+    problem: Problem, geometric: Identification, progress: Callable[[str], None] = _unheard
+) -> Selection:
     """Choose the effects for a problem from its geometric result."""
+    progress('effects')
     model = _Linear(problem, geometric)
     chosen: list[str] = []
     verdicts: dict[str, Verdict] = {}
@@ -76,6 +88,7 @@ def choose_effects(problem: Problem, geometric: Identification) -> Selection:
         tried = []
         for group, names in groups.items():
             if names and not set(names) <= set(chosen):
+                progress(f'effects: {group}')
                 tried.append((model.judge(chosen, names, group), group))
         if not tried:
             break
@@ -88,7 +101,8 @@ def choose_effects(problem: Problem, geometric: Identification) -> Selection:
         verdicts[group] = best
         chosen += groups[group]
     found = list(verdicts.values())
-    for _ in range(MOST_HARMONICS):
+    for number in range(1, MOST_HARMONICS + 1):
+        progress(f'harmonics: number {number}')
         harmonic = model.strongest_harmonic(chosen)
         if harmonic is None:
             break

@@ -14,7 +14,7 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 
 ORDER = [
     {'errors'},
-    {'escapes', 'files', 'mcap', 'se3'},
+    {'escapes', 'files', 'mcap', 'progress', 'se3'},
     {'effects', 'description', 'values'},
     {'chain', 'settings'},
     {'arguments', 'urdf'},

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy: what it hears, keeps, answers and publishes."""
 
+import queue
 import signal
 import threading
 from dataclasses import replace
@@ -47,6 +48,7 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
+from calib_ros.archive import Archive
 from calib_ros.arguments import PARAMETERS
 from calib_ros.config import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
@@ -495,7 +497,7 @@ def test_messages_are_taken_while_an_identification_runs(
 ):
     release, problems = threading.Event(), []
 
-    def slow(problem, model):
+    def slow(problem, model, progress):
         problems.append(problem)
         assert release.wait(20.0)
         return identify(problem)
@@ -526,10 +528,120 @@ def test_messages_are_taken_while_an_identification_runs(
         assert cell.call('identify').success
 
 
+STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics: number 1']
+
+
+@pytest.fixture
+def stages(monkeypatch):
+    """Let identifications of model auto wait at each stage; return a queue that lets them go."""
+    release, reached = queue.Queue(), []
+    identify_model = node_module.identify_model
+
+    def slow(problem, model, progress):
+        def at(stage):
+            progress(stage)
+            reached.append(stage)
+            release.get(timeout=20.0)
+
+        return identify_model(problem, model, at)
+
+    monkeypatch.setattr(node_module, 'identify_model', slow)
+    return release, reached
+
+
+def test_the_status_names_the_stage_of_an_identification(monkeypatch, tmp_path, recording, stages):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    release, reached = stages
+    with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
+        words = cell.listen(String, 'calibration_node/status')
+        cell.play(topics(recording))
+        running = cell.start_call('identify')
+        for stage in STAGES[:2]:
+            cell.spin_until(lambda now=stage: f's ({now}); ' in words[-1].data)
+            assert '; identifying for ' in words[-1].data
+            release.put(None)
+        for _ in range(100):
+            release.put(None)
+        cell.spin_until(running.done)
+        assert running.result().success, running.result().message
+        assert set(STAGES) <= set(reached)
+        cell.spin_until(lambda: 'identifying' not in words[-1].data)
+
+
+@pytest.mark.parametrize('stage', range(3))
+def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stages, stage):
+    release, reached = stages
+    with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
+        none = cell.call('cancel')
+        assert not none.success
+        assert 'nothing to cancel' in none.message
+        cell.play(topics(recording))
+        texts = cell.listen(String, 'calibration_node/calibration')
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
+        cell.spin_until(lambda: texts)
+        good = cell.node.session.calibration
+        while not release.empty():
+            release.get()
+        reached.clear()
+        running = cell.start_call('identify')
+        for _ in range(stage):
+            release.put(None)
+        cell.spin_until(lambda: len(reached) == stage + 1)
+        answer = cell.call('cancel')
+        assert answer.success
+        assert f'({reached[-1]})' in answer.message
+        release.put(None)
+        cell.spin_until(running.done)
+        assert not running.result().success
+        assert f'cancelled after the stage "{reached[-1]}"' in running.result().message
+        assert len(reached) == stage + 1
+        assert cell.node.session.calibration is good
+        assert len(texts) == 1
+        assert len(cell.node.session.samples) == STOPS
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
+
+
+def test_a_result_that_was_cancelled_at_last_is_not_published(monkeypatch, cell, recording):
+    release, running = threading.Event(), threading.Event()
+
+    def slow(problem, model, progress):
+        result = identify(problem)
+        running.set()
+        assert release.wait(20.0)
+        return result
+
+    monkeypatch.setattr(node_module, 'identify_model', slow)
+    cell.play(topics(recording))
+    answer = cell.start_call('identify')
+    cell.spin_until(running.is_set)
+    assert cell.call('cancel').success
+    release.set()
+    cell.spin_until(answer.done)
+    assert not answer.result().success
+    assert 'cancelled' in answer.result().message
+    assert cell.node.session.calibration is None
+
+
+def test_outliers_are_named_by_number_and_stamp(cell, recording):
+    some = pose_messages(recording.poses)
+    for message in some[24:28]:
+        message.pose.position.z += 0.02
+    cell.play(topics(recording, measured_pose=some))
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    sample = cell.node.session.samples[6]
+    stamp = f'{sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d}'
+    assert f'1 outliers carry no weight: sample 7 ({stamp})' in answer.message
+
+
 def test_clear_while_an_identification_runs(monkeypatch, cell, recording):
     release, problems = threading.Event(), []
 
-    def slow(problem, model):
+    def slow(problem, model, progress):
         problems.append(problem)
         assert release.wait(20.0)
         return identify(problem)
@@ -603,8 +715,9 @@ def test_diagnostics_status_and_corrected_pose(monkeypatch, tmp_path, recording,
         assert float(values['age of /measured_pose [s]']) < 20.0
         words = cell.listen(String, 'calibration_node/status')
         cell.spin_until(lambda: words)
-        assert words[0].data.startswith(f'{STOPS} samples, 0.0')
-        assert 'enough for the accuracy wanted; the arm' in words[0].data
+        assert words[0].data.startswith('the arm ')
+        assert f'; {STOPS} samples, 0.0' in words[0].data
+        assert 'enough for the accuracy wanted' in words[0].data
 
 
 def test_the_status_tells_what_the_arm_does(monkeypatch, cell, recording):
@@ -617,7 +730,26 @@ def test_the_status_tells_what_the_arm_does(monkeypatch, cell, recording):
     assert session.state == 'the arm is moving'
     few = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
-    assert few[-1].data.startswith('0 samples')
+    assert few[-1].data == 'the arm is moving; 0 samples'
+
+
+def test_the_status_is_short_and_its_first_words_are_those_that_matter(
+    monkeypatch, cell, recording
+):
+    """The rest is in the diagnostics; `ros2 topic echo` cuts texts at 128 characters."""
+    words = cell.listen(String, 'calibration_node/status')
+    long = '; '.join(['the arm is moving', *(f'sample {k} of many words' for k in range(20))])
+    monkeypatch.setattr(CalibrationSession, 'status', lambda *arguments: long)
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: words and words[-1].data.startswith('the arm is moving; sample 0'))
+    assert 100 < len(words[-1].data) <= 120
+    assert words[-1].data.endswith(' ...')
+    cell.spin_until(lambda: heard and heard[-1].status[0].message.endswith(long))
+    trouble = 'samples are in memory only: ' + 'no space left on a device of a long name ' * 5
+    monkeypatch.setattr(Archive, 'trouble', f'{trouble}; ')
+    cell.spin_until(lambda: words[-1].data.startswith('samples are in memory only: '))
+    assert 100 < len(words[-1].data) <= 120
+    assert '...; the arm is moving' in words[-1].data
 
 
 def test_residual_markers_are_well_formed(cell, recording):
