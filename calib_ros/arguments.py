@@ -160,6 +160,22 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     return words
 
 
+def typed(command: Sequence[str]) -> list[str]:
+    """Return a command line of the node on which ROS takes text as it was typed.
+
+    ROS makes the number 10 of `-p serial:=0012`, and true of `-p serial:=yes`.
+    """
+    words = list(command)
+    for k in range(1, len(words)):
+        name, given, value = words[k].partition(':=')
+        parameter = PARAMETERS.get(name.rpartition(':')[2])  # NODE:NAME is for one node only
+        if not given or parameter is None or words[k - 1] not in ('-p', '--param'):
+            continue
+        if isinstance(parameter.default, str) and value[:1] not in ('"', "'", '!'):
+            words[k] = f'{name}:={_quoted(value)}'
+    return words
+
+
 def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str]) -> None:
     """Refuse launch arguments that do not exist: `ros2 launch` takes them and does nothing.
 

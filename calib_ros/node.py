@@ -40,7 +40,7 @@ from visualization_msgs.msg import MarkerArray
 
 from calib_ros import outgoing, report
 from calib_ros.archive import Archive
-from calib_ros.arguments import NODE, usage
+from calib_ros.arguments import NODE, typed, usage
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import CalibrationError, ConfigError
@@ -50,7 +50,7 @@ from calib_ros.inputs import Inputs, deserialised
 from calib_ros.intake import Stream, feed
 from calib_ros.keeper import Exportable, Keeper, Published
 from calib_ros.messages import JOINT_STATE
-from calib_ros.parameters import changed, declare_all, load_robot
+from calib_ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.problem import Problem
 from calib_ros.progress import Progress
 from calib_ros.samples import Sample, named
@@ -122,6 +122,7 @@ class CalibrationNode(Node):
         if given.resume:
             self._resume()
         self._inputs = Inputs(self, streams, self._guarded)
+        refuse_unknown(self)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         latched = QoSProfile(
@@ -461,7 +462,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
-    command = sys.argv if arguments is None else [NODE, *arguments]
+    command = typed(sys.argv if arguments is None else [NODE, *arguments])
     usage(NODE).parse_args(remove_ros_args(command)[1:])
     stop = threading.Event()
 

@@ -49,7 +49,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
 from calib_ros.archive import Archive
-from calib_ros.arguments import PARAMETERS
+from calib_ros.arguments import PARAMETERS, typed
 from calib_ros.config import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
@@ -309,8 +309,7 @@ def test_errors_are_answers(cell, recording):
 
 
 def test_answers_are_in_the_log_as_well(cell, recording):
-    told = cell.listen(Log, '/rosout', 1000)
-    cell.spin_until(lambda: told or cell.peer.get_publishers_info_by_topic('/rosout'))
+    told = cell.log()
 
     def said(name, answer, level):
         text = f'~/{name}: {answer.message}'
@@ -433,7 +432,7 @@ def test_the_calibration_is_published_again_after_a_restart(saved, named):
     path = sorted(folder.glob('*Z.yaml'))[0] if named else newest
     given = {'calibration_filename': path.name} if named else {'autoload': True}
     with Cell() as cell:
-        told = cell.listen(Log, '/rosout', 1000)
+        told = cell.log()
         node = cell.start(chain='ur10e', data_dir=str(folder), **given)
         texts = cell.listen(String, 'calibration_node/calibration')
         cell.spin_until(lambda: texts)
@@ -445,7 +444,7 @@ def test_the_calibration_is_published_again_after_a_restart(saved, named):
 def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
     folder, newest = saved
     with Cell() as cell:
-        told = cell.listen(Log, '/rosout', 1000)
+        told = cell.log()
         node = cell.start(chain='ur10e', data_dir=str(folder))
         cell.spin_until(lambda: any(str(newest) in each.msg for each in told))
         assert any('~/load' in each.msg for each in told)
@@ -466,7 +465,7 @@ def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
         path.write_text(content and dump_chain(load_chain('puma560')))
     given = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'calibration_filename': str(path)}
     with Cell() as cell:
-        told = cell.listen(Log, '/rosout', 1000)
+        told = cell.log()
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         node = cell.start(**given)
         cell.spin_until(lambda: any(said in m.msg and m.level == m.ERROR for m in told))
@@ -822,6 +821,7 @@ def test_the_parameter_file_holds_every_parameter_with_its_default(cell):
         ('sigma_position', -1.0, 'sigma_position'),
         ('sigma_position', 1, "expected 'Type.DOUBLE'"),
         ('folds', 1, 'folds'),
+        ('longest_stop', 0.1, 'must be shorter than longest_stop (0.1 s)'),
         ('mode', 'continuous', 'read-only'),
         ('joint_names', ['a'], 'read-only'),
         ('serial', 'A8', 'read-only'),
@@ -956,6 +956,10 @@ def test_signals_end_the_node_cleanly(tmp_path, number, executor):
         ({'sources': ['/pose', '/pose type=Range']}, 'named twice'),
         ({'max_gapp': 1.0}, 'did you mean "max_gap"'),
         ({'delay': 'none'}, 'parameter "delay" must be a number'),
+        ({'serial': 12}, 'must be text, not 12: write it in quotes'),
+        ({'model': True}, 'parameter "model" must be text, not True'),
+        ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
+        ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
     ],
 )
 def test_a_wrong_parameter_is_refused_at_the_start(tmp_path, parameters, said):
@@ -996,6 +1000,26 @@ def test_words_that_are_not_for_ros_are_refused(capsys):
         node_module.main(['--serial', '7', '--ros-args', '-p', 'chain:=ur10e'])
     assert caught.value.code == 2
     assert 'unrecognized arguments: --serial 7' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('word', 'meant'),
+    [('0012', '0012'), ('"0012"', '0012'), ("'1e5'", '1e5'), ('yes', 'yes'), ('A 7', 'A 7')],
+)
+def test_a_serial_number_is_text(word, meant):
+    words = typed(['node', '--ros-args', '-p', f'serial:={word}', '-p', 'folds:=4'])
+    assert words[-1] == 'folds:=4'
+    assert yaml.safe_load(words[3].partition(':=')[2]) == meant
+
+
+def test_leading_zeros_of_a_serial_number_are_kept(tmp_path):
+    with (
+        Cell() as cell,
+        Child(domain=cell.domain, chain='ur10e', serial='0012', data_dir=tmp_path),
+    ):
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        cell.spin_until(lambda: heard)
+        assert heard[0].status[0].hardware_id == '0012'
 
 
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):

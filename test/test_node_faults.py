@@ -611,7 +611,15 @@ def test_a_topic_of_another_type_is_told(cell):
 
 @pytest.mark.parametrize(
     ('policy', 'value', 'said'),
-    [('reliability', 'often', 'often'), ('depth', 0, 'must be >= 1')],
+    [
+        ('reliability', 'often', 'often'),
+        ('reliability', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('history', 'sometimes', 'sometimes'),
+        ('history', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('depth', 0, 'must be >= 1'),
+        ('reliabilty', 'reliable', r'did you mean .*/joint_states.subscription.reliability'),
+        ('durability', 'volatile', 'unknown parameter'),
+    ],
 )
 def test_a_qos_that_there_is_not_is_refused(tmp_path, policy, value, said):
     override = {f'qos_overrides./joint_states.subscription.{policy}': value}
@@ -688,6 +696,45 @@ def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, record
         missing = sent + 3001 - first - told()[0]
         flood()  # DDS may tell the rest of a loss with the next one only
         cell.spin_until(lambda: told()[1] >= missing)
+
+
+def test_what_dds_tells_of_losses_never_goes_below_zero():
+    """A total of -2147483645 came as 18446744071562067971 once."""
+    heard = inputs_module.Hearing()
+    for total, lost in (
+        (3, 3),
+        (2**64 - 2147483645, 3),
+        (2**64 - 2147483640, 8),
+        (5, 8),
+        (9, 12),
+        (9, 12),
+    ):
+        heard.note_lost(total)
+        assert heard.lost == lost
+
+
+def test_a_count_of_losses_goes_on_where_it_overflows():
+    heard = inputs_module.Hearing()
+    for total in (2**29, 2**30, 3 * 2**29, 2**31 - 1, 2**64 - 2**31, 2**64 - 2**31 + 2):
+        heard.note_lost(total)
+    assert heard.lost == 2**31 + 2
+
+
+def test_two_nodes_of_one_name_are_told(cell, tmp_path):
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    logged = cell.log()
+    said = '2 nodes are called /calibration_node'
+    cell.spin_until(lambda: heard)
+    assert said not in heard[-1].status[0].message
+    other = cell.start(chain='ur10e', data_dir=str(tmp_path / 'other'))
+    cell.spin_until(lambda: said in heard[-1].status[0].message)
+    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    cell.spin_until(lambda: any(said in each.msg for each in logged))
+    cell.executor.remove_node(other)
+    cell.nodes.remove(other)
+    assert other.close()
+    count = len(heard)
+    cell.spin_until(lambda: len(heard) > count and said not in heard[-1].status[0].message)
 
 
 # Requests that are too large

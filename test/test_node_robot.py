@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from rcl_interfaces.msg import Log
 from ros_cell import LATCHED, Cell, shift, topics, true_arm
 from std_msgs.msg import String
 
@@ -86,7 +85,7 @@ def test_a_table_is_exported_without_a_urdf(tmp_path):
 def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
     monkeypatch.setattr(parameters_module, 'DESCRIPTION_WAIT', 0.2)
     with Cell() as cell:
-        told = cell.listen(Log, '/rosout', 1000)
+        told = cell.log()
         with pytest.raises(ConfigError, match='no robot_description has come within'):
             cell.start(['__ns:=/cell_2'], chain='robot_description', data_dir=str(tmp_path))
         said = 'waiting for /cell_2/robot_description, 0.2 s at most'
