@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,9 +102,8 @@ def choose_effects(
         verdicts[group] = best
         chosen += groups[group]
     found = list(verdicts.values())
-    for number in range(1, MOST_HARMONICS + 1):
-        progress(f'harmonics: number {number}')
-        harmonic = model.strongest_harmonic(chosen)
+    for _ in range(MOST_HARMONICS):
+        harmonic = model.strongest_harmonic(chosen, progress)
         if harmonic is None:
             break
         verdict = model.judge(chosen, harmonic, f'{harmonic[0].replace(".sin_", ", ")} per turn')
@@ -188,7 +188,9 @@ class _Linear:
             pays = chance(self._shifts.shares(known, [self._moved(new)])[0]) < CHANCE
         return Verdict(what, found[0], found[1], bool(pays))
 
-    def strongest_harmonic(self, chosen: Sequence[str]) -> list[str] | None:
+    def strongest_harmonic(
+        self, chosen: Sequence[str], progress: Callable[[str], None]
+    ) -> list[str] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
         None where the strongest one of residuals moved in time often explains as much.
@@ -197,7 +199,11 @@ class _Linear:
         if self._shifts is None or not pairs:
             return None
         known = self._moved([*self._names, *chosen])
-        shares = self._shifts.shares(known, [self._moved(pair) for pair in pairs])
+        moved: list[Columns] = []
+        for joint, own in groupby(pairs, lambda pair: pair[0].partition('.')[0]):
+            progress(f'harmonics of {joint}')
+            moved += [self._moved(pair) for pair in own]
+        shares = self._shifts.shares(known, moved)
         if chance(shares.max(axis=0)) >= CHANCE:
             return None
         return list(pairs[int(np.argmax(shares[:, 0]))])

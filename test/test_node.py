@@ -527,7 +527,7 @@ def test_messages_are_taken_while_an_identification_runs(
         assert cell.call('identify').success
 
 
-STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics: number 1']
+STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
 
 
 @pytest.fixture
