@@ -9,6 +9,8 @@ and the node read the same list.
 
 from __future__ import annotations
 
+import argparse
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -51,12 +53,16 @@ BESIDE_SETTINGS = (
     ),
     Parameter('resume', False, 'go on with the newest journal of this robot'),
     Parameter(
+        'autoload', False, 'publish the newest saved calibration of this robot at the start'
+    ),
+    Parameter(
         'target_filename', '', 'file in data_dir that ~/save writes; default: a new one', False
     ),
     Parameter(
         'calibration_filename',
         '',
-        'file in data_dir that ~/load reads; default: the newest',
+        'file in data_dir that is published at the start and that ~/load reads; default: the '
+        'newest, by autoload or ~/load',
         False,
     ),
     Parameter('marker_scale', 200.0, 'residual vectors are drawn so many times as long', False),
@@ -106,6 +112,25 @@ def launch_arguments() -> dict[str, str]:
     return {**texts, **PLACED, **REMAPPED}
 
 
+def usage(program: str) -> argparse.ArgumentParser:
+    """Return a parser of what is not for ROS: of --help alone, which lists the parameters."""
+    lines = ['parameters:']
+    for each in PARAMETERS.values():
+        text = textwrap.fill(
+            _described(each), 90, initial_indent=' ' * 6, subsequent_indent=' ' * 6
+        )
+        lines += [f'  {each.name}{"" if each.fixed else " *"}', text]
+    lines += ['', '* can change while the node runs: ros2 param set /' + program + ' NAME VALUE']
+    return argparse.ArgumentParser(
+        prog=program,
+        usage='%(prog)s --ros-args -p chain:=ur10e [-p NAME:=VALUE ...] [--params-file FILE]',
+        description='Calibrates a robot from its joint states and measured poses. Services, '
+        'topics and files: docs/node.md',
+        epilog='\n'.join(lines),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def ros_arguments(given: Mapping[str, str]) -> list[str]:
     """Return ROS arguments of the node for launch arguments; those that are empty are not passed.
 
@@ -132,6 +157,22 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     for topic in REMAPPED:
         if given.get(topic):
             words += ['-r', f'{topic}:={given[topic]}']
+    return words
+
+
+def typed(command: Sequence[str]) -> list[str]:
+    """Return a command line of the node on which ROS takes text as it was typed.
+
+    ROS makes the number 10 of `-p serial:=0012`, and true of `-p serial:=yes`.
+    """
+    words = list(command)
+    for k in range(1, len(words)):
+        name, given, value = words[k].partition(':=')
+        parameter = PARAMETERS.get(name.rpartition(':')[2])  # NODE:NAME is for one node only
+        if not given or parameter is None or words[k - 1] not in ('-p', '--param'):
+            continue
+        if isinstance(parameter.default, str) and value[:1] not in ('"', "'", '!'):
+            words[k] = f'{name}:={_quoted(value)}'
     return words
 
 

@@ -16,6 +16,7 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -466,8 +467,13 @@ def _columns(names: Sequence[str], program: Program) -> list[int]:
     for name in names:
         if program.names.count(name) > 1:
             raise InputError(f'joint "{name}" comes twice in the program')
-        if name not in program.names:
-            raise UnknownNameError('joint in the program', name, program.names)
+    missing = [name for name in names if name not in program.names]
+    others = [name for name in program.names if name not in names]
+    if missing and others:
+        (strange,) = difflib.get_close_matches(missing[0], others, n=1, cutoff=0.0)
+        raise UnknownNameError('joint in the program', strange, names)
+    if missing:
+        raise InputError(f'the program has no values of {", ".join(missing)}')
     return [program.names.index(name) for name in names]
 
 

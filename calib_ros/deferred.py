@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
@@ -27,7 +28,8 @@ class DeferredTrigger:
     node : Node
     name : str
     answer : callable
-        Runs work and returns what it returns; makes an answer of an error.
+        Takes the name and work, which it runs; returns what that returns, or makes an answer of
+        an error.
     prepare : callable
         Runs on the executor's thread; returns the snapshot to work on.
     work : callable
@@ -39,11 +41,12 @@ class DeferredTrigger:
         self,
         node: Node,
         name: str,
-        answer: Callable[[Callable[[], Answer]], Answer],
+        answer: Callable[[str, Callable[[], Answer]], Answer],
         prepare: Callable[[], Any],
         work: Callable[[Any], Answer],
     ) -> None:
-        self._answer, self._prepare, self._work = answer, prepare, work
+        self._answer = partial(answer, name)
+        self._prepare, self._work = prepare, work
         self._thread: threading.Thread | None = None
         self._running = threading.Event()
         self._snapshot: list[Any] = []
@@ -58,12 +61,10 @@ class DeferredTrigger:
         return self._thread is None or not self._thread.is_alive()
 
     def _on_call(self, request: Any, response: Any) -> Any:
-        if self._running.is_set():
-            response.success = False
-            response.message = 'refused: the call before is still running, wait for its answer'
-            return response
 
         def prepare() -> Answer:
+            if self._running.is_set():
+                return False, 'refused: the call before is still running, wait for its answer'
             self._snapshot = [self._prepare()]
             return True, ''
 

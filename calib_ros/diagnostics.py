@@ -48,6 +48,7 @@ class Diagnostics:
         self._dropped_before: dict[str, int] = {}
         self._failed: dict[str, str] = {}
         self._logged: dict[str, str] = {}
+        self._alike = 1
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def tried(self, what: str, work: Callable[[], Any]) -> Any:
@@ -83,7 +84,7 @@ class Diagnostics:
 
     def _judged(self, account: Account) -> tuple[bytes, str]:
         """Return how grave what is wrong is, and what it is in words."""
-        wrong = self._inputs.troubles()
+        wrong = [*self._namesakes(), *self._inputs.troubles()]
         fresh = {
             cause: count
             for cause, count in account.dropped.items()
@@ -96,6 +97,22 @@ class Diagnostics:
         if self._archive.trouble:
             level = DiagnosticStatus.ERROR
         return level, ''.join([self._archive.trouble, *(f'{text}; ' for text in wrong)])
+
+    def _namesakes(self) -> list[str]:
+        """Return in words that there are other nodes of the same name; log it when they come."""
+        node = self._node
+        me = (node.get_name(), node.get_namespace())
+        count = node.get_node_names_and_namespaces().count(me)
+        before, self._alike = self._alike, count
+        if count < 2:
+            return []
+        words = (
+            f'{count} nodes are called {node.get_fully_qualified_name()}, and all of them answer '
+            'services: end one, or rename it (-r __node:=NAME)'
+        )
+        if before < 2:
+            node.get_logger().warning(f'{words}. One that was killed counts for some seconds')
+        return [words]
 
     def _figures(self, account: Account) -> dict[str, Any]:
         session = self._session

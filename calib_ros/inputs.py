@@ -28,6 +28,8 @@ from calib_ros.intake import Stream, links_of
 
 INPUT_QUEUE = 2000
 """Messages of a topic that may wait while the node is busy; what comes on top is lost."""
+MOST_LOST = 2**30
+"""Messages that may get lost between two reports of DDS: two weeks of 1 kHz."""
 SILENCE = 5.0
 """A source that has been heard before and is silent for so long [s] is reported."""
 
@@ -46,11 +48,24 @@ class Hearing:
     """True when it comes once and not again."""
     lost: int = 0
     """Messages that got lost on the way, as DDS tells by their numbers."""
+    told: int = 0
+    """The total of which DDS told last."""
     full: int = 0
     """How often the queue was found full, so that messages may be lost."""
     lost_before: int = 0
     losing: bool = False
     """True when either has grown between the last two looks."""
+
+    def note_lost(self, total: int) -> None:
+        """Count up to a total of lost messages; the change told with it leaves some out.
+
+        DDS counts with 32 bits, signed, and sometimes tells nonsense: a total that falls, or grows
+        by too many messages to be meant, is where it goes on from.
+        """
+        more = (total - self.told) % 2**32
+        self.told = total
+        if more < MOST_LOST:
+            self.lost += more
 
     def look(self, now: float, span: float) -> None:
         """Note how many messages came in the last `span`."""
@@ -166,7 +181,7 @@ class Inputs:
                 raw=True,
             )
         except RuntimeError as err:  # what rclpy raises for a policy that there is not
-            raise ConfigError(f'topic "{stream.topic}": {err}') from err
+            raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
         if subscription.qos_profile.depth < 1:
             raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
         return subscription, (stream, heard)
@@ -177,7 +192,7 @@ class Inputs:
             heard.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
 
         def note_lost(event: Any) -> None:
-            heard.lost = event.total_count  # the change leaves out what came with others
+            heard.note_lost(event.total_count)
 
         return SubscriptionEventCallbacks(
             incompatible_qos=self._guarded(note_deaf), message_lost=self._guarded(note_lost)

@@ -102,9 +102,15 @@ class Keeper:
             raise InputError('there is no accepted calibration to save: call ~/identify first')
         return self._archive.save(*self._published, self._named('target_filename'))
 
+    def at_start(self) -> tuple[Path | None, bool]:
+        """Return which calibration there is to load, and whether it shall be at the start."""
+        named = self._named('calibration_filename')
+        path = named or self._archive.newest_calibration()
+        return path, path is not None and (named is not None or self._given.autoload)
+
     def load(self) -> Path:
         """Take the calibration in `calibration_filename` or the newest one; return its path."""
-        path = self._named('calibration_filename') or self._archive.newest_calibration()
+        path, _ = self.at_start()
         session = self._session
         if path is None:
             raise InputError(

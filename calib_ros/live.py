@@ -16,6 +16,7 @@ has grown by a fifth: an early gross error is found, and what was left out wrong
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -60,6 +61,8 @@ FAR_OFF = 7.0
 """Distance [standard deviations] from which a sample is left out as suspicious."""
 LEAST_NOISE = 1e-3
 """Smallest noise [sigma given] that residuals are taken to show."""
+LOOKED_AT = 200
+"""Samples at which is looked whether the residuals are as small as the noise."""
 LOOK = 100
 """Configurations at which the accuracy is predicted."""
 LITTLE = 0.35
@@ -71,7 +74,10 @@ class Estimate:
     """What the samples so far tell.
 
     `sigma` is the RMS standard deviation [m] of positions predicted over the joint range, by the
-    noise that the residuals show, which is `noise` [sigma given].
+    noise that the residuals show, which is `noise` [sigma given]. `excess` is how many times
+    larger the residuals of positions are than what measurements scatter by: the sigma given, or
+    the spread at a stop where that is larger. It is None while too few samples show it; priors,
+    and nothing measured, make up much of the sigma then.
     """
 
     chain: Chain
@@ -80,6 +86,7 @@ class Estimate:
     samples: int
     sigma: float
     noise: float
+    excess: float | None
 
     def more_for(self, wanted: float) -> int:
         """Return how many more samples are expected to bring the sigma to a wanted one [m]."""
@@ -282,8 +289,29 @@ class LiveEstimate:
         variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
         sigma = float(np.sqrt(variance.mean()))
         return Estimate(
-            chain, self._names, covariance, len(self._added), sigma, float(np.sqrt(noise))
+            chain,
+            self._names,
+            covariance,
+            len(self._added),
+            sigma,
+            float(np.sqrt(noise)),
+            self._excess(chain) if self._enough(self._rows) else None,
         )
+
+    def _excess(self, chain: Chain) -> float:
+        """Return the RMS residual of positions in units of what measurements scatter by."""
+        chosen = np.linspace(0, len(self._added) - 1, LOOKED_AT).round().astype(int)
+        some = [self._added[k] for k in np.unique(chosen)]
+        total = 0.0
+        for members, each in self._groups(some):
+            left = residual_arrays(chain, each)[0]
+            scatter = np.full(len(each), self._sigmas[0] ** 2)
+            if each.covariance is not None:
+                own = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
+                scatter = np.where(np.isnan(own), scatter, own)
+            spread = np.array([sample.spread for sample in members])
+            total += float(((left**2).mean(axis=1) / np.maximum(scatter, spread**2)).sum())
+        return math.sqrt(total / len(some))
 
 
 def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:

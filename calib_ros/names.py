@@ -120,19 +120,15 @@ class FrameNames:
         return any(len(known) > 1 for known in self._known.values())
 
     @property
-    def different(self) -> str:
-        """Return in words that one device measured in different frames; empty when none did.
+    def different(self) -> tuple[str, ...]:
+        """Return the different frames in which one device measured; empty when none did.
 
         A few measurements in others do not count.
         """
         for known in self._known.values():
             if known.total() - max(known.values()) > FEW * known.total():
-                return (
-                    f'poses came in different frames ({", ".join(sorted(known))}), one is '
-                    'needed: set frame_id (--frame-id) to the one to use, or start again with a '
-                    'device of its own for each source'
-                )
-        return ''
+                return tuple(sorted(known))
+        return ()
 
 
 def strange(frame_id: str, usual: str) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import textwrap
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -32,23 +33,27 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
+from rclpy.utilities import remove_ros_args
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros import outgoing, report
 from calib_ros.archive import Archive
+from calib_ros.arguments import NODE, typed, usage
 from calib_ros.deferred import DeferredTrigger
 from calib_ros.diagnostics import Diagnostics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.guide import Guide
+from calib_ros.identification import Outlier
 from calib_ros.inputs import Inputs, deserialised
 from calib_ros.intake import Stream, feed, measured
 from calib_ros.keeper import Exportable, Keeper, Published
 from calib_ros.messages import JOINT_STATE
-from calib_ros.parameters import changed, declare_all, load_robot
+from calib_ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.problem import Problem
-from calib_ros.samples import Sample
+from calib_ros.progress import Progress
+from calib_ros.samples import Sample, named
 from calib_ros.selection import identify_model
 from calib_ros.session import CalibrationSession, check_settings
 from calib_ros.sources import STANDARD, parse_sources
@@ -64,6 +69,8 @@ TAKING_PERIOD = 0.1
 a time, each in a cold cache, they cost three times as much."""
 DIAGNOSTICS_PERIOD = 1.0
 JOIN_TIMEOUT = 1.0
+STATUS_LENGTH = 120
+"""Most characters of the status: `ros2 topic echo` cuts texts at 128."""
 
 
 class Snapshot(NamedTuple):
@@ -72,8 +79,19 @@ class Snapshot(NamedTuple):
     problem: Problem
     model: str
     samples: tuple[Sample, ...]
+    numbers: dict[Sample, int]
     origin: dict[str, Any]
     configuration: str
+
+    def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
+        """Return the numbers by which the operator knows the samples that are outliers."""
+        frames = named(self.samples)
+        known = {(each.stamp_ns, *frames.of(each)): self.numbers[each] for each in self.samples}
+        sets = self.problem.sets
+        return {
+            each: known[each.stamp_ns, sets[each.set].base, sets[each.set].tool]
+            for each in outliers
+        }
 
 
 class CalibrationNode(Node):
@@ -95,6 +113,7 @@ class CalibrationNode(Node):
             chain, given.settings, self._on_sample, self._archive.remove
         )
         self._last = 'nothing identified yet'
+        self._progress = Progress('identifying')
         self._observability = ''
         self._status_text = ''
         self.lost = ''
@@ -103,6 +122,7 @@ class CalibrationNode(Node):
         if given.resume:
             self._resume()
         self._inputs = Inputs(self, streams, self._guarded)
+        refuse_unknown(self)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         latched = QoSProfile(
@@ -130,6 +150,7 @@ class CalibrationNode(Node):
             self, '~/export', self._answer, self._to_export, self._keeper.export
         )
         for kind, name, callback in (
+            (Trigger, '~/cancel', self._on_cancel),
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/validate', self._on_validate),
@@ -138,13 +159,17 @@ class CalibrationNode(Node):
             (Trigger, '~/load', self._on_load),
             (SetBool, '~/record', self._on_record),
         ):
-            self.create_service(kind, name, self._answering(callback))
+            self.create_service(kind, name, self._answering(name, callback))
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
         for period, work in (
             (DIAGNOSTICS_PERIOD, self._on_second),
             (TAKING_PERIOD, self._on_tick),
         ):
             self.create_timer(period, self._guarded(work), clock=steady)
+        self._load_at_start()
+
+    def announce(self) -> None:
+        """Say that the node is ready, once an executor serves it."""
         self.get_logger().info(
             f'ready to calibrate {self.session.chain.name}: joints '
             f'{", ".join(self.session.joint_names)}; samples are kept in {self._archive.folder}'
@@ -247,6 +272,24 @@ class CalibrationNode(Node):
         if self._archive.journal is not None:
             self.get_logger().info(f'resumed {len(samples)} samples of {self._archive.journal}')
 
+    def _load_at_start(self) -> None:
+        """Publish the calibration of before if that is wanted, or say that there is one."""
+        path, wanted = self._keeper.at_start()
+        log = self.get_logger()
+        if wanted:
+            try:
+                log.info(f'{self._on_load(None)[1]}: it is published')
+            except Exception as err:  # whatever is wrong with a file, samples can be taken
+                self._last = f'no calibration is published at the start: {err}'
+                log.error(self._last)
+        elif path is not None:
+            log.info(
+                f'no calibration is published yet. There is {path}: call ~/load, or start with '
+                'autoload:=true'
+            )
+        elif self._given.autoload:
+            log.info(f'autoload: there is no saved calibration in {self._archive.folder} yet')
+
     # Services
 
     def _snapshot(self) -> Snapshot:
@@ -263,12 +306,16 @@ class CalibrationNode(Node):
             'journal': str(self._archive.journal or ''),
         }
         model = self.session.settings.model
-        return Snapshot(problem, model, samples, origin, self._configuration())
+        numbers = {sample: k + 1 for k, sample in enumerate(self.session.samples)}
+        found = Snapshot(problem, model, samples, numbers, origin, self._configuration())
+        self._progress.begin()
+        return found
 
     def _run(self, given: Snapshot) -> tuple[bool, str]:
         """Identify, on a thread of its own; publish only what is accepted."""
-        result = identify_model(given.problem, given.model)
-        self._last = report.summary(result)
+        with self._progress.running():
+            result = identify_model(given.problem, given.model, self._progress)
+        self._last = report.summary(result, given.numbers_of(result.outliers))
         self._observability = report.observability_in_words(result)
         self._residuals.publish(
             outgoing.residual_markers(
@@ -285,6 +332,9 @@ class CalibrationNode(Node):
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
+
+    def _on_cancel(self, request: Any) -> tuple[bool, str]:
+        return self._progress.cancel()
 
     def _on_capture(self, request: Any) -> tuple[bool, str]:
         count, why = self.session.capture()
@@ -341,9 +391,10 @@ class CalibrationNode(Node):
         self._diagnostics.publish(status)
 
     def _publish_status(self) -> str:
-        """Return how the session goes; the status is published when it has changed."""
-        words = self.session.status()
-        text = f'{self._archive.trouble}{words}'
+        """Return how the session goes; its first words are published when they have changed."""
+        words = self.session.status(str(self._progress))
+        trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
+        text = textwrap.shorten(f'{trouble} {words}', STATUS_LENGTH, placeholder=' ...')
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))
@@ -368,26 +419,32 @@ class CalibrationNode(Node):
 
         return guarded
 
-    def _answering(self, callback: Callable[[Any], tuple[bool, str]]) -> Callable[[Any, Any], Any]:
+    def _answering(
+        self, name: str, callback: Callable[[Any], tuple[bool, str]]
+    ) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
             def work() -> tuple[bool, str]:
                 self._take_messages()
                 return callback(request)
 
-            response.success, response.message = self._answer(work)
+            response.success, response.message = self._answer(name, work)
             return response
 
         return answer
 
-    def _answer(self, work: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
-        """Run the work of a service; an error is its answer."""
+    def _answer(self, name: str, work: Callable[[], tuple[bool, str]]) -> tuple[bool, str]:
+        """Run the work of a service; an error is its answer. Who reads the log sees it, too."""
         try:
             success, text = work()
         except (CalibrationError, OSError) as err:
-            return False, str(err)
+            success, text = False, str(err)
         except Exception as err:
             self.get_logger().error(f'internal error: {traceback.format_exc()}')
-            return False, f'internal error, see the log: {err!r}'
+            success, text = False, f'internal error, see the log: {err!r}'
+        if not success:
+            self.get_logger().warning(f'{name}: {text}')
+        elif text:
+            self.get_logger().info(f'{name}: {text}')
         return bool(success), str(text)
 
 
@@ -405,6 +462,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
+    command = typed(sys.argv if arguments is None else [NODE, *arguments])
+    usage(NODE).parse_args(remove_ros_args(command)[1:])
     stop = threading.Event()
 
     def on_signal(number: int, frame: Any) -> None:
@@ -419,11 +478,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     executor: Executor | None = None
     status, finished = 0, True
     try:
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
         node = CalibrationNode()
         executor = _executor(node.get_parameter('executor').value)
         handle_signals(on_signal)  # the events executor takes them when it is made
         executor.add_node(node)
+        node.announce()
         while not stop.is_set() and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
     except ExternalShutdownException:

@@ -26,6 +26,7 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.settings import STARTUP, Settings
 from calib_ros.urdf import chain_from_urdf
 
+QOS = 'qos_overrides.'
 DESCRIPTION_WAIT = 10.0
 """Time [s] for which the node waits for the robot's description."""
 
@@ -48,6 +49,7 @@ class Given:
     data_dir: Path | None
     allowed_folders: tuple[Path, ...]
     resume: bool
+    autoload: bool
     candidates: Path | None
     frames: FrameNames
     settings: Settings
@@ -67,7 +69,7 @@ def declare_all(node: Node) -> Given:
         for each in BESIDE_SETTINGS
     }
     settings = Settings(**{item.name: _declare_setting(node, item) for item in fields(Settings)})
-    _refuse_unknown(node)
+    refuse_unknown(node, QOS)
     if not own['chain']:
         raise ConfigError(
             'parameter "chain" is not set: give the chain file of the robot, for example '
@@ -80,6 +82,7 @@ def declare_all(node: Node) -> Given:
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
         resume=own['resume'],
+        autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
         settings=settings,
@@ -102,6 +105,8 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     name, links = given.chain, given.links
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        topic = node.resolve_topic_name('robot_description')
+        node.get_logger().info(f'waiting for {topic}, {DESCRIPTION_WAIT:g} s at most')
         found, message = wait_for_message(
             String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
         )
@@ -120,6 +125,17 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     return replace(chain_from_urdf(text, **links), base=None, tool=None), text
 
 
+def refuse_unknown(node: Node, later: str = f'{QOS}/clock.') -> None:
+    """Refuse parameters that were set but do not exist; ROS ignores them.
+
+    Names that begin with `later` are let pass: what they set comes into being later, or not.
+    """
+    known = [*node._parameters]
+    for name in node._parameter_overrides:
+        if name not in known and not name.startswith((later, 'use_sim_time')):
+            raise UnknownNameError('parameter', name, known)
+
+
 def _path(name: str) -> Path | None:
     return Path(name).expanduser() if name else None
 
@@ -128,6 +144,12 @@ def _declare(
     node: Node, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
 ) -> Any:
     descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
+    override = node._parameter_overrides.get(name)
+    if isinstance(default, str) and override and not isinstance(override.value, str):
+        raise ConfigError(
+            f'parameter "{name}" must be text, not {override.value!r}: write it in quotes, for '
+            f"""example {name}: '0012'"""
+        )
     if isinstance(default, tuple):  # an empty list has no type in ROS, [''] has one
         return _names(node.declare_parameter(name, [''], descriptor).value)
     return node.declare_parameter(name, default, descriptor).value
@@ -152,14 +174,6 @@ def _declare_setting(node: Node, item: Any) -> Any:
         description=text, read_only=fixed, floating_point_range=[span]
     )
     return node.declare_parameter(item.name, float(value), descriptor, ignore_override=True).value
-
-
-def _refuse_unknown(node: Node) -> None:
-    """Refuse parameters that were set but do not exist; ROS ignores them."""
-    known = [*node._parameters]
-    for name in node._parameter_overrides:
-        if name not in known and not name.startswith(('qos_overrides.', 'use_sim_time')):
-            raise UnknownNameError('parameter', name, known)
 
 
 def _names(values: Sequence[str] | None) -> tuple[str, ...]:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import datetime, timezone
 from typing import Any
@@ -18,26 +18,35 @@ from calib_ros.calibration import Calibration
 from calib_ros.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.config import dump_chain, dump_yaml, nominal_record
 from calib_ros.escapes import in_markdown
-from calib_ros.identification import Identification, Noise
+from calib_ros.identification import Identification, Noise, Outlier
 from calib_ros.region import Region
 from calib_ros.settings import Settings
 from calib_ros.validation import Comparison, ErrorFigures, Parameter
 
 HOLDS = 1.5
 """A calibration whose error on new samples has grown by more does not hold."""
+MOST_OUTLIERS = 5
+"""Outliers that an answer names."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
 
 
-def summary(result: Identification) -> str:
-    """Return the one line that an operator reads."""
+def summary(result: Identification, numbers: Mapping[Outlier, int] | None = None) -> str:
+    """Return the one line that an operator reads.
+
+    With the `numbers` of the samples that are outliers these are named.
+    """
     before, after = (result.validation or result.fitted).figures
     text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
     if result.outliers:
-        text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+        if numbers is None:
+            text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+        else:
+            named = _outliers_in_words(result.outliers, numbers)
+            text += f'; {len(result.outliers)} outliers carry no weight: {named}'
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
         text += f'; with {len(result.chain.effects)} effects ({", ".join(groups)})'
@@ -56,6 +65,18 @@ def summary(result: Identification) -> str:
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
+
+
+def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
+    """Return the numbers and stamps [s] of outliers, the largest first."""
+    largest = sorted(outliers, key=lambda each: -each.size)
+    words = [
+        f'sample {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
+        for each in largest[:MOST_OUTLIERS]
+    ]
+    if len(largest) > MOST_OUTLIERS:
+        words.append(f'and {len(largest) - MOST_OUTLIERS} more')
+    return ', '.join(words)
 
 
 def weakly_determined(result: Identification) -> tuple[str, ...]:

@@ -14,8 +14,9 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,10 @@ MOST_HARMONICS = 24
 SUBSET = 3000
 
 
+def _unheard(stage: str) -> None:
+    """Tell nobody which stage begins."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """The effects that pay for themselves, and the verdicts on all that were tried."""
@@ -52,24 +57,32 @@ class Selection:
     verdicts: tuple[Verdict, ...]
 
 
-def identify_model(problem: Problem, model: str) -> Identification:
+def identify_model(
+    problem: Problem, model: str, progress: Callable[[str], None] = _unheard
+) -> Identification:
     """Identify with the errors that `model` names; `auto` chooses by cross-validation.
 
-    A choice that cannot be fitted leaves the geometric result, with the verdicts.
+    A choice that cannot be fitted leaves the geometric result, with the verdicts. `progress` is
+    called with each stage that begins; what it raises ends the work.
     """
+    progress(f'model {"geometric" if model == "auto" else model}')
     result = identify(problem)
     if model != 'auto':
         return result
-    selection = choose_effects(problem, result)
+    selection = choose_effects(problem, result, progress)
     if selection.effects:
+        progress(f'model with {len(selection.effects)} effects')
         richer = identify(replace(problem, effects=selection.effects), result)
         if richer.converged:
             result = richer
     return replace(result, verdicts=selection.verdicts)
 
 
-def choose_effects(problem: Problem, geometric: Identification) -> Selection:
+def choose_effects(
+    problem: Problem, geometric: Identification, progress: Callable[[str], None] = _unheard
+) -> Selection:
     """Choose the effects for a problem from its geometric result."""
+    progress('effects')
     model = _Linear(problem, geometric)
     chosen: list[str] = []
     verdicts: dict[str, Verdict] = {}
@@ -78,6 +91,7 @@ def choose_effects(problem: Problem, geometric: Identification) -> Selection:
         tried = []
         for group, names in groups.items():
             if names and not set(names) <= set(chosen):
+                progress(f'effects: {group}')
                 tried.append((model.judge(chosen, names, group), group))
         if not tried:
             break
@@ -91,7 +105,7 @@ def choose_effects(problem: Problem, geometric: Identification) -> Selection:
         chosen += groups[group]
     found = list(verdicts.values())
     for _ in range(MOST_HARMONICS):
-        harmonic = model.strongest_harmonic(chosen)
+        harmonic = model.strongest_harmonic(chosen, progress)
         if harmonic is None:
             break
         verdict = model.judge(chosen, harmonic, f'{harmonic[0].replace(".sin_", ", ")} per turn')
@@ -178,7 +192,9 @@ class _Linear:
             pays = chance(self._shifts.shares(known, [self._moved(new)])[0]) < CHANCE
         return Verdict(what, found[0], found[1], bool(pays))
 
-    def strongest_harmonic(self, chosen: Sequence[str]) -> list[str] | None:
+    def strongest_harmonic(
+        self, chosen: Sequence[str], progress: Callable[[str], None]
+    ) -> list[str] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
         None where the strongest one of residuals moved in time often explains as much.
@@ -187,7 +203,11 @@ class _Linear:
         if self._shifts is None or not pairs:
             return None
         known = self._moved([*self._names, *chosen])
-        shares = self._shifts.shares(known, [self._moved(pair) for pair in pairs])
+        moved: list[Columns] = []
+        for joint, own in groupby(pairs, lambda pair: pair[0].partition('.')[0]):
+            progress(f'harmonics of {joint}')
+            moved += [self._moved(pair) for pair in own]
+        shares = self._shifts.shares(known, moved)
         if chance(shares.max(axis=0)) >= CHANCE:
             return None
         return list(pairs[int(np.argmax(shares[:, 0]))])

@@ -42,6 +42,13 @@ LOOK_AGAIN_NS = 2_000_000_000
 """Time between two looks for the delay."""
 SILENT_NS = 5_000_000_000
 """Time after which joints of which nothing is heard, while others are, count as silent."""
+ONE_FRAME = (
+    'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
+    'its own for each source'
+)
+NOT_NOISE = 3.0
+"""RMS residual [what measurements scatter by] from which it is no noise, and more samples would
+average nothing: chance alone does not reach it with the fewest samples of which it is told."""
 LEAST_FAR = 1.0
 """Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
 what has not come yet; joint states up to `max_gap` apart belong together."""
@@ -419,7 +426,9 @@ class CalibrationSession:
     @property
     def _different(self) -> str:
         """Return in words that one device measured in different frames, if it matters."""
-        return '' if self.settings.frame_id else self._frames.different
+        if self.settings.frame_id or not self._frames.different:
+            return ''
+        return f'poses came in different frames ({", ".join(self._frames.different)})'
 
     @property
     def state(self) -> str:
@@ -431,8 +440,8 @@ class CalibrationSession:
         missing = [self.joint_names[k] for k in track.missing]
         if missing and self._names.foreign:
             return (
-                f'waiting for joint states of {", ".join(missing)}; those that come name '
-                f'{", ".join(self._names.foreign)}: set joint_names?'
+                f'waiting for joint states, set joint_names? Those that come name '
+                f'{", ".join(self._names.foreign)}, not {", ".join(missing)}'
             )
         return self._collector.state()
 
@@ -467,48 +476,72 @@ class CalibrationSession:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what an engineer should know about the measurements."""
-        return tuple(filter(None, (self._different, self._disagreement)))
+        found = []
+        if self._different:
+            found.append(f'{self._different}, {ONE_FRAME}')
+        delay = self._disagreement
+        if delay is not None:
+            left = delay - self.settings.delay
+            words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
+            found.append(
+                f'measurements are stamped {words} than the joint states of their time: '
+                f'set delay to {delay:.3f}, or make the clocks agree'
+            )
+        return tuple(found)
 
     @property
-    def _disagreement(self) -> str:
-        """Return in words that the clocks do not agree; empty when they do."""
+    def _disagreement(self) -> float | None:
+        """Return the delay that the motion shows [s], if it spoils stops."""
         if self.delay is None or self.settings.mode == 'continuous':
-            return ''  # there it is a parameter of the fit
+            return None  # there it is a parameter of the fit
         left = self.delay.seconds - self.settings.delay
-        if -EARLY <= left <= self.settings.settle:
-            return ''  # no stop is spoilt by it
-        words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
-        return (
-            f'measurements are stamped {words} than the joint states of their time: '
-            f'set delay to {self.delay.seconds:.3f}, or make the clocks agree'
-        )
+        return None if -EARLY <= left <= self.settings.settle else self.delay.seconds
 
     @property
     def estimate(self) -> Estimate | None:
         """Return what the samples so far tell; None while they are too few."""
         return self._live.update(self.usable)
 
-    def status(self) -> str:
-        """Return in words how far the samples have come."""
+    def status(self, work: str = '') -> str:
+        """Return in words what the arm does, what else goes on, and how far the samples are.
+
+        What an operator must know or do comes first: who has room for a line only cuts the rest.
+        `work` is what goes on besides.
+        """
         fitted = [sample for sample in self.usable if not sample.validation]
-        words = [f'{len(fitted)} samples']
         estimate = self.estimate
-        wanted = self.settings.wanted_accuracy
-        if estimate is not None:
-            more = estimate.more_for(wanted)
-            words.append(f'{1e3 * estimate.sigma:.3f} mm expected')
-            if more:
-                words.append(f'{more} more expected for {1e3 * wanted:g} mm')
-            else:
-                words.append('enough for the accuracy wanted')
+        words = [self.state, work]
+        if self._different:
+            words.append(f'{self._different}: set frame_id')
+        if self._disagreement is not None:
+            words.append(f'stamps disagree: set delay to {self._disagreement:.3f}')
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
             words.append(f'sample {number} does not fit to the others, was the target moved?')
+        counted = f'{len(fitted)} samples'
+        if estimate is not None:
+            counted += f', {1e3 * estimate.sigma:.3f} mm expected, {self._forecast(estimate)}'
+        words.append(counted)
         if fitted:
             still = barely_moved(self.chain, np.array([sample.joints for sample in fitted]))
             if still:
                 words.append(f'hardly moved so far: {", ".join(still)}')
-        return '; '.join([', '.join(words), *self.warnings, self.state])
+        return '; '.join(filter(None, words))
+
+    def _forecast(self, estimate: Estimate) -> str:
+        """Return in words what it takes until positions are known as well as wanted."""
+        wanted = self.settings.wanted_accuracy
+        more = estimate.more_for(wanted)
+        if not more:
+            return 'enough for the accuracy wanted'
+        if estimate.excess is None:
+            return 'too few to tell how many it takes'
+        if estimate.excess > NOT_NOISE:
+            advice = 'is the target firm? More'
+            if self.settings.model == 'geometric':
+                advice = 'set model to auto, more'
+            return f'{advice} will not help: what is left is {estimate.excess:.0f} x noise'
+        return f'{more} more expected for {1e3 * wanted:g} mm'
 
     # Identification
 
@@ -525,7 +558,7 @@ class CalibrationSession:
         self._collector.flush()
         self._take()
         if self._different:
-            raise InputError(self._different)
+            raise InputError(f'{self._different}, {ONE_FRAME}')
         self._leave_out_strange()
         return self.problem_of(self.usable)
 

@@ -136,6 +136,13 @@ class Settings:
                 raise ConfigError(f'{item.name} must be a finite number, not {value}')
             if lower is not None and value < lower:
                 raise ConfigError(f'{item.name} must be at least {lower}, not {value}')
+        for name in ('shortest_stop', 'settle'):
+            value = getattr(self, name)
+            if value >= self.longest_stop:
+                raise ConfigError(
+                    f'{name} ({value:g} s) must be shorter than longest_stop '
+                    f'({self.longest_stop:g} s): else no stop is ever sampled'
+                )
 
 
 def _check_list(name: str, entries: Sequence[str]) -> None:

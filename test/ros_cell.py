@@ -32,6 +32,7 @@ from geometry_msgs.msg import (
     Vector3,
 )
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -145,6 +146,11 @@ class Cell:
         heard = []
         self.peer.create_subscription(kind, topic, heard.append, qos)
         return heard
+
+    def log(self):
+        """Return what nodes log, also before they are discovered."""
+        qos = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        return self.listen(Log, '/rosout', qos)
 
     def publisher(self, kind, topic, reliability=ReliabilityPolicy.RELIABLE):
         """Return a publisher that somebody listens to."""

@@ -14,7 +14,7 @@ MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__i
 
 ORDER = [
     {'errors'},
-    {'escapes', 'files', 'mcap', 'se3', 'texts'},
+    {'escapes', 'files', 'mcap', 'progress', 'se3', 'texts'},
     {'effects', 'values'},
     {'description'},
     {'chain', 'settings'},

@@ -622,6 +622,23 @@ def test_joints_are_found_by_name_and_others_are_left_alone():
     np.testing.assert_array_equal(program.positions, mixed)
 
 
+@pytest.mark.parametrize('joint', UR.joint_names)
+@pytest.mark.parametrize('rename', [lambda name: name.removesuffix('_joint'), lambda name: 'a'])
+def test_the_unknown_joint_is_that_of_the_program(joint, rename):
+    """Not the one of the arm that it is without; an axis of something else is in no one's way."""
+    names = [rename(name) if name == joint else name for name in UR.joint_names]
+    values = np.zeros((2, 6))
+    with pytest.raises(UnknownNameError, match='unknown joint in the program') as caught:
+        compensate_program(Compensator(UR, UR), Program(tuple(names), values))
+    assert caught.value.name == rename(joint)
+    assert caught.value.alternatives == UR.joint_names
+
+
+def test_a_joint_that_a_program_lacks_is_named():
+    with pytest.raises(InputError, match='no values of wrist_3_joint'):
+        compensate_program(Compensator(UR, UR), Program(UR.joint_names[:5], np.zeros((2, 5))))
+
+
 @pytest.mark.parametrize(
     ('change', 'error', 'complaint'),
     [

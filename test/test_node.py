@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy: what it hears, keeps, answers and publishes."""
 
+import queue
 import signal
 import threading
 from dataclasses import replace
@@ -19,6 +20,7 @@ from geometry_msgs.msg import (
     TransformStamped,
 )
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Log
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental import EventsExecutor
@@ -46,7 +48,9 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros import node as node_module
-from calib_ros.config import calibration_record, load_chain, parse_chain
+from calib_ros.archive import Archive
+from calib_ros.arguments import PARAMETERS, typed
+from calib_ros.config import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.errors import CalibrationError
 from calib_ros.identification import identify
 from calib_ros.replay import replay, write_bag
@@ -305,6 +309,21 @@ def test_errors_are_answers(cell, recording):
     assert '2 measured configurations are too few, at least 5' in few.message
 
 
+def test_answers_are_in_the_log_as_well(cell, recording):
+    told = cell.log()
+
+    def said(name, answer, level):
+        text = f'~/{name}: {answer.message}'
+        cell.spin_until(lambda: (text, level) in [(each.msg, each.level) for each in told])
+
+    for name in ('identify', 'export', 'capture', 'remove_last', 'validate', 'save', 'load'):
+        said(name, cell.call(name), Log.WARN)
+    said('record', cell.call('record', SetBool.Request(data=True)), Log.INFO)
+    cell.play(topics(recording))
+    for name in ('identify', 'export', 'save', 'load', 'remove_last', 'clear'):
+        said(name, cell.call(name), Log.INFO)
+
+
 def test_record_remove_last_and_clear(cell, recording):
     joints, poses = topics(recording).values()
     assert cell.call('record', SetBool.Request(data=False)).success
@@ -395,6 +414,68 @@ def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, re
             assert (cell.node.session.calibration is not None) == loads
 
 
+@pytest.fixture(scope='module')
+def saved(tmp_path_factory, recording):
+    """Return a folder in which two calibrations are saved, and the path of the newest."""
+    folder = tmp_path_factory.mktemp('saved')
+    with Cell(chain='ur10e', data_dir=str(folder)) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        assert cell.call('save').success
+        assert cell.call('save').success
+    *_, newest = sorted(folder.glob('*Z.yaml'))
+    return folder, newest
+
+
+@pytest.mark.parametrize('named', [True, False])
+def test_the_calibration_is_published_again_after_a_restart(saved, named):
+    folder, newest = saved
+    path = sorted(folder.glob('*Z.yaml'))[0] if named else newest
+    given = {'calibration_filename': path.name} if named else {'autoload': True}
+    with Cell() as cell:
+        told = cell.log()
+        node = cell.start(chain='ur10e', data_dir=str(folder), **given)
+        texts = cell.listen(String, 'calibration_node/calibration')
+        cell.spin_until(lambda: texts)
+        assert texts[0].data == path.read_text()
+        assert node.session.calibration.world_frame == 'tracker'
+        cell.spin_until(lambda: any(f'loaded {path}' in each.msg for each in told))
+
+
+def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
+    folder, newest = saved
+    with Cell() as cell:
+        told = cell.log()
+        node = cell.start(chain='ur10e', data_dir=str(folder))
+        cell.spin_until(lambda: any(str(newest) in each.msg for each in told))
+        assert any('~/load' in each.msg for each in told)
+        assert node.session.calibration is None
+
+
+@pytest.mark.parametrize(
+    ('content', 'said'),
+    [(None, 'there is no file'), ('', 'is not a calibration'), ('puma', 'joints')],
+)
+def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
+    monkeypatch, tmp_path, recording, content, said
+):
+    """A node that did not start would take no samples, and a respawned one gives up."""
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    path = tmp_path / 'of_before.yaml'
+    if content is not None:
+        path.write_text(content and dump_chain(load_chain('puma560')))
+    given = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'calibration_filename': str(path)}
+    with Cell() as cell:
+        told = cell.log()
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        node = cell.start(**given)
+        cell.spin_until(lambda: any(said in m.msg and m.level == m.ERROR for m in told))
+        cell.spin_until(lambda: heard and said in values_of(heard[-1])['last identification'])
+        assert node.session.calibration is None
+        cell.play(topics(recording), node=node)
+        assert cell.call('identify').success
+
+
 def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording):
     """Whatever has been changed since."""
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
@@ -416,7 +497,7 @@ def test_messages_are_taken_while_an_identification_runs(
 ):
     release, problems = threading.Event(), []
 
-    def slow(problem, model):
+    def slow(problem, model, progress):
         problems.append(problem)
         assert release.wait(20.0)
         return identify(problem)
@@ -447,10 +528,120 @@ def test_messages_are_taken_while_an_identification_runs(
         assert cell.call('identify').success
 
 
+STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
+
+
+@pytest.fixture
+def stages(monkeypatch):
+    """Let identifications of model auto wait at each stage; return a queue that lets them go."""
+    release, reached = queue.Queue(), []
+    identify_model = node_module.identify_model
+
+    def slow(problem, model, progress):
+        def at(stage):
+            progress(stage)
+            reached.append(stage)
+            release.get(timeout=20.0)
+
+        return identify_model(problem, model, at)
+
+    monkeypatch.setattr(node_module, 'identify_model', slow)
+    return release, reached
+
+
+def test_the_status_names_the_stage_of_an_identification(monkeypatch, tmp_path, recording, stages):
+    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+    release, reached = stages
+    with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
+        words = cell.listen(String, 'calibration_node/status')
+        cell.play(topics(recording))
+        running = cell.start_call('identify')
+        for stage in STAGES[:2]:
+            cell.spin_until(lambda now=stage: f's ({now}); ' in words[-1].data)
+            assert '; identifying for ' in words[-1].data
+            release.put(None)
+        for _ in range(100):
+            release.put(None)
+        cell.spin_until(running.done)
+        assert running.result().success, running.result().message
+        assert set(STAGES) <= set(reached)
+        cell.spin_until(lambda: 'identifying' not in words[-1].data)
+
+
+@pytest.mark.parametrize('stage', range(3))
+def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stages, stage):
+    release, reached = stages
+    with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
+        none = cell.call('cancel')
+        assert not none.success
+        assert 'nothing to cancel' in none.message
+        cell.play(topics(recording))
+        texts = cell.listen(String, 'calibration_node/calibration')
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
+        cell.spin_until(lambda: texts)
+        good = cell.node.session.calibration
+        while not release.empty():
+            release.get()
+        reached.clear()
+        running = cell.start_call('identify')
+        for _ in range(stage):
+            release.put(None)
+        cell.spin_until(lambda: len(reached) == stage + 1)
+        answer = cell.call('cancel')
+        assert answer.success
+        assert f'({reached[-1]})' in answer.message
+        release.put(None)
+        cell.spin_until(running.done)
+        assert not running.result().success
+        assert f'cancelled after the stage "{reached[-1]}"' in running.result().message
+        assert len(reached) == stage + 1
+        assert cell.node.session.calibration is good
+        assert len(texts) == 1
+        assert len(cell.node.session.samples) == STOPS
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
+
+
+def test_a_result_that_was_cancelled_at_last_is_not_published(monkeypatch, cell, recording):
+    release, running = threading.Event(), threading.Event()
+
+    def slow(problem, model, progress):
+        result = identify(problem)
+        running.set()
+        assert release.wait(20.0)
+        return result
+
+    monkeypatch.setattr(node_module, 'identify_model', slow)
+    cell.play(topics(recording))
+    answer = cell.start_call('identify')
+    cell.spin_until(running.is_set)
+    assert cell.call('cancel').success
+    release.set()
+    cell.spin_until(answer.done)
+    assert not answer.result().success
+    assert 'cancelled' in answer.result().message
+    assert cell.node.session.calibration is None
+
+
+def test_outliers_are_named_by_number_and_stamp(cell, recording):
+    some = pose_messages(recording.poses)
+    for message in some[24:28]:
+        message.pose.position.z += 0.02
+    cell.play(topics(recording, measured_pose=some))
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    sample = cell.node.session.samples[6]
+    stamp = f'{sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d}'
+    assert f'1 outliers carry no weight: sample 7 ({stamp})' in answer.message
+
+
 def test_clear_while_an_identification_runs(monkeypatch, cell, recording):
     release, problems = threading.Event(), []
 
-    def slow(problem, model):
+    def slow(problem, model, progress):
         problems.append(problem)
         assert release.wait(20.0)
         return identify(problem)
@@ -524,8 +715,9 @@ def test_diagnostics_status_and_corrected_pose(monkeypatch, tmp_path, recording,
         assert float(values['age of /measured_pose [s]']) < 20.0
         words = cell.listen(String, 'calibration_node/status')
         cell.spin_until(lambda: words)
-        assert words[0].data.startswith(f'{STOPS} samples, 0.0')
-        assert 'enough for the accuracy wanted; the arm' in words[0].data
+        assert words[0].data.startswith('the arm ')
+        assert f'; {STOPS} samples, 0.0' in words[0].data
+        assert 'enough for the accuracy wanted' in words[0].data
 
 
 def test_the_status_tells_what_the_arm_does(monkeypatch, cell, recording):
@@ -538,7 +730,26 @@ def test_the_status_tells_what_the_arm_does(monkeypatch, cell, recording):
     assert session.state == 'the arm is moving'
     few = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
-    assert few[-1].data.startswith('0 samples')
+    assert few[-1].data == 'the arm is moving; 0 samples'
+
+
+def test_the_status_is_short_and_its_first_words_are_those_that_matter(
+    monkeypatch, cell, recording
+):
+    """The rest is in the diagnostics; `ros2 topic echo` cuts texts at 128 characters."""
+    words = cell.listen(String, 'calibration_node/status')
+    long = '; '.join(['the arm is moving', *(f'sample {k} of many words' for k in range(20))])
+    monkeypatch.setattr(CalibrationSession, 'status', lambda *arguments: long)
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: words and words[-1].data.startswith('the arm is moving; sample 0'))
+    assert 100 < len(words[-1].data) <= 120
+    assert words[-1].data.endswith(' ...')
+    cell.spin_until(lambda: heard and heard[-1].status[0].message.endswith(long))
+    trouble = 'samples are in memory only: ' + 'no space left on a device of a long name ' * 5
+    monkeypatch.setattr(Archive, 'trouble', f'{trouble}; ')
+    cell.spin_until(lambda: words[-1].data.startswith('samples are in memory only: '))
+    assert 100 < len(words[-1].data) <= 120
+    assert '...; the arm is moving' in words[-1].data
 
 
 def test_residual_markers_are_well_formed(cell, recording):
@@ -611,6 +822,7 @@ def test_the_parameter_file_holds_every_parameter_with_its_default(cell):
         ('sigma_position', -1.0, 'sigma_position'),
         ('sigma_position', 1, "expected 'Type.DOUBLE'"),
         ('folds', 1, 'folds'),
+        ('longest_stop', 0.1, 'must be shorter than longest_stop (0.1 s)'),
         ('mode', 'continuous', 'read-only'),
         ('joint_names', ['a'], 'read-only'),
         ('serial', 'A8', 'read-only'),
@@ -745,6 +957,10 @@ def test_signals_end_the_node_cleanly(tmp_path, number, executor):
         ({'sources': ['/pose', '/pose type=Range']}, 'named twice'),
         ({'max_gapp': 1.0}, 'did you mean "max_gap"'),
         ({'delay': 'none'}, 'parameter "delay" must be a number'),
+        ({'serial': 12}, 'must be text, not 12: write it in quotes'),
+        ({'model': True}, 'parameter "model" must be text, not True'),
+        ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
+        ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
     ],
 )
 def test_a_wrong_parameter_is_refused_at_the_start(tmp_path, parameters, said):
@@ -765,7 +981,46 @@ def test_a_wrong_parameter_ends_the_node_with_one_clear_line(parameters, said):
     with Child(**parameters) as child:
         assert child.end() == 1
         assert said in child.output
+        assert 'ready' not in child.output
         assert 'Traceback' not in child.output
+
+
+def test_help_names_every_parameter_and_starts_nothing(capsys):
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--help'])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    for name in PARAMETERS:
+        assert f'\n  {name}' in out
+    assert '--ros-args -p chain:=ur10e' in out
+
+
+def test_words_that_are_not_for_ros_are_refused(capsys):
+    """ROS ignores them."""
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--serial', '7', '--ros-args', '-p', 'chain:=ur10e'])
+    assert caught.value.code == 2
+    assert 'unrecognized arguments: --serial 7' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('word', 'meant'),
+    [('0012', '0012'), ('"0012"', '0012'), ("'1e5'", '1e5'), ('yes', 'yes'), ('A 7', 'A 7')],
+)
+def test_a_serial_number_is_text(word, meant):
+    words = typed(['node', '--ros-args', '-p', f'serial:={word}', '-p', 'folds:=4'])
+    assert words[-1] == 'folds:=4'
+    assert yaml.safe_load(words[3].partition(':=')[2]) == meant
+
+
+def test_leading_zeros_of_a_serial_number_are_kept(tmp_path):
+    with (
+        Cell() as cell,
+        Child(domain=cell.domain, chain='ur10e', serial='0012', data_dir=tmp_path),
+    ):
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        cell.spin_until(lambda: heard)
+        assert heard[0].status[0].hardware_id == '0012'
 
 
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):

@@ -158,7 +158,7 @@ os.fsync = slow
 SLOW_IDENTIFICATION = """
 import time
 from calib_ros import node
-def identify_model(problem, model):
+def identify_model(problem, model, progress):
     print('identifying', flush=True)
     time.sleep(60.0)
 node.identify_model = identify_model
@@ -254,7 +254,7 @@ def test_the_first_run_of_an_account_loses_nothing(
         with cell_and_child(**given) as (cell, child):
             status = cell.listen(String, '/calibration_node/status')
             cell.play(part(recording, 0.0, 12.0))
-            cell.spin_until(lambda: status and status[-1].data.startswith('10 samples'))
+            cell.spin_until(lambda: status and '; 10 samples' in status[-1].data)
             if number == signal.SIGKILL:
                 child.kill()
             else:
@@ -461,7 +461,7 @@ def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
         message.pose.position.z += 0.02
     words = cell.listen(String, 'calibration_node/status')
     cell.play(part(recording, 0.0, 20.0))
-    cell.spin_until(lambda: words and words[-1].data.startswith('18 samples'))
+    cell.spin_until(lambda: words and '; 18 samples' in words[-1].data)
     assert 'fit' not in words[-1].data
     joints = topics(recording)['joint_states'][1000:]
     cell.play({'joint_states': joints, 'measured_pose': some[80:]})
@@ -542,15 +542,17 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     if not all_renamed:
         names = [*recording.joint_names[:5], 'tool0']
     words = cell.listen(String, 'calibration_node/status')
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     cell.play(topics(recording, joint_states=joint_messages(recording, names)))
     answer = cell.call('identify')
     assert not answer.success
     assert 'set joint_names' in answer.message
     assert names[5] in answer.message
-    cell.spin_until(lambda: words and 'waiting for joint states of' in words[-1].data)
+    said = 'waiting for joint states, set joint_names? Those that come name '
+    cell.spin_until(lambda: words and words[-1].data.startswith(said))
     missing = recording.joint_names if all_renamed else recording.joint_names[5:]
-    assert f'waiting for joint states of {", ".join(missing)};' in words[-1].data
-    assert names[5] in words[-1].data
+    whole = f'{said}{", ".join(sorted(names))}, not {", ".join(missing)}; '
+    cell.spin_until(lambda: whole in heard[-1].status[0].message)
 
 
 def test_broken_messages_are_counted_by_cause(cell, recording):
@@ -609,7 +611,15 @@ def test_a_topic_of_another_type_is_told(cell):
 
 @pytest.mark.parametrize(
     ('policy', 'value', 'said'),
-    [('reliability', 'often', 'often'), ('depth', 0, 'must be >= 1')],
+    [
+        ('reliability', 'often', 'often'),
+        ('reliability', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('history', 'sometimes', 'sometimes'),
+        ('history', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('depth', 0, 'must be >= 1'),
+        ('reliabilty', 'reliable', r'did you mean .*/joint_states.subscription.reliability'),
+        ('durability', 'volatile', 'unknown parameter'),
+    ],
 )
 def test_a_qos_that_there_is_not_is_refused(tmp_path, policy, value, said):
     override = {f'qos_overrides./joint_states.subscription.{policy}': value}
@@ -686,6 +696,45 @@ def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, record
         missing = sent + 3001 - first - told()[0]
         flood()  # DDS may tell the rest of a loss with the next one only
         cell.spin_until(lambda: told()[1] >= missing)
+
+
+def test_what_dds_tells_of_losses_never_goes_below_zero():
+    """A total of -2147483645 came as 18446744071562067971 once."""
+    heard = inputs_module.Hearing()
+    for total, lost in (
+        (3, 3),
+        (2**64 - 2147483645, 3),
+        (2**64 - 2147483640, 8),
+        (5, 8),
+        (9, 12),
+        (9, 12),
+    ):
+        heard.note_lost(total)
+        assert heard.lost == lost
+
+
+def test_a_count_of_losses_goes_on_where_it_overflows():
+    heard = inputs_module.Hearing()
+    for total in (2**29, 2**30, 3 * 2**29, 2**31 - 1, 2**64 - 2**31, 2**64 - 2**31 + 2):
+        heard.note_lost(total)
+    assert heard.lost == 2**31 + 2
+
+
+def test_two_nodes_of_one_name_are_told(cell, tmp_path):
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    logged = cell.log()
+    said = '2 nodes are called /calibration_node'
+    cell.spin_until(lambda: heard)
+    assert said not in heard[-1].status[0].message
+    other = cell.start(chain='ur10e', data_dir=str(tmp_path / 'other'))
+    cell.spin_until(lambda: said in heard[-1].status[0].message)
+    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    cell.spin_until(lambda: any(said in each.msg for each in logged))
+    cell.executor.remove_node(other)
+    cell.nodes.remove(other)
+    assert other.close()
+    count = len(heard)
+    cell.spin_until(lambda: len(heard) > count and said not in heard[-1].status[0].message)
 
 
 # Requests that are too large

@@ -84,8 +84,12 @@ def test_a_table_is_exported_without_a_urdf(tmp_path):
 
 def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
     monkeypatch.setattr(parameters_module, 'DESCRIPTION_WAIT', 0.2)
-    with Cell() as cell, pytest.raises(ConfigError, match='no robot_description has come within'):
-        cell.start(chain='robot_description', data_dir=str(tmp_path))
+    with Cell() as cell:
+        told = cell.log()
+        with pytest.raises(ConfigError, match='no robot_description has come within'):
+            cell.start(['__ns:=/cell_2'], chain='robot_description', data_dir=str(tmp_path))
+        said = 'waiting for /cell_2/robot_description, 0.2 s at most'
+        cell.spin_until(lambda: said in [each.msg for each in told])
 
 
 def test_links_belong_to_a_urdf(tmp_path):

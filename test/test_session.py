@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import itertools
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -200,7 +201,7 @@ def test_targets_that_were_measured_once_are_left_out():
     ]
     made = session(junk[:150], good, junk[150:])
     assert [len(each) for each in made.problem().sets] == [20]
-    assert made.status().startswith('20 samples')
+    assert '; 20 samples' in made.status()
     assert made.identify().accepted
     left_out = 'samples left out, in another frame or of a target measured once'
     assert made.account().notes[left_out] == 300
@@ -449,14 +450,34 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
 
 def test_the_status_tells_how_far_it_is():
     made = session(samples(6))
-    assert made.status().startswith('6 samples')
-    assert 'waiting for joint states' in made.status()
+    assert made.status().startswith('waiting for joint states; 6 samples, ')
+    assert 'too few to tell how many it takes' in made.status()
+    assert 'more' not in made.status()
     made.restore(samples(60, start=100))
     assert 'mm expected' in made.status()
     made.change(replace(made.settings, wanted_accuracy=1e-2))
     assert 'enough for the accuracy wanted' in made.status()
     made.change(replace(made.settings, wanted_accuracy=1e-6))
     assert 'more expected for 0.001 mm' in made.status()
+
+
+@pytest.mark.parametrize(
+    ('model', 'advice'),
+    [('geometric', 'set model to auto, more'), ('ratio', 'is the target firm? More')],
+)
+def test_no_forecast_where_what_is_left_is_not_noise(rng, model, advice):
+    """Errors that the model lacks do not average out."""
+    given = [
+        replace(each, position=each.position + 1e-3 * np.sin(7.0 * each.joints[:3]))
+        for each in samples(60)
+    ]
+    made = session(given, loss='none', model=model)
+    assert re.search(rf'{re.escape(advice)} will not help: what is left is 1\d x', made.status())
+    assert 'expected for' not in made.status()
+    made.change(replace(made.settings, sigma_position=1e-3))  # it is the noise of the device
+    assert 'more expected for 0.1 mm' in made.status()
+    as_noisy = session([replace(each, spread=1e-3) for each in given], loss='none', model=model)
+    assert 'more expected for 0.1 mm' in as_noisy.status()
 
 
 def test_the_status_names_a_sample_that_does_not_fit():
@@ -486,18 +507,21 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
             made.take_joints(joint_state(stamp, UR5E.joint_names[4:], [0.0] * 2))
         if k == 600:
             assert 'the arm stands' in made.status()
-    assert made.status().endswith(
+    assert made.status().startswith(
         'nothing can be sampled: no joint states of wrist_2_joint, wrist_3_joint come any more'
     )
 
 
 def test_the_status_is_never_an_error():
     only_judging = session(samples(10, validation=True))
-    assert only_judging.status().startswith('0 samples')
+    assert '; 0 samples' in only_judging.status()
     (one,) = samples(1)
     same_place = session([replace(one, stamp_ns=k) for k in range(1, 20)])
-    assert same_place.status().startswith('19 samples')
-    assert CalibrationSession(UR5E).status().startswith('0 samples')
+    assert '; 19 samples' in same_place.status()
+    assert '; 0 samples' in CalibrationSession(UR5E).status()
+    assert CalibrationSession(UR5E).status('identifying') == (
+        'waiting for joint states; identifying; 0 samples'
+    )
 
 
 def test_identifying_nothing_says_what_came():
