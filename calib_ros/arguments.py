@@ -46,12 +46,12 @@ BESIDE_SETTINGS = (
     Parameter('executor', 'events', 'events or single_threaded: how messages are taken'),
     Parameter('serial', '', 'serial number of the robot, for the record'),
     Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
+    Parameter('resume', False, 'go on with the newest journal of this robot'),
     Parameter(
         'allowed_folders',
         (),
         'folders in which ~/save and ~/load may use files besides data_dir; default: none',
     ),
-    Parameter('resume', False, 'go on with the newest journal of this robot'),
     Parameter(
         'autoload', False, 'publish the newest saved calibration of this robot at the start'
     ),

@@ -128,9 +128,9 @@ class _Linear:
         self._names = geometric.names
         posterior = geometric.posterior
         priors = {n: s for n, s in posterior.priors.items() if n in self._names}
-        learned = Learned(priors, geometric.noise.size)
-        problem = replace(problem, learned=learned)
-        self._problem, self._sizes = problem, posterior.sizes
+        self._noise, self._sizes = geometric.noise.size, posterior.sizes
+        problem = replace(problem, learned=Learned(priors, self._noise))
+        self._problem = problem
         judged = np.split(
             geometric.fitted.judged, np.cumsum([len(each) for each in problem.sets])[:-1]
         )
@@ -245,12 +245,13 @@ class _Linear:
         whole = columns.T @ columns + extra.T @ extra
         gradient = columns.T @ self._residual + extra.T @ offset
         folds = dealing[self._owner]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))  # a fold may hold all of it
         for fold in range(self._problem.folds):
             inside = folds == fold
             part = columns[inside]
-            matrix = whole - part.T @ part
-            scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-            scaled = matrix * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+            scaled = (whole - part.T @ part) * np.outer(scale, scale) + ROUNDING * np.eye(
+                len(scale)
+            )
             factor = linalg.cho_factor(scaled)
             right = gradient - part.T @ self._residual[inside]
             weights = scale * linalg.cho_solve(factor, scale * right)
@@ -270,15 +271,14 @@ class _Linear:
 
         Effects may be as large as usual, or as large as the data show.
         """
-        prior = self._system.prior
-        assert prior is not None
+        sigmas = self._problem.prior_sigmas
         found = np.zeros(len(names))
         for k, name in enumerate(names):
-            size = prior.sigmas.get(name, 0.0)
+            size = sigmas.get(name, 0.0)
             if name not in self._names:
                 group = str(group_of(self._chain, name))
                 size = max(effects.expected(name), self._sizes.get(group, 0.0))
-            found[k] = prior.noise / size if size else 0.0
+            found[k] = self._noise / size if size else 0.0
         return found
 
 

@@ -62,7 +62,8 @@ def transforms(message):
 
 
 def test_nothing_is_published_and_tf2_msgs_not_needed_without_names(monkeypatch):
-    monkeypatch.setitem(sys.modules, 'tf2_msgs', None)
+    for name in ('tf2_msgs', 'tf2_msgs.msg'):
+        monkeypatch.setitem(sys.modules, name, None)
     with Cell(chain='ur10e') as cell:
         topics = {
             name

@@ -448,7 +448,7 @@ def identified(monkeypatch):
         problem = Problem(load_chain('ur5e'), measured(seed=seed))
         result, settings = identify(problem), Settings(folds=seed)
         text = report.configuration_yaml('ur5e', settings)
-        return result, {'samples': label}, (f'of {label}',), text
+        return result, {'samples': label}, (f'of {label}',), text, ''
 
     monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
     monkeypatch.setattr(report, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: '')))
