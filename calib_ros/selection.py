@@ -62,8 +62,9 @@ def identify_model(
 ) -> Identification:
     """Identify with the errors that `model` names; `auto` chooses by cross-validation.
 
-    A choice that cannot be fitted leaves the geometric result, with the verdicts. `progress` is
-    called with each stage that begins; what it raises ends the work.
+    A choice that cannot be fitted, or is refused where the geometric result is not, leaves that
+    one, with the verdicts and a remark. `progress` is called with each stage that begins; what it
+    raises ends the work.
     """
     progress(f'model {"geometric" if model == "auto" else model}')
     result = identify(problem)
@@ -73,7 +74,13 @@ def identify_model(
     if selection.effects:
         progress(f'model with {len(selection.effects)} effects')
         richer = identify(replace(problem, effects=selection.effects), result)
-        if richer.converged:
+        reasons = () if richer.converged else ('its fit has not converged',)
+        if result.accepted:
+            reasons = reasons or richer.refusals
+        if reasons:
+            remark = f'the richer model is not used, because {"; ".join(reasons)}'
+            result = replace(result, remarks=(*result.remarks, remark))
+        else:
             result = richer
     return replace(result, verdicts=selection.verdicts)
 
