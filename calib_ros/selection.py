@@ -74,7 +74,9 @@ def identify_model(
     if selection.effects:
         progress(f'model with {len(selection.effects)} effects')
         richer = identify(replace(problem, effects=selection.effects), result)
-        reasons = () if richer.converged else ('its fit has not converged',)
+        reasons: tuple[str, ...] = ()
+        if not richer.converged:
+            reasons = ('its fit has not converged',)
         if result.accepted:
             reasons = reasons or richer.refusals
         if reasons:
