@@ -23,7 +23,7 @@ from calib_ros.report import as_document, calibration_yaml, summary
 from calib_ros.selection import identify_model
 from calib_ros.simulation import Cell, faulty, measure, random_frame
 
-EXAMPLES = int(os.environ.get('AWKWARD', '40'))
+EXAMPLES = int(os.environ.get('AWKWARD', '30'))
 MOST = 40
 """Poses of a design."""
 POSITIONER = Chain(
@@ -52,7 +52,7 @@ def designs(draw):
     still = draw(st.lists(number(0, len(chain.joints) - 1), max_size=3))
     q[:, still] = home[still]
     q += draw(st.sampled_from([0.0, 0.0, 1e-6, 3e-4])) * rng.normal(size=q.shape)
-    step = draw(st.sampled_from([0.0, 0.0, 1e-3, 0.1]))
+    step = draw(st.sampled_from([0.0, 0.0, 1e-3, 0.01]))
     commanded = np.round(q / step) * step if step else q
     if draw(flag):  # one stop, measured again and again
         q[count // 2 :], commanded[count // 2 :] = q[0], commanded[0]
