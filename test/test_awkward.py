@@ -118,3 +118,12 @@ def test_any_design_ends_with_a_result_or_an_error_that_explains(problem):
     assert summary(result)
     assert as_document(result, {})
     assert calibration_yaml(result)
+
+
+def test_a_design_that_determines_no_parameter_of_the_arm():
+    """Nothing but frames is fitted, and nothing has a prior."""
+    rng = np.random.default_rng(0)
+    q = np.column_stack([np.full(3, 0.1), [-1.4, -2.9, 2.5]])
+    result = identify_model(Problem(POSITIONER, measured(POSITIONER, q, 'pose', 1.0, rng)), 'auto')
+    assert all(POSITIONER.owns_frame(name) for name in result.names)
+    assert not result.accepted
