@@ -11,6 +11,7 @@ import os
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
@@ -127,3 +128,16 @@ def test_a_design_that_determines_no_parameter_of_the_arm():
     result = identify_model(Problem(POSITIONER, measured(POSITIONER, q, 'pose', 1.0, rng)), 'auto')
     assert all(POSITIONER.owns_frame(name) for name in result.names)
     assert not result.accepted
+
+
+@pytest.mark.parametrize('noise', [0.0, 1.0])
+@pytest.mark.parametrize('robot', ROBOTS[1:4], ids=lambda chain: chain.name)
+def test_a_target_seen_once_in_sweeps(robot, noise):
+    """The fold with its only pose holds all that its frame knows."""
+    rng = np.random.default_rng(0)
+    true = faulty(robot, Cell(), rng)
+    q = joints_of(robot, 'sweeps', 24, rng)
+    other = replace(true, tool=random_frame(rng, 0.2))
+    once = replace(measured(other, q[:1], 'pose', noise, rng), tool='second')
+    problem = Problem(robot, measured(true, q, 'pose', noise, rng), more=[once])
+    assert identify_model(problem, 'auto').verdicts
