@@ -35,6 +35,8 @@ STEP_TOLERANCE = 1e-6
 larger, in RMS residuals)."""
 PATIENCE = 3
 """Steps in succession that may raise the cost before they are damped."""
+MOST_ITERATIONS = 1000
+"""Iterations after which a fit that still progresses is given up; curved valleys need 400."""
 STALLED = 50
 """Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
 LEAST_FALL = 1e-3
@@ -399,7 +401,7 @@ def minimise(
     names: Sequence[str],
     system: System,
     tolerance: float = STEP_TOLERANCE,
-    iterations: float = np.inf,
+    iterations: int = MOST_ITERATIONS,
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 

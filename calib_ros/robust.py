@@ -152,6 +152,8 @@ def reweighted(
         fit = minimise(chain, names, system, tolerance=1e-3)
         chain, iterations = fit.chain, iterations + fit.iterations
         distances = judged(chain)
+        if not fit.converged:  # nor will the next one
+            break
     fit = minimise(chain, names, system)
     return Robust(fit, distances, settled, iterations + fit.iterations, loss)
 
