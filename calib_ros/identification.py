@@ -17,11 +17,11 @@ import numpy as np
 from scipy import special
 
 from calib_ros import effects, identifiability, suspicions
-from calib_ros.chain import FRAME_KINDS, Chain, is_length
+from calib_ros.chain import FRAME_KINDS, Chain
 from calib_ros.chance import chance_of_gain
 from calib_ros.differential import ErrorModel
 from calib_ros.errors import InputError, TooFewObservationsError
-from calib_ros.evidence import TYPICAL, Posterior, considered, posterior_of
+from calib_ros.evidence import Posterior, considered, posterior_of
 from calib_ros.frames import start_frames
 from calib_ros.leastsquares import System, minimise, triangular_factor
 from calib_ros.misfits import arms_own
@@ -414,14 +414,14 @@ def _weak(problem: Problem, parameters: Sequence[Parameter]) -> tuple[str, ...]:
     if problem.learned is None:
         return ()
     known, learned = {*dict(problem.model.effects), *problem.given}, problem.learned.priors
-    found = []
-    for p in parameters:
-        if p.std is not None and p.name in learned and p.name not in known:
-            untold = max(learned[p.name], TYPICAL['length' if is_length(p.name) else 'angle'])
-            alone = p.std**-2 - learned[p.name] ** -2  # what the poses tell without the prior
-            if alone < untold**-2:
-                found.append(p.name)
-    return tuple(found)
+    return tuple(
+        p.name
+        for p in parameters
+        if p.std is not None
+        and p.name in learned
+        and p.name not in known
+        and p.std**2 > 0.5 * learned[p.name] ** 2
+    )
 
 
 def _some(observations: Observations) -> Observations:

@@ -481,7 +481,8 @@ def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
     record = {'accepted': True, 'nominal': nominal_record(nominal)}
     (tmp_path / 'calibration.yaml').write_text(calibrated_text(nominal, record))
     for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
-        found = load_calibration(path, nominal)
+        found, read = load_calibration(path, nominal)
+        assert read == record
         assert found.joints[1].a == pytest.approx(nominal.joints[1].a + 1e-3, abs=1e-12)
 
 

@@ -127,14 +127,14 @@ def test_data_without_noise_stay_exact():
 @pytest.mark.parametrize('seed', range(3))
 def test_effects_neither_shown_nor_possible_are_of_no_size(seed):
     found = identify(problem_of(arm(seed), spread(seed), seed))
-    for group in ('drive', 'bending'):
+    for group in ('drive', 'gravity'):
         assert found.posterior.sizes[group] < 0.01 * TYPICAL[group]
 
 
 @pytest.mark.parametrize('seed', range(3))
 def test_effects_that_the_data_cannot_show_are_of_usual_size(seed):
     found = identify(problem_of(arm(seed), spread(seed, 0.15), seed))
-    for group in ('drive', 'bending'):
+    for group in ('drive', 'gravity'):
         assert 0.2 < found.posterior.sizes[group] / TYPICAL[group] < 2.0
 
 

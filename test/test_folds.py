@@ -47,7 +47,7 @@ def test_neighbours_along_a_path_are_no_repeats(count, rng):
 
 
 @pytest.mark.parametrize('kind', ['repeats', 'targets', 'test'])
-def test_a_healthy_arm_that_bends_gains_nothing_on_what_was_fitted(kind):
+def test_an_arm_that_bends_is_not_judged_on_what_was_fitted(kind):
     for seed in range(6):
         rng = np.random.default_rng(seed)
         true = arm(rng, errors=0.0, unmodelled=True)
@@ -61,12 +61,22 @@ def test_a_healthy_arm_that_bends_gains_nothing_on_what_was_fitted(kind):
             more.append(replace(measure(other, q, rng, *NOISE), tool=f'tool_{k}'))
         held_out = measure(true, q, rng, *NOISE) if kind == 'test' else None
         problem = Problem(UR10E, seen, more=more, held_out=held_out, **SIGMAS)
-        result = identify(problem)
-        assert not result.accepted
-        if kind == 'test':
-            assert result.validated_by.endswith('because all held-out samples are at such')
-        if kind == 'targets':
-            assert not identify_model(problem, 'auto').chain.effects
+        for result in (identify(problem), identify_model(problem, 'auto')):
+            if result.accepted:  # as far as it may be used the arm, which does bend, gains by it
+                assert gain(result, true, rng) > 1.0
+            if kind == 'test':
+                assert result.validated_by.endswith('because all held-out samples are at such')
+
+
+def gain(result, true, rng):
+    """Return the RMS error of the nominal arm over that of a calibration, in its region."""
+    inside = UR10E.random_joints(2000, rng)
+    inside = inside[result.region.covers(inside)]
+    before, after = (
+        np.linalg.norm((chain.forward(inside) - true.forward(inside))[:, :3, 3])
+        for chain in (result.before, result.chain)
+    )
+    return before / after
 
 
 def test_held_out_samples_at_fitted_configurations_decide_nothing(rng):
@@ -85,10 +95,10 @@ def test_held_out_samples_at_fitted_configurations_decide_nothing(rng):
 
 @pytest.mark.parametrize('design', ['sweep', 'grid'])
 def test_rounded_joint_values_are_no_gain(design):
-    """Joint values are known to 1 mrad; the arm is as drawn, or off by 0.1 mm and 0.2 mrad."""
+    """Joint values are known to 1 mrad; the arm is as drawn, or off by 0.5 mm and 1 mrad."""
     healthy, found = 0, 0
     for seed in range(8):
-        for errors in (0.0, 0.2):
+        for errors in (0.0, 1.0):
             rng = np.random.default_rng(seed)
             true = arm(rng, errors)
             if design == 'grid':
