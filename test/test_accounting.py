@@ -84,7 +84,7 @@ plans = st.fixed_dictionaries(
         'pose_buffer': st.sampled_from([1, 5, 10_000]),
         'delay': st.sampled_from([0.0, 0.1, -0.1]),
     }
-)
+).filter(lambda plan: plan['shortest_stop'] < plan['longest_stop'])  # others are refused
 traffic = st.fixed_dictionaries(
     {
         'seed': st.integers(0, 2**32 - 1),
