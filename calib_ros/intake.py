@@ -125,14 +125,15 @@ def feed(
     while begin < len(batch):
         stop = min(begin + WINDOW, len(batch))
         window = [group.between(begin, stop) for group in groups]
-        eventful = alone[begin:stop].copy()
+        window = [group for group in window if len(group.places)]
+        eventful = (begin + np.flatnonzero(alone[begin:stop])[:1]).tolist()
         for group in window:
             if isinstance(group.readings, JointReadings):
                 quiet = session.uneventful(group.readings, among=stop - begin)
             elif group.stream.source is not None:
                 quiet = session.uneventful_poses(group.stream.source, group.readings.stamps_ns)
-            eventful[group.places[~quiet] - begin] = True  # a message may measure several things
-        end = begin + int(eventful.argmax()) if eventful.any() else stop
+            eventful += group.places[~quiet][:1].tolist()
+        end = min(eventful, default=stop)
         try:
             _keep(session, [group.between(begin, end) for group in window])
             if end < stop:

@@ -675,12 +675,11 @@ class CalibrationSession:
         """Note stamps that go backwards among messages that came at some positions."""
         if not parts:
             return
-        stamps = np.concatenate([each for _, each in parts])
-        stamps = stamps[np.argsort(np.concatenate([where for where, _ in parts]))]
+        (stamps,) = _in_order(parts)
         last = stamps[-1] - (self._delay_ns if stream == POSES else 0)
         self._gate.passed(stream, int(last))
-        newest = np.maximum.accumulate(np.append(self._newest[stream], stamps))
-        back = int((stamps < newest[:-1]).sum())
+        newest = np.maximum(np.maximum.accumulate(stamps), self._newest[stream])
+        back = int((stamps < newest).sum())
         if back:
             self._notes[f'{stream} with a stamp older than the one before'] += back
         self._newest[stream] = int(newest[-1])
@@ -719,15 +718,17 @@ def _stream(source: Source, frame_id: str, child: str, distance: bool) -> Stream
     )
 
 
-def _in_order(
-    parts: Sequence[tuple[Positions, Stamps, FloatArray]],
-) -> tuple[Stamps, FloatArray]:
-    """Return stamps and rows of numbers of several streams in the order in which they came."""
-    order = np.argsort(np.concatenate([where for where, _, _ in parts]))
-    stamps = np.concatenate([each for _, each, _ in parts])
-    return stamps[order], np.concatenate([rows for _, _, rows in parts])[order]
+def _in_order(parts: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    """Return stamps, say, and rows of numbers of streams in the order in which they came."""
+    if len(parts) == 1:  # in order already
+        return parts[0][1:]
+    where, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(where)
+    return tuple(column[order] for column in columns)
 
 
 def _padded(rows: FloatArray, width: int) -> FloatArray:
     missing = width - rows.shape[1]
+    if not missing:
+        return rows
     return np.pad(rows, ((0, 0), (0, missing)), constant_values=np.nan)

@@ -93,7 +93,9 @@ class Gate(Generic[Item]):
         """Return (M,) which messages of a stream would pass, and free none that is held back."""
         if kind not in self._last or self.held(kind):
             return np.zeros(len(times), dtype=bool)
-        found = np.abs(np.diff(times, prepend=self._last[kind])) <= self._far_ns
+        before = np.empty_like(times)
+        before[:1], before[1:] = self._last[kind], times[:-1]
+        found = np.abs(times - before) <= self._far_ns
         for each in self._held:
             found &= np.abs(times - each.time_ns) > self._far_ns
         return np.asarray(found)
