@@ -218,15 +218,20 @@ def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
 
 def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
     return InputError(
-        f'the bag has no {what} of type {" or ".join(types)}; it holds {_contents(available)}'
+        f'the bag has no {what} ({", ".join(map(_short, types))}); it holds {_contents(available)}'
     )
+
+
+def _short(kind: str) -> str:
+    """Return the name of a type without its package."""
+    return kind.rpartition('/')[2]
 
 
 def _contents(available: Mapping[str, str]) -> str:
     own = outputs(available)
     return (
         ', '.join(
-            f'{t} (of the calibration node itself)' if t in own else f'{t} ({kind})'
+            f'{t} (own output)' if t in own else f'{t} ({_short(kind)})'
             for t, kind in sorted(available.items())
         )
         or 'nothing'

@@ -73,7 +73,7 @@ def test_outputs_that_are_all_there_is_are_told(tmp_path):
     path = record(tmp_path / 'bag', [*events, *standing([])])
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
-    assert '/calibration_node/corrected_pose (of the calibration node itself)' in str(caught.value)
+    assert '/calibration_node/corrected_pose (own output)' in str(caught.value)
 
 
 @pytest.mark.parametrize(
