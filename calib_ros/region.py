@@ -31,7 +31,7 @@ from calib_ros.leastsquares import BLOCK
 from calib_ros.observations import Observations
 from calib_ros.se3 import FloatArray
 
-RISK = 0.007
+RISK = 0.01
 """Probability at which a calibration may make the arm worse over the poses of a shell."""
 DRAWN = 200
 """Random configurations that stand for the range of the joints."""
