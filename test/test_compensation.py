@@ -709,7 +709,7 @@ def test_the_command_line_says_how_well_the_orientation_is_known(run, tmp_path, 
     true = UR_TRUE.with_frame('tool', Frame(se3.transform(np.eye(3), np.array([0, 0, 0.01]))))
     seen = measure(true, UR.random_joints(60, rng), rng, 1e-4, 3e-4, oriented=oriented)
     # what the data tell of the size of errors would do for the orientation, too
-    priors = {} if oriented else {'*_joint.*': 1.0}
+    priors = {} if oriented else {'*_joint.*': 0.1}
     found = identify(Problem(UR, seen, sigma_position=1e-4, priors=priors))
     folder = tmp_path / 'result'
     folder.mkdir()

@@ -231,7 +231,8 @@ def test_a_camera_on_the_flange_and_a_draw_wire_as_sources(tmp_path, recording, 
     seen = poses.inverted()
     lengths = np.linalg.norm(poses.positions - [0.5, 0.2, -0.3], axis=1)
     sources = ['camera/target type=PoseStamped eye_in_hand=true target=board', 'wire type=Range']
-    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'sources': sources}
+    noise = {'sigma_position': 2e-5, 'sigma_orientation': 1e-4}
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'sources': sources, **noise}
     with Cell(**parameters) as cell:
         cell.play(
             {
