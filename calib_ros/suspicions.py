@@ -36,10 +36,10 @@ from calib_ros.config import load_chain, shipped_robots
 from calib_ros.differential import ErrorModel
 from calib_ros.identifiability import excited
 from calib_ros.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.observations import Observations
 from calib_ros.problem import Problem
 from calib_ros.robust import SUSPICIOUS
 from calib_ros.se3 import FloatArray
-from calib_ros.simulation import measure
 
 if TYPE_CHECKING:
     from calib_ros.identification import Identification
@@ -170,7 +170,8 @@ def _sister(problem: Problem, result: Identification) -> str:
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     """Return the RMS distance [m] of two arms' targets at (N, n), in the best base and tool."""
-    poses = measure(found, joints, np.random.default_rng(0))
+    exact = found.forward(joints)
+    poses = Observations.from_arrays(joints, exact[:, :3, 3], exact[:, :3, :3])
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
     names = [f'{frame}.{kind}' for frame in ('base', 'tool') for kind in FRAME_KINDS]
     system = System((Samples(poses, 1e-4, 1e-4 / 0.3),))

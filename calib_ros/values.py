@@ -8,9 +8,9 @@ import math
 import re
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.se3 import FloatArray
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
@@ -55,7 +55,7 @@ def parse_name(value: object, where: str) -> str:
 
 def parse_numbers(
     value: object, count: int, where: str, error: type[CalibrationError] = ConfigError
-) -> FloatArray:
+) -> NDArray[np.float64]:
     """Return so many finite numbers (count,) from YAML; `where` names them in the error."""
     if not isinstance(value, list) or len(value) != count:
         raise error(f'{where} must be a list of {count} numbers, not {value!r}')
@@ -84,7 +84,7 @@ def cell_integer(text: str, where: str) -> int:
     return number
 
 
-def covariance_fault(covariance: FloatArray) -> str:
+def covariance_fault(covariance: NDArray[np.float64]) -> str:
     """Return what is wrong with a covariance (6, 6) of a measured pose; empty when nothing is.
 
     Zeros alone mean that none was measured. Zeros in all that concerns the rotation mean that it
