@@ -25,8 +25,8 @@ lint: $(VENV)/installed
 # The oldest versions that setup.py allows, on the Python of Ubuntu 24.04; not part of CI.
 OLDEST_PYTHON ?= python3.12
 OLDEST := .venv-oldest
-OLDEST_TESTS ?= $(addprefix test/test_,cli.py config.py export.py identification.py mcap.py \
-	node.py packaging.py replay.py session.py tables.py urdf.py without_rosbags.py)
+OLDEST_TESTS ?= test/cli test/files test/kinematics test/identification/test_identification.py \
+	test/sampling/test_session.py test/ros/test_node.py test/test_packaging.py
 
 oldest: $(OLDEST)/installed
 	$(OLDEST)/bin/python -m pytest $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)

@@ -4,7 +4,7 @@
 
 from glob import glob
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 NAME = 'calib_ros'
 # What builds messages; the wheels do not name all that they need of one another.
@@ -24,7 +24,7 @@ setup(
     license='Apache-2.0',
     maintainer='calib_ros maintainers',
     maintainer_email='maintainers@calib-ros.invalid',
-    packages=[NAME],
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
     python_requires='>=3.10',
     # The lower bounds are those of Ubuntu 24.04; `make oldest` runs with exactly these.
     install_requires=[
@@ -73,8 +73,8 @@ setup(
     zip_safe=True,
     entry_points={
         'console_scripts': [
-            'calib_ros = calib_ros.cli:main',
-            'calibration_node = calib_ros.node:main',
+            'calib_ros = calib_ros.cli.main:main',
+            'calibration_node = calib_ros.ros.node:main',
         ]
     },
 )

@@ -32,13 +32,13 @@ from peers import CACHE, environment, machine
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.config import load_chain
-from calib_ros.messages import JOINT_STATE
-from calib_ros.replay import replay
-from calib_ros.se3 import to_quat
-from calib_ros.session import CalibrationSession
+from calib_ros.apply.simulation import Cell, drive, faulty, measure
+from calib_ros.files.bags import replay
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import to_quat
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
-from calib_ros.simulation import Cell, drive, faulty, measure
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types

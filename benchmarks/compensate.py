@@ -30,13 +30,13 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from scipy.optimize import least_squares, root
 
-from calib_ros import se3
-from calib_ros.chain import Frame
-from calib_ros.compensation import Compensator, compensate
-from calib_ros.config import load_chain
-from calib_ros.differential import ErrorModel
-from calib_ros.identification import Problem, identify
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.jacobian import ErrorModel
 
 NOISE = (5e-5, 2e-4)
 MARGIN, LEAST_SINGULAR_VALUE = 0.1, 0.05

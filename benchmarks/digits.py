@@ -25,11 +25,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from scipy import linalg
 
-from calib_ros.chain import Frame
-from calib_ros.config import load_chain
-from calib_ros.identifiability import independent
-from calib_ros.leastsquares import Samples, System, triangular_factor
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.identifiability import independent
+from calib_ros.identification.leastsquares import Samples, System, triangular_factor
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = (5e-5, 2e-4)
 

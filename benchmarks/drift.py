@@ -23,10 +23,10 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from scipy.signal import lfilter
 
-from calib_ros.config import load_chain
-from calib_ros.identification import Problem, identify
-from calib_ros.selection import identify_model
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = {'sigma_position': 5e-5, 'sigma_orientation': 2e-4}
 DRIFT = 3e-4

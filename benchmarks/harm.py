@@ -44,10 +44,10 @@ import numpy as np
 from cell_simulator import misfit, rms
 from harm_designs import DESIGNS, GOOD, session
 
-from calib_ros.compensation import Compensator, compensate
+from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.errors import CalibrationError
-from calib_ros.identification import identify
-from calib_ros.selection import identify_model
+from calib_ros.identification.identification import identify
+from calib_ros.identification.model_choice import identify_model
 
 FLOOR = 1e-5
 """Errors [m] below which nothing is harm."""

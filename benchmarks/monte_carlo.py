@@ -20,11 +20,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 
-from calib_ros import identifiability
-from calib_ros.config import load_chain
-from calib_ros.identification import Problem, identify
-from calib_ros.leastsquares import triangular_factor
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification import identifiability
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import triangular_factor
+from calib_ros.kinematics.chain_file import load_chain
 
 SIGMA_POSITION, SIGMA_ORIENTATION = 5e-5, 2e-4
 KINDS = {'pose': (True, 40), 'position': (False, 60)}

@@ -21,11 +21,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
 
-from calib_ros import se3
-from calib_ros.config import load_chain
-from calib_ros.identification import Problem, identify
-from calib_ros.observations import Observations
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
 
 POSES, UNSEEN = 60, 300
 SCATTERED, WORLD, TOOL = 'scattered', 'world', 'tool'

@@ -41,11 +41,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.chain import Chain, Frame
-from calib_ros.config import dump_chain, load_chain
-from calib_ros.export import converted
-from calib_ros.identification import Problem, identify
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.files.export import converted
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
 PACKAGES = {
     'pybotics': '3.1.2',

@@ -41,17 +41,17 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
-from calib_ros import planning
-from calib_ros.candidates import Visibility, draw_candidates
-from calib_ros.chain import Frame
-from calib_ros.config import load_chain
-from calib_ros.design import Candidates, Design, accuracy, predicted
-from calib_ros.identification import Problem, identify
-from calib_ros.placement import place
-from calib_ros.planning import choose
-from calib_ros.se3 import transform
-from calib_ros.simulation import Cell, faulty, measure
-from calib_ros.workspace import CalibratedArm
+from calib_ros.apply import planning
+from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.design import Candidates, Design, accuracy, predicted
+from calib_ros.apply.placement import place
+from calib_ros.apply.planning import choose
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import transform
 
 POSTURE = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
 SIGMAS = (1e-4, 1e-4 / 0.3)

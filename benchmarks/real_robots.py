@@ -29,11 +29,11 @@ import numpy as np
 from scipy import linalg
 from scipy.spatial.distance import cdist
 
-from calib_ros import effects
-from calib_ros.config import load_chain
-from calib_ros.identification import Problem, identify
-from calib_ros.selection import identify_model
-from calib_ros.tables import read_table
+from calib_ros.files.tables import read_table
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain_file import load_chain
 
 DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
 # Held-out RMS [mm] of an independent plain least squares with the geometric model.

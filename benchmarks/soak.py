@@ -57,10 +57,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from calib_ros import se3
-from calib_ros.config import load_chain
-from calib_ros.samples import Sample
-from calib_ros.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.sample import Sample
 
 LEG = 1.2
 """Time from one stop to the next [s], half of it in motion."""
@@ -251,7 +251,7 @@ def run(options, seconds, folder):
     if options.frames:
         parameters += ('-p', "sources:=['tf parent=tracker child=target']")
     rules = ('-r', f'__ns:={options.namespace}')
-    node = Process('-m', 'calib_ros.node', '--ros-args', *parameters, *rules)
+    node = Process('-m', 'calib_ros.ros.node', '--ros-args', *parameters, *rules)
     same = ('--namespace', options.namespace, '--frames', options.frames)
     idle = Process(__file__, '--role', 'empty', *same)
     flood = Process(__file__, '--role', 'publisher', '--rates', *options.rates, *same)

@@ -53,7 +53,7 @@ def _split(numbers):
 
 
 def _observations(given, samples):
-    from calib_ros.observations import Observations
+    from calib_ros.identification.observations import Observations
 
     joints, positions, rotations = samples
     return Observations.from_arrays(joints, positions, rotations if given.oriented else None)
@@ -65,8 +65,8 @@ def _positions(given):
 
 def ours(given):
     """Identify with everything: frames, rank, gross errors, covariance, residuals, judgement."""
-    from calib_ros.config import load_chain
-    from calib_ros.identification import Problem, identify
+    from calib_ros.identification.identification import Problem, identify
+    from calib_ros.kinematics.chain_file import load_chain
 
     judge = np.fromfile(given.folder / 'judge.bin')
     held_out = _observations(given, _split(judge))
@@ -81,7 +81,7 @@ def ours(given):
 
 def _start(given):
     """Return the nominal chain with frames, the parameters to fit, and the sigmas."""
-    from calib_ros.config import load_chain
+    from calib_ros.kinematics.chain_file import load_chain
 
     return (
         load_chain(str(given.folder / 'start.yaml')),
@@ -92,7 +92,7 @@ def _start(given):
 
 def fit(given):
     """Only fit, from a start with frames: what the others below do, too."""
-    from calib_ros.leastsquares import Samples, System, minimise
+    from calib_ros.identification.leastsquares import Samples, System, minimise
 
     start, names, sigmas = _start(given)
     system = System((Samples(_observations(given, given.samples), *sigmas),))
@@ -109,7 +109,7 @@ class Streamed:
 
     def blocks(self, chain, names):
         """Yield weighted rows of Jacobian and residual; see `leastsquares.Samples`."""
-        from calib_ros.leastsquares import Samples
+        from calib_ros.identification.leastsquares import Samples
 
         for chunk in self.given.chunks():
             yield from Samples(_observations(self.given, chunk), *self.sigmas).blocks(chain, names)
@@ -117,7 +117,7 @@ class Streamed:
 
 def streamed(given):
     """Only fit, and read the samples from the disk in each iteration."""
-    from calib_ros.leastsquares import System, minimise
+    from calib_ros.identification.leastsquares import System, minimise
 
     start, names, sigmas = _start(given)
     system = System((Streamed(given, sigmas),))
@@ -126,7 +126,7 @@ def streamed(given):
 
 def one_by_one(given):
     """Only fit, with the same code, one sample at a time."""
-    from calib_ros.leastsquares import Samples, System, minimise
+    from calib_ros.identification.leastsquares import Samples, System, minimise
 
     start, names, sigmas = _start(given)
     joints, positions, rotations = given.samples
@@ -140,8 +140,8 @@ def scipy(given):
     """Fit with scipy's least squares; the Jacobian is that of our error model, all at once."""
     from scipy.optimize import least_squares
 
-    from calib_ros.differential import ErrorModel
-    from calib_ros.identification import residuals
+    from calib_ros.identification.identification import residuals
+    from calib_ros.kinematics.jacobian import ErrorModel
 
     start, names, sigmas = _start(given)
     observations = _observations(given, given.samples)

@@ -26,7 +26,7 @@ def spent(times, *arguments):
     found = []
     for _ in range(times):
         begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-        command = [sys.executable, '-m', 'calib_ros.cli', *map(str, arguments)]
+        command = [sys.executable, '-m', 'calib_ros.cli.main', *map(str, arguments)]
         subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

@@ -27,14 +27,14 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
-from calib_ros import inverse
-from calib_ros.config import load_chain
-from calib_ros.design import Design
-from calib_ros.identification import Problem, identify, residuals
-from calib_ros.simulation import Cell, faulty, measure
-from calib_ros.testposes import iso_9283_poses
-from calib_ros.verification import _freedom, rms_limits, verify
-from calib_ros.workspace import CalibratedArm
+from calib_ros.apply.design import Design
+from calib_ros.apply.iso9283 import iso_9283_poses
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.verification import _freedom, rms_limits, verify
+from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.identification.identification import Problem, identify, residuals
+from calib_ros.kinematics import inverse
+from calib_ros.kinematics.chain_file import load_chain
 
 SETS = (
     ('ur10_ipa_leica', 'B'),

@@ -23,7 +23,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from calib_ros.arguments import NODE, ros_arguments, switched
+from calib_ros.ros.arguments import NODE, ros_arguments, switched
 
 ARGUMENTS = {
     'chain': ('', 'robot of the calibration, as for the node'),

@@ -12,7 +12,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from calib_ros.arguments import NODE, launch_arguments, refuse_unknown, ros_arguments
+from calib_ros.ros.arguments import NODE, launch_arguments, refuse_unknown, ros_arguments
 
 ARGUMENTS = launch_arguments()
 

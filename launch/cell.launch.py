@@ -26,7 +26,8 @@ from launch.event_handlers import OnProcessExit
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from calib_ros.arguments import (
+from calib_ros.errors import ConfigError
+from calib_ros.ros.arguments import (
     NODE,
     launch_arguments,
     refuse_unknown,
@@ -34,7 +35,6 @@ from calib_ros.arguments import (
     rviz_config,
     switched,
 )
-from calib_ros.errors import ConfigError
 
 CONFIG = Path(__file__).parents[1] / 'config'
 OURS = {

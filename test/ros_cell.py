@@ -43,16 +43,16 @@ from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from calib_ros import node as node_module
-from calib_ros import se3
-from calib_ros.config import load_chain
-from calib_ros.node import CalibrationNode
-from calib_ros.replay import Recording
-from calib_ros.session import CalibrationSession
+from calib_ros.apply.simulation import Cell as SimulatedCell
+from calib_ros.apply.simulation import drive, faulty, measure
+from calib_ros.files.bags import Recording
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.ros import node as node_module
+from calib_ros.ros.node import CalibrationNode
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import STANDARD
 from calib_ros.settings import Settings
-from calib_ros.simulation import Cell as SimulatedCell
-from calib_ros.simulation import drive, faulty, measure
-from calib_ros.sources import STANDARD
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -203,7 +203,9 @@ class Cell:
 class Child:
     """The node in a process of its own, and what it prints."""
 
-    def __init__(self, *arguments, domain=None, command=('-m', 'calib_ros.node'), **parameters):
+    def __init__(
+        self, *arguments, domain=None, command=('-m', 'calib_ros.ros.node'), **parameters
+    ):
         environment = {
             name: value
             for name, value in os.environ.items()

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from calib_ros import se3
-from calib_ros.sources import Source
+from calib_ros.kinematics import se3
+from calib_ros.sampling.sources import Source
 
 MS = 1_000_000
 S = 1_000_000_000

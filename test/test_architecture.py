@@ -5,102 +5,87 @@
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
-MODULES = sorted(path.stem for path in PACKAGE.glob('*.py') if path.stem != '__init__')
-
-ORDER = [
-    {'errors'},
-    {'escapes', 'files', 'mcap', 'progress', 'se3', 'texts'},
-    {'effects', 'values'},
-    {'description'},
-    {'chain', 'settings'},
-    {'arguments', 'urdf'},
-    {'config', 'differential', 'observations'},
-    {'identifiability', 'inverse', 'leastsquares', 'messages', 'samples', 'track'},
-    {'cdr', 'correlation', 'dwells', 'delays', 'simulation', 'sources', 'tables', 'trimmed'},
-    {'account', 'following', 'names', 'robust', 'strays', 'transforms', 'waypoints'},
-    {'collector', 'export', 'frames', 'journal'},
-    {'archive', 'problem', 'vendors'},
-    {'chance', 'evidence', 'live', 'noise'},
-    {'misfits', 'region', 'rounding', 'steps'},
-    {'compensation', 'suspicions', 'validation'},
-    {'programs'},
-    {'identification'},
-    {'calibration', 'design', 'salvage', 'selection', 'workspace'},
-    {'candidates', 'placement', 'verification'},
-    {'planning', 'plots', 'session', 'testposes'},
-    {'intake', 'report'},
-    {'topics'},
-    {'replay'},
-    {'deferred', 'inputs', 'options', 'outgoing', 'parameters'},
-    {'broadcast', 'commands', 'diagnostics', 'guide'},
-    {'keeper'},
-    {'cli', 'node'},
-]
-LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
-ROS = {
-    'node',
-    'broadcast',
-    'deferred',
-    'diagnostics',
-    'guide',
-    'inputs',
-    'keeper',
-    'outgoing',
-    'parameters',
+ORDER = 'kinematics < identification < sampling < apply < files < report < ros, cli'
+LEVEL = {name: k for k, names in enumerate(ORDER.split(' < ')) for name in names.split(', ')}
+MODULES = {
+    '.'.join(path.relative_to(PACKAGE).with_suffix('').parts): path
+    for path in sorted(PACKAGE.rglob('*.py'))
+    if path.stem != '__init__'
 }
+ROS = {'rclpy', 'sensor_msgs', 'tf2_msgs', 'geometry_msgs', 'trajectory_msgs', 'std_srvs'}
 ONLY = {
-    'rclpy': ROS,
-    'sensor_msgs': ROS,
-    'tf2_msgs': ROS,
-    'geometry_msgs': ROS,
-    'trajectory_msgs': ROS,
-    'rosbags': {'replay'},
-    'matplotlib': {'plots'},
-    'yaml': {'arguments', 'config', 'export', 'programs', 'texts', 'vendors'},
+    **dict.fromkeys(ROS, ('ros.',)),
+    'rosbags': ('files.bags',),
+    'matplotlib': ('report.plots',),
+    'yaml': (
+        *('texts', 'kinematics.chain_file', 'files.export', 'files.trajectories'),
+        *('files.vendors', 'ros.arguments'),
+    ),
 }
 
 
 def imports(module):
-    """Return the names that a module imports, those inside functions included.
+    """Return the names that a module imports, inside functions as well.
 
     Imports for type checking alone do not count.
     """
     found = set()
-    tree = ast.parse((PACKAGE / f'{module}.py').read_text())
-    for node in ast.walk(tree):
+    waiting = [ast.parse(MODULES[module].read_text())]
+    while waiting:
+        node = waiting.pop()
         if isinstance(node, ast.If) and getattr(node.test, 'id', '') == 'TYPE_CHECKING':
-            node.body = []
-    for node in ast.walk(tree):
+            continue
+        waiting += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module == 'calib_ros':
-            found |= {f'calib_ros.{alias.name}' for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            found.add(node.module)
+            found |= {f'{node.module}.{alias.name}' for alias in node.names}
     return found
 
 
-def test_every_module_has_its_place():
-    assert set(MODULES) == set(LEVEL)
+def inner(name):
+    """Return the module of this package that an imported name belongs to, or None."""
+    package, _, rest = name.partition('.')
+    parts = rest.split('.')
+    ways = ('.'.join(parts[:count]) for count in (2, 1))
+    return next((way for way in ways if package == 'calib_ros' and way in MODULES), None)
+
+
+def test_every_folder_has_its_place():
+    assert {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()} == set(
+        LEVEL
+    )
 
 
 @pytest.mark.parametrize('module', MODULES)
-def test_modules_import_only_from_below(module):
+def test_modules_import_only_from_the_folders_before(module):
+    folder = module.rpartition('.')[0]
     for name in imports(module):
-        package, _, inner = name.partition('.')
-        if package == 'calib_ros' and inner in LEVEL:
-            assert LEVEL[inner] < LEVEL[module], f'{module} imports {inner}'
-        assert module in ONLY.get(package, {module}), f'{module} imports {package}'
+        package = name.partition('.')[0]
+        assert module.startswith(ONLY.get(package, ('',))), f'{module} imports {package}'
+        other = inner(name)
+        if other is None:
+            continue
+        there = other.rpartition('.')[0]
+        below = LEVEL.get(there, -1) < LEVEL.get(folder, -1)
+        assert there == folder or below, f'{module} imports {other}'
+
+
+def test_no_two_modules_import_each_other():
+    graph = {module: {inner(name) for name in imports(module)} - {None} for module in MODULES}
+    TopologicalSorter(graph).prepare()
 
 
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
-    blocked = ['rclpy', 'sensor_msgs', 'rosbags', 'yaml', 'matplotlib']
-    core = [name for name in MODULES if name not in (*ROS, 'replay', 'plots')]
+    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib']
+    apart = ('ros.', 'files.bags', 'report.plots')
+    core = [name for name in MODULES if not name.startswith(apart)]
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]
     lines += [f'import calib_ros.{name}' for name in core]
     subprocess.run([sys.executable, '-c', '\n'.join(lines)], check=True)

@@ -13,23 +13,23 @@ import numpy as np
 import pytest
 import yaml
 
-from calib_ros.chain import Chain, Joint
-from calib_ros.cli import main
-from calib_ros.config import dump_chain, parse_chain
+from calib_ros.apply.simulation import measure
+from calib_ros.cli.main import main
 from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
-from calib_ros.identification import identify
-from calib_ros.mcap import LARGEST_CHUNK
-from calib_ros.messages import MessageError, measured_covariance
-from calib_ros.observations import Observations
-from calib_ros.problem import Problem
-from calib_ros.programs import read_program
-from calib_ros.replay import Recording, Replayed, replay, write_bag
-from calib_ros.salvage import recorded
-from calib_ros.session import CalibrationSession
-from calib_ros.simulation import measure
-from calib_ros.tables import COVARIANCE, read_journal, read_table
+from calib_ros.files.bags import Recording, Replayed, replay, write_bag
+from calib_ros.files.mcap import LARGEST_CHUNK
+from calib_ros.files.salvage import recorded
+from calib_ros.files.tables import COVARIANCE, read_journal, read_table
+from calib_ros.files.trajectories import read_program
+from calib_ros.identification.identification import identify
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain_file import dump_chain, parse_chain
+from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.sampling.messages import MessageError, measured_covariance
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.texts import LARGEST_TABLE, parse_yaml
-from calib_ros.urdf import chain_from_urdf
 
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
 HEAD = 'convention: standard\njoints:\n- {name: a, a: 0, alpha: 0, d: 0, theta: '

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 import calib_ros
-from calib_ros.arguments import BESIDE_SETTINGS, PARAMETERS
+from calib_ros.ros.arguments import BESIDE_SETTINGS, PARAMETERS
 from calib_ros.settings import Settings
 
 ROOT = Path(__file__).parents[1]

@@ -11,10 +11,10 @@ from fuzz_targets import ARM, CORPUS, MARK
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.config import dump_chain, nominal_record
-from calib_ros.messages import DECODERS, JOINT_STATE
-from calib_ros.samples import Sample
-from calib_ros.tables import cells, columns
+from calib_ros.files.tables import cells, columns
+from calib_ros.kinematics.chain_file import dump_chain, nominal_record
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE
+from calib_ros.sampling.sample import Sample
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 T = STORE.types

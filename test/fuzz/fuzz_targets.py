@@ -19,8 +19,8 @@ from pathlib import Path
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from calib_ros.chain import Chain, Joint
 from calib_ros.errors import LONGEST, CalibrationError
+from calib_ros.kinematics.chain import Chain, Joint
 
 HERE = Path(__file__).parent
 CORPUS = HERE / 'corpus'
@@ -97,22 +97,22 @@ def corpus(name):
 
 @target('.csv')
 def table(path):
-    from calib_ros.problem import Problem
-    from calib_ros.tables import read_table
+    from calib_ros.files.tables import read_table
+    from calib_ros.identification.problem import Problem
 
     read = read_table(path, len(ARM.joints))
     problem = Problem(ARM, read.fitted[0], read.held_out, more=read.fitted[1:])
     for observations in (*read.fitted, *read.held_out):
         if observations.distances is None:
-            from calib_ros.leastsquares import Samples
+            from calib_ros.identification.leastsquares import Samples
 
             Samples(observations, problem.sigma_position, problem.sigma_orientation)
 
 
 @target('.csv')
 def journal(path):
-    from calib_ros.journal import Journal
-    from calib_ros.tables import read_journal
+    from calib_ros.files.journal import Journal
+    from calib_ros.files.tables import read_journal
 
     samples, _ = read_journal(path, len(ARM.joints))
     writing = Journal(path, len(ARM.joints))
@@ -123,7 +123,7 @@ def journal(path):
 
 @target('.csv')
 def waypoints(path):
-    from calib_ros.waypoints import read_joints, read_poses
+    from calib_ros.files.waypoints import read_joints, read_poses
 
     for read in (lambda: read_joints(path, ARM), lambda: read_poses(path)):
         with contextlib.suppress(CalibrationError):
@@ -141,7 +141,7 @@ def program_yaml(path):
 
 
 def _program(path):
-    from calib_ros.programs import read_program
+    from calib_ros.files.trajectories import read_program
 
     read = read_program(path, ARM.joint_names)
     read.text_with(read.program)
@@ -151,8 +151,8 @@ def _program(path):
 def chain(path):
     import numpy as np
 
-    from calib_ros.config import dump_chain, load_chain, parse_chain
-    from calib_ros.export import exports
+    from calib_ros.files.export import exports
+    from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 
     found = load_chain(path)
     found.forward(found.random_joints(5, np.random.default_rng(0)))
@@ -163,14 +163,14 @@ def chain(path):
 
 @target('.yaml')
 def calibration(path):
-    from calib_ros.config import load_calibration
+    from calib_ros.kinematics.chain_file import load_calibration
 
     load_calibration(path, ARM)
 
 
 @target('result.json')
 def result(path):
-    from calib_ros.workspace import CalibratedArm
+    from calib_ros.apply.workspace import CalibratedArm
 
     shutil.copy(next(iter((CORPUS / 'calibration').iterdir())), path.parent / 'calibration.yaml')
     CalibratedArm.read(path.parent, ARM)
@@ -178,16 +178,16 @@ def result(path):
 
 @target('.urdf')
 def urdf(path):
-    from calib_ros.config import read_text, read_urdf
-    from calib_ros.urdf import corrected_urdf
+    from calib_ros.kinematics.chain_file import read_text, read_urdf
+    from calib_ros.kinematics.urdf import corrected_urdf
 
     found = read_urdf(path)
     corrected_urdf(read_text(path), found.with_offsets({f'{found.joint_names[0]}.theta': 1e-3}))
 
 
 def _replayed(path):
-    from calib_ros.replay import replay
-    from calib_ros.session import CalibrationSession
+    from calib_ros.files.bags import replay
+    from calib_ros.sampling.session import CalibrationSession
 
     session = CalibrationSession(ARM)
     replayed = replay(path, session)
@@ -216,11 +216,11 @@ def metadata(path):
 
 def message(data):
     """The first byte chooses the type; messages are divided by a mark."""
-    from calib_ros.intake import Stream, feed
-    from calib_ros.messages import DECODERS, JOINT_STATE
-    from calib_ros.replay import _deserialised
-    from calib_ros.session import CalibrationSession
-    from calib_ros.sources import Source
+    from calib_ros.files.bags import _deserialised
+    from calib_ros.sampling.intake import Stream, feed
+    from calib_ros.sampling.messages import DECODERS, JOINT_STATE
+    from calib_ros.sampling.session import CalibrationSession
+    from calib_ros.sampling.sources import Source
 
     session = CalibrationSession(ARM)
     types = [JOINT_STATE, *DECODERS]
@@ -241,14 +241,14 @@ TARGETS['message'] = message
 
 def settings(data):
     """Options of identify, one in a line."""
-    from calib_ros import cli
-    from calib_ros.options import settings_of
-    from calib_ros.session import CalibrationSession
+    from calib_ros.cli import main
+    from calib_ros.cli.options import settings_of
+    from calib_ros.sampling.session import CalibrationSession
 
     lines = data.decode(errors='replace').replace('\0', '').split('\n')
     with contextlib.suppress(SystemExit):
         given = ['identify', 'bag', '--chain', 'ur10e', *lines]
-        CalibrationSession(ARM, settings_of(cli._parser(given).parse_args(given)))
+        CalibrationSession(ARM, settings_of(main._parser(given).parse_args(given)))
 
 
 TARGETS['settings'] = settings
@@ -256,7 +256,7 @@ TARGETS['settings'] = settings
 
 def command(data):
     """A command line that ends before it computes much: its files are not there."""
-    from calib_ros import cli
+    from calib_ros.cli import main
 
     lines = data.decode(errors='replace').replace('\0', '').split('\n')
     folder = tempfile.mkdtemp(dir=_memory())
@@ -265,7 +265,7 @@ def command(data):
     try:
         if lines[0] in ('identify', 'verify', 'compensate', 'workspace', 'export', 'chain'):
             with contextlib.suppress(SystemExit):
-                cli.main([line for line in lines if '/' not in line])
+                main.main([line for line in lines if '/' not in line])
     finally:
         os.chdir(back)
         shutil.rmtree(folder)

@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses at which the target can be measured, and the way from one to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.apply.design import Design
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+
+MOST_DRAWS = 1000
+"""Draws per candidate after which a measurable region is said to be out of reach."""
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility:
+    """Where the measuring device sees the target.
+
+    Parameters
+    ----------
+    box : (2, 3), optional
+        Lower and upper corner [m] of the measurable region.
+    tracker : (3,), optional
+        Where the device stands [m].
+    axis : (3,)
+        Direction in the target's frame that must point to the device.
+    cone : float
+        Largest angle [rad] between that axis and the direction to the device.
+    world : bool
+        Whether box and tracker are given in the world; else they are in the arm's base frame.
+
+    """
+
+    box: FloatArray | None = None
+    tracker: FloatArray | None = None
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    cone: float = np.pi / 4.0
+    world: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse an empty box and an axis without direction."""
+        if self.box is not None and not (self.box[0] < self.box[1]).all():
+            raise ConfigError(
+                f'the box from {self.box[0].tolist()} to {self.box[1].tolist()} is empty: give '
+                'the lower corner first'
+            )
+        if not np.linalg.norm(self.axis) > 0.0:
+            raise ConfigError('the axis of the target must not be 0 0 0')
+        if not 0.0 < self.cone <= np.pi:
+            raise ConfigError(
+                f'the cone must be between 0 and 180 degrees, not {np.degrees(self.cone):g}'
+            )
+
+    def sees(self, design: Design, joints: FloatArray) -> NDArray[np.bool_]:
+        """Return (N,) whether the target can be measured at joint values (N, n)."""
+        base = {'base': design.chain.base, **dict(design.chain.frames)}[design.base]
+        poses = design.targets(joints)
+        if not self.world:
+            poses = se3.invert(design.chain.frame(design.base).matrix) @ poses
+        elif base is None:
+            raise ConfigError(
+                'the measurable region is given in the world, but the chain file does not say '
+                'where the base is: give it in the base frame, or "base" in the chain file'
+            )
+        position = poses[:, :3, 3]
+        seen = np.ones(len(joints), dtype=bool)
+        if self.box is not None:
+            seen &= ((self.box[0] <= position) & (position <= self.box[1])).all(axis=1)
+        if self.tracker is not None:
+            sight = self.tracker - position
+            axis = poses[:, :3, :3] @ (np.array(self.axis) / np.linalg.norm(self.axis))
+            along = np.einsum('ni,ni->n', sight, axis)
+            seen &= along >= np.cos(self.cone) * np.linalg.norm(sight, axis=1)
+        return seen
+
+
+def draw_candidates(
+    design: Design, count: int, rng: np.random.Generator, visibility: Visibility | None = None
+) -> FloatArray:
+    """Draw joint values (count, n) within the limits at which the target can be measured.
+
+    Raises
+    ------
+    InputError
+        When hardly any can.
+
+    """
+    found = np.zeros((0, len(design.chain.joints)))
+    drawn = 0
+    while len(found) < count:
+        if drawn > MOST_DRAWS * count:
+            raise InputError(
+                f'the target can be measured at {len(found)} of {drawn} random poses only, '
+                f'{count} candidates are wanted: widen box and cone, or give a file of candidates'
+            )
+        joints = design.chain.random_joints(10 * count, rng)
+        drawn += len(joints)
+        seen = joints if visibility is None else joints[visibility.sees(design, joints)]
+        found = np.concatenate([found, seen])
+    return found[:count]
+
+
+def visit_order(joints: FloatArray, velocities: FloatArray) -> NDArray[np.intp]:
+    """Return an order (N,) of visiting configurations (N, n) that takes little time.
+
+    The time of a move is that of the joint which takes longest, at `velocities` (n,) [rad/s or
+    m/s]. Nearest neighbour from the configuration that lies farthest out, then parts of the way
+    are turned round while that shortens it (2-opt; Croes 1958).
+    """
+    travel = travel_times(joints, velocities)
+    count = len(joints)
+    order = [int(travel.sum(axis=1).argmax())]
+    free = np.ones(count, dtype=bool)
+    for _ in range(count - 1):
+        free[order[-1]] = False
+        order.append(int(np.where(free, travel[order[-1]], np.inf).argmin()))
+    path = np.array(order)
+    while True:
+        # turning i ... j round joins i - 1 to j and i to j + 1; an end of the way joins nothing
+        there = np.zeros((count + 2, count + 2))
+        there[1:-1, 1:-1] = travel[np.ix_(path, path)]
+        legs = np.diagonal(there, 1)
+        change = there[:-2, 1:-1] + there[1:-1, 2:] - legs[:-1, None] - legs[None, 1:]
+        change = np.triu(change, 1)
+        i, j = np.unravel_index(change.argmin(), change.shape)
+        if change[i, j] > -1e-9:
+            return path
+        path[i : j + 1] = path[i : j + 1][::-1]
+
+
+def travel_times(joints: FloatArray, velocities: FloatArray) -> FloatArray:
+    """Return the times (N, N) [s] of the moves between configurations (N, n)."""
+    return np.asarray(np.abs((joints[:, None] - joints[None]) / velocities).max(axis=2))

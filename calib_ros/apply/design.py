@@ -1,0 +1,216 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What poses would tell about the parameters, before any is measured.
+
+A pose adds A^T A to the information M about the parameters, with A (m, P) its rows of the weighted
+Jacobian: 6 by full pose, 3 by position. Neither needs a measured value. With C = M^-1 the
+predicted RMS position error over task poses is the root of the mean of tr J C J^T, with J their
+rows of position.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.errors import InputError
+from calib_ros.identification.identifiability import independent, structurally_independent
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.live import Estimate
+
+ASSUMED_TOOL = (0.1, 0.1, 0.1)
+"""Where the target is taken to be [m] in the flange's frame when nothing is known about it."""
+UNDETERMINED = 1e-7
+"""A direction of the parameters with less information, in that of an average candidate, is not
+determined."""
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """What is to be identified, how it will be measured, and what is known about it already.
+
+    Parameters
+    ----------
+    chain : Chain
+        The point of linearisation. The base frame has no influence, the tool has.
+    names : tuple of str
+        P parameters to identify, without gauge freedoms.
+    sigma_position, sigma_orientation : float, float or None
+        Of a measured pose [m, rad]; None when only positions are measured.
+    known : (R, P)
+        Rows of information that is there already, in sigma: priors, poses taken.
+    base, tool : str
+        Frames of the chain that hold for the poses to come.
+
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    sigma_position: float
+    sigma_orientation: float | None
+    known: FloatArray
+    base: str = 'base'
+    tool: str = 'tool'
+
+    @classmethod
+    def of(cls, problem: Problem, result: Identification | Estimate | None = None) -> Design:
+        """Return the design of a problem: nothing but the priors is known yet.
+
+        With the result of an identification, or an estimate while samples come, that is known as
+        well, and poses to come have the noise that it found. Measured values do not count
+        otherwise: `simulation.measure` can make the observations of a problem before anything is
+        measured.
+
+        Raises
+        ------
+        InputError
+            When neither poses nor positions are measured.
+
+        """
+        kind = problem.kinds[0]
+        if kind.distance or problem.separations:
+            raise InputError('planning is for measured poses or positions, not for distances')
+        model = problem.model
+        priors = problem.prior_sigmas
+        structural = structurally_independent(model, problem.free, problem.kinds)
+        names = tuple(n for n in problem.free if n in structural or n in priors)
+        scales = (1.0, 1.0)
+        if result is None:
+            model = _with_assumed_tool(model, kind.tool)
+            known = np.diag([1.0 / priors.get(name, np.inf) for name in names])
+        else:
+            model = result.chain
+            names = (*result.names, *(name for name in names if name not in result.names))
+            known = np.zeros((len(result.names), len(names)))
+            known[:, : len(result.names)] = _root_of_inverse(result.covariance)
+            noise = result.noise
+            if isinstance(noise, float):
+                scales = (noise, noise)
+            elif not noise.consistent:
+                scales = (noise.position, noise.orientation or noise.position)
+        return cls(
+            chain=model,
+            names=names,
+            sigma_position=problem.sigma_position * scales[0],
+            sigma_orientation=problem.sigma_orientation * scales[1] if kind.oriented else None,
+            known=known,
+            base=kind.base,
+            tool=kind.tool,
+        )
+
+    def rows(self, joints: FloatArray) -> FloatArray:
+        """Return the rows (N, 6 or 3, P) of information, in sigma, of poses at (N, n)."""
+        jacobian = ErrorModel(self.chain, self.names, self.base, self.tool).jacobian(joints)
+        jacobian[:, :3] /= self.sigma_position
+        if self.sigma_orientation is None:
+            return jacobian[:, :3]
+        jacobian[:, 3:] /= self.sigma_orientation
+        return jacobian
+
+    def after(self, joints: FloatArray) -> Design:
+        """Return the design when poses at (N, n) have been measured."""
+        rows = self.rows(joints).reshape(-1, len(self.names))
+        return replace(self, known=triangular(np.concatenate([self.known, rows])))
+
+    def determined_by(self, joints: FloatArray) -> Design:
+        """Return the design without parameters that not even all poses at (N, n) determine."""
+        names = independent(self.after(joints).known, self.names)
+        known = self.known[:, [self.names.index(name) for name in names]]
+        return replace(self, names=names, known=known)
+
+    def targets(self, joints: FloatArray) -> FloatArray:
+        """Return the target's poses (N, 4, 4) in the world at (N, n)."""
+        return self.chain.forward(joints, base=self.base, tool=self.tool)
+
+
+class Candidates:
+    """Rows (N, m, P) of candidates in coordinates in which they weigh one on average.
+
+    `factor` (P, P) leads back: rows @ factor are in sigma per metre or radian.
+    """
+
+    def __init__(self, design: Design, joints: FloatArray) -> None:
+        self.joints = joints
+        self.design = design.determined_by(joints)
+        rows = self.design.rows(joints)
+        self.factor = self.design.after(joints).known / np.sqrt(len(rows))
+        self._inverse = linalg.solve_triangular(self.factor, np.eye(len(self.factor)))
+        self.rows = times(rows, self._inverse)
+        self.known = information_of(self.design.known @ self._inverse)
+
+    def of_task(self, task: FloatArray) -> FloatArray:
+        """Return V (P, P) [m^2]: tr V C is the mean squared position error at (T, n)."""
+        design = self.design
+        jacobian = ErrorModel(design.chain, design.names, design.base, design.tool).jacobian(task)
+        return information_of(times(jacobian[:, :3], self._inverse)) / len(task)
+
+
+def accuracy(design: Design, joints: FloatArray, task: FloatArray) -> FloatArray:
+    """Return the predicted RMS position error (N,) [m] with the first 1, 2, ... N poses.
+
+    At task poses (T, n), from the uncertainty of the parameters alone; infinite while they are
+    not all determined. `joints` (N, n) are the poses, in the order in which they are measured.
+    """
+    space = Candidates(design, joints)
+    if space.design.names != design.names:
+        return np.full(len(joints), np.inf)
+    each = np.swapaxes(space.rows, 1, 2) @ space.rows
+    values, vectors = np.linalg.eigh(space.known + np.cumsum(each, axis=0))
+    along = np.einsum('npk,pq,nqk->nk', vectors, space.of_task(task), vectors, optimize=True)
+    squares = (along / np.maximum(values, UNDETERMINED)).sum(axis=1)
+    return np.where(values[:, 0] < UNDETERMINED, np.inf, np.sqrt(squares))
+
+
+def predicted(design: Design, task: FloatArray) -> float:
+    """Return the RMS position error [m] at task poses (T, n) predicted by what is known."""
+    known = triangular(design.known)
+    if independent(known, design.names) != design.names:
+        return float('inf')
+    model = ErrorModel(design.chain, design.names, design.base, design.tool)
+    rows = model.jacobian(task)[:, :3].reshape(-1, len(design.names))
+    return float(
+        np.linalg.norm(linalg.solve_triangular(known, rows.T, trans='T')) / len(task) ** 0.5
+    )
+
+
+def times(rows: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Return the product of (N, m, P) and (P, P), which BLAS does in one piece."""
+    flat = np.ascontiguousarray(rows).reshape(-1, rows.shape[2]) @ matrix
+    return flat.reshape(*rows.shape[:2], -1)
+
+
+def information_of(rows: FloatArray) -> FloatArray:
+    """Return the information (P, P) of rows (..., P)."""
+    flat = rows.reshape(-1, rows.shape[-1])
+    return flat.T @ flat
+
+
+def triangular(rows: FloatArray) -> FloatArray:
+    """Return R (P, P), upper triangular, with the information of rows (R, P)."""
+    size = rows.shape[1]
+    padded = np.concatenate([rows, np.zeros((max(0, size - len(rows)), size))])
+    return np.asarray(linalg.qr(padded, mode='r')[0])[:size]
+
+
+def _root_of_inverse(covariance: FloatArray) -> FloatArray:
+    """Return rows (P, P) with the information whose inverse is a covariance."""
+    std = np.sqrt(np.diag(covariance))
+    lower = linalg.cholesky(covariance / np.outer(std, std), lower=True)
+    return np.asarray(linalg.solve_triangular(lower, np.diag(1.0 / std), lower=True))
+
+
+def _with_assumed_tool(chain: Chain, tool: str) -> Chain:
+    """Return the chain with its target off the flange's axis, if nothing is known about it.
+
+    On the axis, where a frame of no size would put it, its position hides the last joint.
+    """
+    if {'tool': chain.tool, **dict(chain.frames)}[tool] is not None:
+        return chain
+    return chain.with_frame(tool, Frame(se3.transform(np.eye(3), np.array(ASSUMED_TOOL))))

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Five poses at which to verify an arm, after ISO 9283:1998, 6.10.2.
+
+They lie in the largest cube that is found in the workspace beside the z axis of the base (on which
+the arm itself stands), with edges parallel to the base frame and one orientation for all: P1 in
+its centre, P2 to P5 on a diagonal plane of it, each a tenth of the diagonal away from a corner.
+
+The cube grows about many reachable poses at once; where its eight corners are reached is followed
+(`inverse.py`), and what is lost on the way is out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.design import Design
+from calib_ros.errors import InputError
+from calib_ros.kinematics import inverse, se3
+from calib_ros.kinematics.se3 import FloatArray
+
+CENTRES = 500
+"""Reachable poses about which a cube is grown."""
+FIRST_EDGE, GROWTH = 0.02, 1.3
+"""Edge [m] of the first cube, and by how much it grows at a time."""
+FINER = 4
+"""Times that the growth is refined: to GROWTH ** (1 / 16)."""
+CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+PLANE = [7, 5, 0, 2]
+"""Corners of the plane x = z of the cube, round about."""
+INSIDE = 0.8
+"""Where on the way from the centre to a corner a test pose is."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestPoses:
+    """Joint values (5, n) [rad or m] of the test poses P1 to P5, and the edge [m] of the cube."""
+
+    __test__ = False  # no test class, whatever its name
+
+    joints: FloatArray
+    edge: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Cubes:
+    """Cubes of one edge about reachable centres (M, 4, 4), with the joint values at the corners.
+
+    `middle` (M, n) are those of the centres, `corners` (M, 8, n) those of the corners.
+    """
+
+    edge: float
+    centres: FloatArray
+    middle: FloatArray
+    corners: FloatArray
+
+    def select(self, index: NDArray[np.intp]) -> _Cubes:
+        """Return some of the cubes."""
+        return replace(
+            self,
+            centres=self.centres[index],
+            middle=self.middle[index],
+            corners=self.corners[index],
+        )
+
+
+def iso_9283_poses(
+    design: Design, rng: np.random.Generator, visibility: Visibility | None = None
+) -> TestPoses:
+    """Return the test poses in the largest cube that the arm reaches, and the device sees.
+
+    Raises
+    ------
+    InputError
+        When the arm keeps its orientation in no cube, as with fewer than six joints, or the
+        target is not seen.
+
+    """
+    middle = draw_candidates(design, CENTRES, rng, visibility)
+    start = np.repeat(middle[:, np.newaxis], 8, axis=1)
+    cubes = _grown(design, visibility, _Cubes(0.0, design.targets(middle), middle, start))
+    if not cubes.edge:
+        raise InputError(
+            'the arm keeps one orientation in no cube of its workspace: choose test poses '
+            'yourself; new ones anywhere will do'
+        )
+    travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
+    best = cubes.select(travel.argmin()[np.newaxis])
+    wanted = _poses(design, best.centres, INSIDE * best.edge)[0, PLANE]
+    found = inverse.solve(design.chain, wanted, best.corners[0, PLANE], design.base, design.tool)
+    if not found.converged.all():
+        raise InputError(
+            'the arm does not reach the inside of the cube that it reaches: try --seed'
+        )
+    return TestPoses(np.concatenate([best.middle, found.joints]), best.edge)
+
+
+def _grown(design: Design, visibility: Visibility | None, cubes: _Cubes) -> _Cubes:
+    """Return the cubes that can be grown furthest."""
+    factor, finer = GROWTH, 0
+    while finer <= FINER:
+        edge = FIRST_EDGE if not cubes.edge else cubes.edge * factor
+        more = _at(design, visibility, cubes, edge)
+        if len(more.centres):
+            cubes = more
+        elif not cubes.edge:
+            return cubes
+        else:
+            factor, finer = factor**0.5, finer + 1
+    return cubes
+
+
+def _at(design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float) -> _Cubes:
+    """Return those cubes that have another edge, too."""
+    count, _, joints = cubes.corners.shape
+    wanted = _poses(design, cubes.centres, edge).reshape(-1, 4, 4)
+    start = cubes.corners.reshape(-1, joints)
+    found = inverse.solve(design.chain, wanted, start, design.base, design.tool)
+    reached = found.converged
+    if visibility is not None:
+        reached &= visibility.sees(design, found.joints)
+    whole = reached.reshape(count, 8).all(axis=1)
+    middle = se3.invert(design.chain.frame(design.base).matrix) @ cubes.centres
+    whole &= np.abs(middle[:, :2, 3]).max(axis=1) > 0.5 * edge
+    grown = replace(cubes, edge=edge, corners=found.joints.reshape(count, 8, joints))
+    return grown.select(np.flatnonzero(whole))
+
+
+def _poses(design: Design, centres: FloatArray, edge: float) -> FloatArray:
+    """Return the poses (M, 8, 4, 4) at the corners of cubes about centres (M, 4, 4)."""
+    turn = design.chain.frame(design.base).matrix[:3, :3]
+    poses = np.repeat(centres[:, np.newaxis], 8, axis=1)
+    poses[:, :, :3, 3] += edge * CORNERS @ turn.T
+    return poses

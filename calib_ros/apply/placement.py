@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where in the workspace a task is done best.
+
+The optimal workspace of a task (Vacarescu et al., abstract) is where its frame is placed so that
+the error expected there (`workspace.py`) is least, the mean or the worst over the task's poses. It
+is searched on a grid, which is the map to prove it, and refined about the best. Every pose is
+solved for joint values (`inverse.py`): the first one from configurations that come near it, the
+others from pose to pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from calib_ros.apply.workspace import CalibratedArm, Model, in_base
+from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.kinematics import inverse, se3
+from calib_ros.kinematics.se3 import FloatArray
+
+Aim: TypeAlias = Literal['mean', 'worst']
+AIMS: tuple[Aim, ...] = get_args(Aim)
+STARTS = 6
+"""Configurations from which the first pose of a task is solved."""
+KNOWN_POSES = 20_000
+"""Random configurations among which they are looked for."""
+REFINEMENTS = 4
+"""Times that the grid is halved about the best placement."""
+
+
+def task_of(poses: FloatArray) -> FloatArray:
+    """Return poses (K, 4, 4) in a frame at their middle, whose axes stay as they are."""
+    task = poses.copy()
+    task[:, :3, 3] -= 0.5 * (poses[:, :3, 3].min(axis=0) + poses[:, :3, 3].max(axis=0))
+    return task
+
+
+@dataclass(frozen=True, eq=False)
+class Placements:
+    """Where a task's frame may be placed, and the error expected there.
+
+    Attributes
+    ----------
+    positions : (M, 3)
+        Of the task's frame [m] in the arm's base frame.
+    turns : (M,)
+        Turn [rad] of the task's frame about the vertical axis of the base.
+    errors : (M,)
+        Expected error [m]; NaN where the arm does not reach all poses of the task.
+    joints : (M, K, n)
+        Joint values [rad or m] of the task's poses, where it is reached.
+    best, centre : int
+        The placement of least error, and the one nearest to the centre of all that are reached.
+
+    """
+
+    positions: FloatArray
+    turns: FloatArray
+    errors: FloatArray
+    joints: FloatArray
+    best: int
+    centre: int
+
+
+def place(
+    arm: CalibratedArm,
+    task: FloatArray,
+    aim: Aim = 'mean',
+    model: Model = 'corrected',
+    region: FloatArray | None = None,
+    cells: int = 9,
+    turns: int = 1,
+) -> Placements:
+    """Find the placement of a task with the least expected error.
+
+    Parameters
+    ----------
+    arm : CalibratedArm
+        Before and after.
+    task : (K, 4, 4)
+        Poses of the target in the task's frame, whose axes are those of the base at turn 0.
+    aim : 'mean' or 'worst'
+        Over the task's poses.
+    model : 'corrected' or 'nominal'
+        By which the arm is commanded.
+    region : (2, 3), optional
+        Lower and upper corner [m], in the base frame, for the origin of the task's frame; all
+        that the arm reaches if None.
+    cells : int
+        Points of the grid along each axis.
+    turns : int
+        Turns about the vertical to try, evenly spread.
+
+    Raises
+    ------
+    InputError
+        When the region is empty, or the arm reaches all poses of the task nowhere in it.
+
+    """
+    if aim not in AIMS:
+        raise UnknownNameError('aim', aim, AIMS)
+    if region is not None and not (region[0] <= region[1]).all():
+        raise InputError(
+            f'the region from {region[0].tolist()} to {region[1].tolist()} is empty: give the '
+            'lower corner first'
+        )
+    search = _Search(arm, task, aim, model)
+    corners = search.reach if region is None else region
+    axes = [np.linspace(low, high, cells) for low, high in corners.T]
+    angles = 2.0 * np.pi * np.arange(turns) / turns
+    grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
+    errors, joints = search.errors(grid)
+    reached = ~np.isnan(errors)
+    if not reached.any():
+        raise InputError(
+            f'the arm reaches all {len(task)} poses of the task at none of {len(grid)} '
+            'placements: check the unit (m), the orientation and the region, or use more cells'
+        )
+    middle = grid[reached, :3].mean(axis=0)
+    distance = np.linalg.norm(grid[:, :3] - middle, axis=1)
+    centre = int(np.where(reached, distance, np.inf).argmin())
+    step = (corners[1] - corners[0]) / max(cells - 1, 1)
+    for _ in range(REFINEMENTS):
+        step = 0.5 * step
+        best = grid[np.nanargmin(errors)]
+        around = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
+        near = np.column_stack([best[:3] + step * around, np.full(len(around), best[3])])
+        near[:, :3] = np.clip(near[:, :3], corners[0], corners[1])
+        more_errors, more_joints = search.errors(near)
+        grid, errors = np.concatenate([grid, near]), np.concatenate([errors, more_errors])
+        joints = np.concatenate([joints, more_joints])
+    best = int(np.nanargmin(errors))
+    return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
+
+
+class _Search:
+    """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad]."""
+
+    def __init__(self, arm: CalibratedArm, task: FloatArray, aim: Aim, model: Model) -> None:
+        self._arm, self._task, self._aim, self._model = arm, task, aim, model
+        self._chain = arm.commanded_by(model)
+        self._base = self._chain.frame('base').matrix
+        self._known = self._chain.random_joints(KNOWN_POSES, np.random.default_rng(0))
+        poses = in_base(self._chain, self._known)
+        self._tree = cKDTree(_features(poses))
+        self.reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
+
+    def errors(self, placements: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n)."""
+        turns = np.zeros((len(placements), 3))
+        turns[:, 2] = placements[:, 3]
+        frames = se3.transform(se3.exp_rotation(turns), placements[:, :3])
+        poses = frames[:, np.newaxis] @ self._task
+        joints, reached = self._follow(poses)
+        errors = np.full((len(placements), STARTS), np.nan)
+        expected = self._arm.expected(joints[reached].reshape(-1, joints.shape[-1]), self._model)
+        expected = expected.reshape(-1, len(self._task))
+        over = expected.mean(axis=1) if self._aim == 'mean' else expected.max(axis=1)
+        errors[reached] = over
+        best = np.where(np.isnan(errors), np.inf, errors).argmin(axis=1)
+        index = np.arange(len(placements))
+        return errors[index, best], joints[index, best]
+
+    def _follow(self, poses: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return joint values (M, STARTS, K, n) for poses (M, K, 4, 4), and which reach them."""
+        count, length = poses.shape[:2]
+        _, nearest = self._tree.query(_features(poses[:, 0]), STARTS)
+        joints = np.full((count, STARTS, length, self._known.shape[1]), np.nan)
+        reached = np.ones((count, STARTS), dtype=bool)
+        start = self._known[nearest]
+        for k in range(length):
+            placement, branch = np.nonzero(reached)
+            wanted = self._base @ poses[placement, k]
+            found = inverse.solve(self._chain, wanted, start[reached])
+            joints[placement, branch, k] = found.joints
+            start[reached] = found.joints
+            reached[placement, branch] = found.converged
+        return joints, reached
+
+
+def _features(poses: FloatArray) -> FloatArray:
+    """Return (N, 12): what is near in position, and in orientation times LEVER, is near in it."""
+    columns = inverse.LEVER / np.sqrt(2.0) * poses[:, :3, :3].reshape(-1, 9)
+    return np.concatenate([poses[:, :3, 3], columns], axis=1)
+
+
+def in_words(placements: Placements, aim: str, model: str) -> str:
+    """Return where to place a task, against the centre of all places."""
+    reached = placements.errors[~np.isnan(placements.errors)]
+    best, centre = (
+        f'{1e3 * placements.errors[k]:.4f} mm at '
+        f'{" ".join(f"{x:.3f}" for x in placements.positions[k])} m in the base '
+        f'frame, turned by {np.degrees(placements.turns[k]):.0f} degrees'
+        for k in (placements.best, placements.centre)
+    )
+    return (
+        f'expected {aim} error of the task, {model} model; the arm reaches it at '
+        f'{len(reached)} of {len(placements.errors)} placements\n'
+        f'best:   {best}\ncentre: {centre}\nworst:  {1e3 * reached.max():.4f} mm\n'
+    )

@@ -1,0 +1,381 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Is the corrected arm as accurate as it has to be? New measurements, and a verdict.
+
+A controller that is corrected by a calibration C stands at joint values q where C means the pose
+that was wanted, so that it misses by measured - C(q); an uncorrected one would miss by
+measured - N(q). Both are known from the joint values that the controller reports. Where the
+program is known as it was before its correction, the pose wanted is N(q_commanded), and a
+correction that did not arrive shows as well.
+
+The figure is the RMS position error over poses like those measured. Of K configurations with
+errors e_k the sum of squares is taken for theta / nu chi2(nu) (Satterthwaite 1946) with
+
+    S = mean of e_k e_k^T        nu = K min((tr S)^2 / tr S^2, 2 / c^2)
+
+between K (all errors in one direction) and 3 K (in all directions alike), and fewer where the
+errors are larger at some places than at others, as compliance and eccentricities leave them: c^2
+is the variance of the squared errors over the square of their mean, taken together with that of
+POOLED errors in one direction (2), and larger by its own standard deviation. Few configurations
+make nu too small rather than too large. Measurements of one configuration share its error and
+count for one. The limits of the RMS are one-sided, each at the confidence wanted:
+
+    PASS        the upper limit is within the tolerance
+    FAIL        the lower limit is beyond it
+    UNDECIDED   neither: more poses are needed
+
+Frames of the new measurements are fitted to both arms where that is asked for: the base where the
+device stands elsewhere, the tool where another target, or the same anew, is on the flange. A frame
+that is not fitted must be that of the calibration: else its change counts as the arm's error, and
+tells nothing about which of two calibrations is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.identifiability import excited
+from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.validation import Comparison, compare
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
+LEAST = 5
+"""Configurations from which a verdict is given, those of a fitted frame not counted."""
+MOST = 10_000
+"""Configurations up to which it is said how many would decide."""
+POOLED = 2
+"""Configurations with errors in one direction that the scatter of the squares is pooled with."""
+BASE_SHARE = 2
+"""Configurations whose errors a new base frame takes up: it has six freedoms, each has three."""
+TOOL_SHARE = 1
+"""The same of a new tool frame: its turn does not move the target."""
+FAR = 0.1
+"""Distance [rad or m] from commanded joint values that no correction makes."""
+UNIT = (1e-3, 1e-3)
+"""Sigmas [m, rad] that weigh all samples alike."""
+MOST_LINES = 20
+"""Configurations up to which each has a line in the report."""
+MOVED = 0.3
+"""Share of the error that is left without one common motion, below which that is suspected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verification:
+    """Errors before and after a correction, and the verdict.
+
+    Attributes
+    ----------
+    comparison : Comparison
+        Residuals by the nominal and by the calibrated arm.
+    tolerance : float or None
+        Wanted RMS position error [m].
+    confidence : float
+        Of each limit.
+    group : (N,)
+        The configuration that each measurement belongs to; `configurations` counts them.
+    rms, lower, upper : float
+        RMS position error [m] over poses like these, and its limits.
+    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
+    needed : int or None
+        Configurations of which the same RMS error would decide, where it is undecided; None where
+        even MOST would not.
+    common : float
+        Share of the RMS error that is left without one common shift and turn of all positions.
+    by_program : bool
+        Whether the poses wanted are those of the program before its correction.
+    fitted : tuple of str
+        Frames that were fitted to the new measurements.
+
+    """
+
+    comparison: Comparison
+    tolerance: float | None
+    confidence: float
+    group: NDArray[np.intp]
+    rms: float
+    lower: float
+    upper: float
+    verdict: Verdict
+    needed: int | None
+    common: float
+    by_program: bool
+    fitted: tuple[str, ...] = ()
+
+    @property
+    def configurations(self) -> int:
+        """Return how many different configurations were measured."""
+        return int(self.group.max()) + 1
+
+
+def verify(
+    arm: CalibratedArm,
+    sets: Sequence[Observations],
+    tolerance: float | None,
+    confidence: float = 0.95,
+    new_base: bool = False,
+    commanded: FloatArray | None = None,
+    new_tool: bool = False,
+) -> Verification:
+    """Judge a calibrated arm on measurements that were not used for it.
+
+    Parameters
+    ----------
+    arm : CalibratedArm
+        Before and after.
+    sets : sequence of Observations
+        New measurements of poses or positions, in the frames of the calibration.
+    tolerance : float, optional
+        Largest RMS position error [m] that will do; without one there is no verdict.
+    confidence : float
+        Of the verdict.
+    new_base : bool
+        The measuring device stands elsewhere than for the calibration: its frame is fitted, which
+        costs the freedom of two configurations.
+    commanded : (M, n), optional
+        Joint values [rad or m] of the program before its correction: the nominal arm means there
+        what is wanted. The nearest belongs to a measurement.
+    new_tool : bool
+        Another target is on the flange than for the calibration, or the same was mounted anew: its
+        frame is fitted, which costs the freedom of one configuration.
+
+    Raises
+    ------
+    InputError
+        For too few configurations, distances, a device or target that the calibration does not
+        know, or measurements far from all that was commanded.
+
+    """
+    if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
+        raise ConfigError(
+            'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
+            f'{tolerance} and {confidence}'
+        )
+    for each in sets:
+        _check(arm.after, each)
+    before, after = arm.before, arm.after
+    wanted = sets
+    if commanded is not None:
+        after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
+        wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
+    before, after = (
+        _in_new_frames(chain, each, new_base, new_tool)
+        for chain, each in ((before, sets), (after, wanted))
+    )
+    comparison = replace(compare(before, after, sets), after=compare(before, after, wanted).after)
+    group = configurations(np.concatenate([each.joints for each in sets]))
+    moments = _moments(comparison.after.position, group)
+    lost = BASE_SHARE * new_base + TOOL_SHARE * new_tool
+    count = len(moments)
+    if count - lost < LEAST:
+        raise InputError(
+            f'{count} configurations were measured, at least {LEAST + lost} are needed: five are '
+            'usual (calib_ros plan --iso9283)'
+        )
+    spread = moments.sum(axis=0) / (count - lost)
+    freedom = _freedom(moments)
+    rms = float(np.sqrt(np.trace(spread)))
+
+    shaped = compare(before, _rebased(after, wanted), wanted).after
+    left = np.trace(_moments(shaped.position, group).sum(axis=0)) / max(count - BASE_SHARE, 1)
+    common = 1.0 if new_base else float(np.sqrt(left)) / rms
+    numbers = np.unique(np.geomspace(count, MOST, 200).astype(int))
+    lower, upper = rms_limits(rms, freedom * (numbers - lost), confidence)
+    verdict: Verdict = 'JUDGED'
+    needed = None
+    if tolerance is not None:
+        decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
+        needed = int(numbers[decided[0]]) if decided.size else None
+        verdict = 'PASS' if upper[0] <= tolerance else 'FAIL'
+        if lower[0] <= tolerance < upper[0]:
+            verdict = 'UNDECIDED'
+    return Verification(
+        comparison,
+        tolerance,
+        confidence,
+        group,
+        rms,
+        float(lower[0]),
+        float(upper[0]),
+        verdict,
+        needed,
+        common,
+        commanded is not None,
+        ('base',) * new_base + ('tool',) * new_tool,
+    )
+
+
+def rms_limits(
+    rms: float, freedom: FloatArray, confidence: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the one-sided limits (N,) of an RMS found with (N,) degrees of freedom."""
+    lower, upper = (
+        rms / np.sqrt(special.chdtri(freedom, 1.0 - level) / freedom)
+        for level in (confidence, 1.0 - confidence)
+    )
+    return lower, upper
+
+
+def _check(chain: Chain, observations: Observations) -> None:
+    """Refuse measurements that the calibration says nothing about."""
+    if observations.distances is not None or observations.socket:
+        raise InputError('to verify, poses or positions must be measured, not distances')
+    if not {observations.base, observations.tool} <= set(chain.frame_names):
+        raise InputError(
+            f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
+            f'{observations.base} and {observations.tool}: measure with the same device and target'
+        )
+
+
+def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
+    """Return the commanded joint values (N, n) that are nearest to those measured (N, n)."""
+    away = np.abs(joints[:, np.newaxis] - commanded).max(axis=2)
+    far = np.flatnonzero(away.min(axis=1) > FAR)
+    if far.size:
+        raise InputError(
+            f'measurement {far[0] + 1} was taken {away.min(axis=1)[far[0]]:.3g} rad or m from '
+            'the nearest commanded joint values: is it of that program?'
+        )
+    return np.asarray(commanded[away.argmin(axis=1)])
+
+
+def _in_new_frames(
+    chain: Chain, sets: Sequence[Observations], new_base: bool, new_tool: bool
+) -> Chain:
+    """Return the chain with base and tool frames, as asked, fitted to measured positions.
+
+    A new tool is turned as the orientations say, if any were measured. Where they hardly vary, the
+    tool keeps the translation that it had: the base takes up the same.
+    """
+    if new_base:
+        chain = _rebased(chain, sets)
+    if not new_tool:
+        return chain
+    names = [f'{each.tool}.{axis}' for each in sets for axis in 'xyz']
+    if new_base:
+        names = [f'{each.base}.{kind}' for each in sets for kind in FRAME_KINDS] + names
+    unoriented = [replace(each, oriented=np.zeros(len(each), bool)) for each in sets]
+    system = System(tuple(Samples(replace(each, covariance=None), *UNIT) for each in unoriented))
+    names = list(dict.fromkeys(names))
+    known = excited(triangular_factor(chain, names, system), names)
+    chain = minimise(chain, known, system).chain
+    for tool in dict.fromkeys(each.tool for each in sets):
+        turns = []
+        for each in sets:
+            if each.tool == tool and each.oriented.any():
+                now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]
+                measured = each.rotations[each.oriented]
+                turns.append(np.einsum('nji,njk->ik', now[:, :3, :3], measured))
+        if turns:
+            frame = chain.frame(tool)
+            matrix = frame.matrix.copy()
+            matrix[:3, :3] = matrix[:3, :3] @ se3.nearest_rotation(np.sum(turns, axis=0))
+            chain = chain.with_frame(tool, replace(frame, matrix=matrix))
+    return chain
+
+
+def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
+    """Return the chain with the base frames that bring it closest to measured positions."""
+    for base in dict.fromkeys(each.base for each in sets):
+        mine = [each for each in sets if each.base == base]
+        found = np.concatenate(
+            [chain.forward(e.joints, e.approach, e.base, e.tool)[:, :3, 3] for e in mine]
+        )
+        wanted = np.concatenate([each.positions for each in mine])
+        middle, goal = found.mean(axis=0), wanted.mean(axis=0)
+        turn = se3.nearest_rotation((wanted - goal).T @ (found - middle))
+        motion = se3.transform(turn, goal - turn @ middle)
+        frame = chain.frame(base)
+        chain = chain.with_frame(base, replace(frame, matrix=motion @ frame.matrix))
+    return chain
+
+
+def _freedom(moments: FloatArray) -> float:
+    """Return the degrees of freedom of one of the configurations with moments (K, 3, 3)."""
+    spread, count = moments.mean(axis=0), len(moments)
+    squares = np.trace(moments, axis1=1, axis2=2)
+    scatter = squares.var(ddof=1) / squares.mean() ** 2
+    scatter = ((count - 1) * scatter + 2.0 * POOLED) / (count - 1 + POOLED)
+    scatter *= 1.0 + np.sqrt(scatter / count)
+    return float(min(np.trace(spread) ** 2 / np.trace(spread @ spread), 2.0 / scatter))
+
+
+def _moments(errors: FloatArray, group: NDArray[np.intp]) -> FloatArray:
+    """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
+    each = errors[:, :, np.newaxis] * errors[:, np.newaxis]
+    sums = np.zeros((int(group.max()) + 1, 3, 3))
+    np.add.at(sums, group, each)
+    return sums / np.bincount(group)[:, np.newaxis, np.newaxis]
+
+
+def in_words(found: Verification) -> str:
+    """Return the verdict with all that it rests on."""
+    before, after = found.comparison.figures
+    share = 100.0 * found.confidence
+    lines = [
+        f'position error [mm] of {after.count} measurements in {found.configurations} '
+        'configurations',
+        '              RMS     mean      max   mean + 3 sigma',
+    ]
+    for label, figures in (('before', before), ('after', after)):
+        turn = '' if figures.rms_mrad is None else f'   (RMS {figures.rms_mrad:.3f} mrad)'
+        lines.append(
+            f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
+            f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
+        )
+    lines += _by_configuration(found)
+    if found.fitted:
+        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
+    verdict = '' if found.tolerance is None else f'{found.verdict}: '
+    wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
+    lines.append(
+        f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
+        f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
+    )
+    if not found.by_program:
+        lines.append(
+            'this is about the calibration: whether its correction arrives at the arm shows only '
+            'with the program as it was before (--commanded)'
+        )
+    if found.verdict == 'UNDECIDED':
+        enough = f'about {found.needed}' if found.needed else f'not even {MOST}'
+        lines.append(f'{enough} configurations with the same RMS error would decide')
+    if found.common < MOVED:
+        lines.append(
+            f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
+            'the error would be left: was the measuring device moved? If it stands elsewhere on '
+            'purpose, --new-base fits its frame, and --new-tool that of another target'
+        )
+    return '\n'.join(lines)
+
+
+def _by_configuration(found: Verification) -> list[str]:
+    """Return the accuracy and repeatability (ISO 9283) of a few configurations, line by line."""
+    if found.configurations > MOST_LINES:
+        return []
+    lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
+    for k in range(found.configurations):
+        before, after = (
+            1e3 * each.position[found.group == k]
+            for each in (found.comparison.before, found.comparison.after)
+        )
+        apart = np.linalg.norm(after - after.mean(axis=0), axis=1)
+        again = ''
+        if len(after) > 1:
+            again = f'{apart.mean() + 3.0 * apart.std(ddof=1):8.4f}'
+        lines.append(
+            f'  {k + 1:4} {len(after):10} {np.linalg.norm(before.mean(axis=0)):8.4f} '
+            f'{np.linalg.norm(after.mean(axis=0)):8.4f} {again}'
+        )
+    return lines

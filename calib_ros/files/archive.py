@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The folder in which a node keeps the journals and calibrations of one robot.
+
+Rows that cannot be written, because the disk is full say, wait in memory until they can be.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from calib_ros.atomic import whole_folder, write_file, write_files
+from calib_ros.errors import InputError
+from calib_ros.files.journal import Journal
+from calib_ros.files.tables import read_journal
+from calib_ros.sampling.sample import Sample
+
+CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
+
+
+class Archive:
+    """Files ROBOT_TIME of one robot.
+
+    Parameters
+    ----------
+    folder : Path
+        It is made if there is none.
+    robot : str
+        Name of the robot, with its serial number if there are several.
+    joints : int
+        Number of joints.
+    configuration : callable
+        Returns the configuration to write beside a journal.
+
+    Raises
+    ------
+    InputError
+        When no file can be written in the folder.
+
+    """
+
+    def __init__(
+        self, folder: Path, robot: str, joints: int, configuration: Callable[[], str]
+    ) -> None:
+        self.folder = folder
+        self.error = ''
+        """Why samples are in memory only; empty while all are in the journal."""
+        self._robot = re.sub(r'[^\w.-]', '_', robot)
+        self._joints = joints
+        self._configuration = configuration
+        self._journal: Journal | None = None
+        self._waiting: list[tuple[Sample, bool]] = []
+        self._path = self._new_path(JOURNAL)
+        self._due = False
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=folder):
+                pass
+        except OSError as err:
+            raise InputError(
+                f'samples cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
+                'in which files can be written'
+            ) from err
+
+    @property
+    def trouble(self) -> str:
+        """Return in words that samples would be lost by now; empty while all are on the disk."""
+        return f'samples are in memory only: {self.error}; ' if self.error else ''
+
+    @property
+    def journal(self) -> Path | None:
+        """Return the path of the journal, if there is one."""
+        return None if self._journal is None else self._journal.path
+
+    def add(self, sample: Sample) -> None:
+        """Keep a sample."""
+        self._waiting.append((sample, False))
+        self.write()
+
+    def remove(self, sample: Sample) -> None:
+        """Keep that a sample was taken back."""
+        if (sample, False) in self._waiting:
+            self._waiting.remove((sample, False))
+        else:
+            self._waiting.append((sample, True))
+        self.write()
+
+    def write(self) -> None:
+        """Write what waits, as far as that is possible; `error` tells whether it was."""
+        try:
+            if self._journal is None and (self._waiting or self._due):
+                self.folder.mkdir(parents=True, exist_ok=True)
+                write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
+                self._journal = Journal(self._path, self._joints)
+                self._due = False
+            while self._journal is not None and self._waiting:
+                sample, removed = self._waiting[0]
+                (self._journal.remove if removed else self._journal.add)(sample)
+                del self._waiting[0]
+        except OSError as err:
+            self.error = str(err)
+        else:
+            self.error = ''
+
+    def begin_anew(self) -> Path | None:
+        """Begin another journal; return the path of the old one, which stays.
+
+        The new one is written at once: after a crash it must be the newest.
+
+        Raises
+        ------
+        InputError
+            When samples cannot be written, which would be lost.
+
+        """
+        self.write()
+        if self._waiting:
+            raise InputError(
+                f'samples are in memory only and would be lost: {self.error}; make room, or start '
+                'the node again with another data_dir'
+            )
+        old = self.journal
+        self.close()
+        self._path = self._new_path(JOURNAL)
+        self._due = old is not None
+        self.write()
+        return old
+
+    def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
+        """Go on with the newest journal, if there is one; return its samples, and warnings.
+
+        Raises
+        ------
+        InputError
+            When it cannot be read.
+
+        """
+        found = self._files(JOURNAL)
+        if not found:
+            return (), (f'nothing to resume in {self.folder}: a new session begins',)
+        self._path = found[-1]
+        samples, warnings = read_journal(self._path, self._joints)
+        self._journal = Journal(self._path, self._joints)
+        return samples, warnings
+
+    def newest_calibration(self) -> Path | None:
+        """Return the calibration that was saved last."""
+        return next(reversed(self._files(CALIBRATION)), None)
+
+    def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
+        """Write a calibration, into a new file unless a path is given; return its path.
+
+        The configuration by which it was made, where that is known, is written beside it.
+
+        Raises
+        ------
+        InputError
+            When one of the files is there already.
+        OSError
+            When it cannot be written.
+
+        """
+        path = path or self._new_path(CALIBRATION)
+        beside = path.with_suffix(SETTINGS)
+        if configuration and beside.exists():
+            raise InputError(f'{beside} exists already: move it or choose another name')
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, text)
+        if configuration:
+            write_file(beside, configuration)
+        return path
+
+    def export(self, files: Mapping[str, str]) -> Path:
+        """Write files into a new folder, which is there with all of them or not at all.
+
+        Returns its path.
+        """
+        folder = self._new_path('')
+        with whole_folder(folder) as partial:
+            write_files(partial, files)
+        return folder
+
+    def close(self) -> None:
+        """Write what can be written, and close the journal."""
+        self.write()
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
+
+    def _new_path(self, ending: str) -> Path:
+        moment = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
+        return self.folder / f'{self._robot}_{moment}{ending}'
+
+    def _files(self, ending: str) -> list[Path]:
+        """Return the files of this robot that hold anything, the oldest first."""
+        name = re.compile(rf'{re.escape(self._robot)}_\d{{8}}T\d{{12}}Z{re.escape(ending)}')
+        found = self.folder.glob(f'*{ending}')
+        mine = [path for path in found if name.fullmatch(path.name)]
+        return sorted(path for path in mine if path.stat().st_size)

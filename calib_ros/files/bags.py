@@ -1,0 +1,458 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings: bag to session, and synthetic or tabulated measurements to bag."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import sqlite3
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cache, partial
+from mmap import ACCESS_READ, mmap
+from operator import attrgetter, itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.atomic import whole_folder, write_file
+from calib_ros.errors import InputError, shortened
+from calib_ros.files.mcap import (
+    LARGEST_CHUNK,
+    LARGEST_RATIO,
+    logged,
+    unindexed,
+    unpacked,
+    unpacked_size,
+)
+from calib_ros.files.salvage import NOT_CLOSED, Salvage, check, recorded, salvage, unpacked_files
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.se3 import FloatArray, to_quat
+from calib_ros.sampling.account import Account
+from calib_ros.sampling.intake import Stream, feed, links_of
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import VALIDATION
+from calib_ros.sampling.topics import Reading, check_joints, choose
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
+
+STORAGES = ('sqlite3', 'mcap')
+STORAGE = ('chunks', 'connections', 'path')
+TIMES = ('message_start_time', 'message_end_time')
+CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompressed_size')
+"""What the library does not promise: without them, it is asked for the messages itself."""
+BATCH = 2000
+"""Messages that are decoded at once."""
+LARGEST_MESSAGE = 65_536
+"""Bytes of a message; a joint state of a thousand joints has fewer."""
+ALLOW = 'take the rest all the same with --largest-loss'
+_LOSS = re.compile(r'stamp|lateness|buffer full|memory')
+_TWICE = re.compile(r'same stamp twice|is there already')
+STAND_NS = 400_000_000
+"""Time for which the arm stands at each row of a table that is made into a bag."""
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What was read of a bag, and warnings about the rest.
+
+    `recorded` is how many messages it should hold, None where that is not known, and `read` how
+    many of these could be read; a message that cannot be decoded was not read.
+    """
+
+    recorded: int | None
+    read: int
+    warnings: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """Return in words what was read."""
+        if self.recorded is None:
+            return f'read {self.read} messages of the bag; how many are lost is not known'
+        return f'read {self.read} of {self.recorded} messages of the bag'
+
+    def refusals(self, account: Account, largest_loss: float) -> tuple[str, ...]:
+        """Return why a result must not be accepted: more was lost than a share allows.
+
+        Lost is what could not be read and, of joint states and measurements each, what was
+        dropped for its stamp or for want of room. What the device did not see is not.
+        """
+        if self.recorded is None and largest_loss < 1.0:
+            return (f'how much of the bag is lost is not known, {ALLOW} 1',)
+        lost = {'of the messages could not be read': _share(self.recorded, self.read)}
+        for name, all_of_them in (('joints', account.joint_states), ('poses', account.poses)):
+            dropped = sum(
+                count
+                for cause, count in account.dropped.items()
+                if cause.startswith(name) and _LOSS.search(cause) and not _TWICE.search(cause)
+            )
+            cause = f'of the {name} were dropped for their stamps or for want of room'
+            lost[cause] = _share(all_of_them, all_of_them - dropped)
+        return tuple(
+            f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}'
+            for cause, share in lost.items()
+            if share > largest_loss
+        )
+
+
+def _share(expected: int | None, found: int) -> float:
+    """Return the share that is missing."""
+    return max(0.0, 1.0 - found / expected) if expected else 0.0
+
+
+def replay(path: Path, session: CalibrationSession) -> Replayed:
+    """Feed a bag to a session; return what could be read.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
+    session : CalibrationSession
+        Takes the messages; its settings name topics where the types leave a choice.
+
+    """
+    if not path.exists():
+        raise InputError(f'there is no bag at {path}')
+    with unpacked_files(path) as folder:
+        return _replay(path, folder, session)
+
+
+def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
+    """Feed the files in a folder, which are those of a bag or were unpacked from it."""
+    library = _rosbag2()
+    try:
+        check(folder)
+        reader = library.Reader(folder)
+        reader.open()
+    except Exception as err:  # a damaged file fails in many ways, in the library and below it
+        found = salvage(folder)
+        if found is None:
+            raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
+        return _salvaged(path, folder, found, session)
+    with closing(reader):
+        available = {c.topic: c.msgtype for c in reader.connections}
+        streams = _chosen(session, available, partial(read, reader))
+        counts = [c.msgcount for c in reader.connections if c.topic in streams]
+        expected = sum(count for count in counts if isinstance(count, int) and count > 0)
+        count, problem = _feed(session, read(reader, streams))
+    if problem is not None and count == 0:
+        found = salvage(folder)
+        if found is not None:
+            _check_joints(session, streams, found.on)
+            count, _ = _feed(session, found.on(streams))
+    _check_links(streams)
+    if problem is None:
+        return Replayed(expected, count, session.warnings)
+    lost = max(0, expected - count)
+    damaged = f'{path} is damaged ({shortened(problem)}): {lost} of {expected} messages are lost'
+    return Replayed(expected, count, (*session.warnings, damaged))
+
+
+def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSession) -> Replayed:
+    """Feed what could be read of a bag without the library."""
+    streams = _chosen(session, found.topics, found.on)
+    count, problem = _feed(session, found.on(streams))
+    _check_links(streams)
+    problem = problem or found.problem
+    total = recorded(folder if folder.is_dir() else folder.parent)
+    if total is None and found.whole:
+        total = found.count
+    if not problem and total == found.count:
+        return Replayed(total, found.count, session.warnings)
+    lost = 'how many are lost is not known'
+    if total is not None and not (total == found.count and problem == NOT_CLOSED):
+        lost = f'{max(0, total - found.count)} of {total} messages are lost'
+    damaged = (
+        f'{path} is damaged ({shortened(problem)}): {count} messages could be read and are used, '
+        f'{lost}'
+    )
+    return Replayed(total, found.count, (*session.warnings, damaged))
+
+
+def _chosen(
+    session: CalibrationSession, available: Mapping[str, str], messages_on: Reading
+) -> dict[str, Stream]:
+    """Return what is read of the topics available."""
+    streams = choose(available, session.settings, _decodable(messages_on))
+    _check_joints(session, streams, messages_on)
+    return streams
+
+
+def _check_joints(
+    session: CalibrationSession, streams: Mapping[str, Stream], messages_on: Reading
+) -> None:
+    """Refuse several topics of the same joints, unless they were named."""
+    joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
+    if len(joints) > 1 and not session.settings.joint_topics:
+        check_joints(_decodable(messages_on)(joints), session.joint_names, _deserialised)
+
+
+def _check_links(streams: Mapping[str, Stream]) -> None:
+    """Refuse sources that could not be measured between their frames."""
+    problems = [words for links in links_of(streams.values()) for words in links.problems()]
+    if problems:
+        raise InputError('; '.join(problems))
+
+
+def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+    """Return the messages of an open bag on some topics, in the order in which they were logged.
+
+    Those of mcap files come chunk by chunk, merged where chunks overlap in time, and as they
+    stand in the file where it has none. All others come as the library reads them.
+    """
+    storage = getattr(reader, 'storage', None)
+    storages = getattr(storage, 'storages', [storage])
+    if not all(map(_is_known, storages)):
+        connections = [c for c in reader.connections if c.topic in streams]
+        return (
+            (streams[c.topic], data)
+            for c, _, data in reader.messages(connections)
+            if c.msgtype == streams[c.topic].type
+        )
+    found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
+    if reader.compression_mode == 'message':
+        return ((stream, unpacked(data, 'zstd', LARGEST_MESSAGE)) for stream, data in found)
+    return found
+
+
+def _is_known(storage: Any) -> bool:
+    """Return whether it is a database, or an mcap file with what is needed of its index."""
+    if hasattr(storage, 'dbconn'):
+        return True
+    if not all(hasattr(storage, name) for name in STORAGE):
+        return False
+    return all(hasattr(each, name) for each in storage.chunks for name in CHUNK)
+
+
+def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+    """Yield the messages of a file; what is wrong with a chunk is raised at the end."""
+    wanted = [
+        each
+        for each in storage.connections
+        if each.topic in streams and each.msgtype == streams[each.topic].type
+    ]
+    channels = {each.id: streams[each.topic] for each in wanted}
+    if hasattr(storage, 'dbconn'):
+        if wanted:
+            yield from ((channels[c.id], data) for c, _, data in storage.messages(wanted))
+        return
+    with storage.path.open('rb') as file:
+        if not storage.chunks:
+            with closing(mmap(file.fileno(), 0, access=ACCESS_READ)) as content:
+                yield from unindexed(content, channels)
+            return
+        left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
+        problem: Exception | None = None
+        for overlapping in _together(storage.chunks, channels):
+            found: list[tuple[int, Stream, bytes]] = []
+            for chunk in overlapping:
+                file.seek(chunk.chunk_start_offset)
+                try:
+                    data = file.read(chunk.chunk_length)
+                    left -= unpacked_size(data)
+                    if left < 0:
+                        raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+                    messages, wrong = logged(data, channels)
+                except Exception as err:  # see `replay`
+                    messages, wrong = [], err
+                found += messages
+                problem = wrong or problem
+            if len(overlapping) > 1:
+                found.sort(key=itemgetter(0))
+            yield from ((stream, data) for _, stream, data in found)
+    if problem is not None:
+        raise problem
+
+
+def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
+    """Yield chunks that hold messages on some channels, those that overlap in time together.
+
+    As far as they fit into memory; messages may come in any order.
+    """
+    together: list[Any] = []
+    end = size = 0
+    for chunk in sorted(chunks, key=attrgetter('message_start_time', 'chunk_start_offset')):
+        counts = chunk.channel_count  # empty where the recorder wrote no index of messages
+        if counts and not any(counts.get(key) for key in channels):
+            continue
+        size += chunk.uncompressed_size
+        if together and (chunk.message_start_time >= end or size > LARGEST_CHUNK):
+            yield sorted(together, key=attrgetter('chunk_start_offset'))
+            together, end, size = [], 0, chunk.uncompressed_size
+        together.append(chunk)
+        end = max(end, chunk.message_end_time)
+    if together:
+        yield sorted(together, key=attrgetter('chunk_start_offset'))
+
+
+def _rosbag2() -> Any:
+    """Return the library that reads and writes bags; nothing but bags needs it.
+
+    Raises
+    ------
+    InputError
+        When it is not installed: Ubuntu does not package it.
+
+    """
+    try:
+        from rosbags import rosbag2
+    except ImportError as err:
+        raise InputError(
+            f'bags need the Python package rosbags, which is not installed ({err}): pip install '
+            'rosbags, in a virtual environment where the system is managed (README, "Bags"); '
+            'tables (--csv) and the node do without'
+        ) from err
+    return rosbag2
+
+
+@cache
+def _typestore() -> Any:
+    """Return the library's message types, which take a tenth of a second that few bags need."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def _deserialised(data: bytes, kind: str) -> Any:
+    return _typestore().deserialize_cdr(data, kind)
+
+
+def _is_message(data: object) -> bool:
+    """Tell whether it may be a message: a file may hold anything."""
+    return isinstance(data, bytes) and len(data) <= LARGEST_MESSAGE
+
+
+def _decodable(messages_on: Reading) -> Reading:
+    """Leave out what cannot be a message; `_feed` tells of it."""
+    return lambda streams: (each for each in messages_on(streams) if _is_message(each[1]))
+
+
+def _feed(
+    session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
+) -> tuple[int, str | None]:
+    """Feed serialised messages; return how many, and what is wrong with the others if any."""
+    count, problem, ended = 0, None, False
+    while not ended:
+        batch: list[tuple[Stream, bytes]] = []
+        try:
+            batch.extend(itertools.islice(messages, BATCH))  # up to an error
+            ended = len(batch) < BATCH
+        except Exception as err:  # see `replay`
+            problem, ended = str(err) or type(err).__name__, True
+        usable = [each for each in batch if _is_message(each[1])]
+        problems = feed(session, usable, _deserialised)
+        count += len(usable) - len(problems)
+        if len(usable) < len(batch):
+            problems.append(f'messages without data, or of more than {LARGEST_MESSAGE} bytes')
+        problem = (problem, *problems)[-1]
+    session.finish()
+    return count, problem
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What to write into a bag: joint samples (M, n), poses (N) and which of those judge only."""
+
+    joint_names: tuple[str, ...]
+    joint_stamps_ns: NDArray[np.int64]
+    joints: FloatArray
+    poses: Observations
+    held_out: NDArray[np.bool_]
+
+    @classmethod
+    def of_dwells(
+        cls,
+        joint_names: tuple[str, ...],
+        observations: Observations,
+        held_out: NDArray[np.bool_],
+    ) -> Recording:
+        """Turn a table into a recording: the arm stands for a while at every row."""
+        count = len(observations)
+        begin = (1 + np.arange(count)[:, np.newaxis]) * 1_000_000_000
+        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 4)
+        return cls(
+            joint_names,
+            stamps.ravel(),
+            np.repeat(observations.joints, stamps.shape[1], axis=0),
+            observations.at(begin.ravel() + STAND_NS * 3 // 4),
+            held_out,
+        )
+
+
+def write_bag(
+    path: Path,
+    recording: Recording,
+    storage: str = 'mcap',
+    beside: Mapping[Path, str] | None = None,
+) -> None:
+    """Write a recording as a rosbag2 folder, in the order of the stamps, as a whole or not at all.
+
+    Topics: /joint_states, and /measured_pose or /measured_point; /validation_pose or
+    /validation_point for held-out poses. Files `beside` the bag are there before it is.
+
+    Raises
+    ------
+    InputError
+        When there is something at the path already.
+    OSError
+        When it cannot be written, because the disk is full say.
+
+    """
+    with whole_folder(path) as folder:
+        try:
+            _write_bag(folder, recording, storage)
+        except (OSError, sqlite3.Error) as err:
+            raise OSError(f'cannot write {path}: {err}') from err
+        for file, text in (beside or {}).items():
+            write_file(file, text, overwrite=True)
+
+
+def _write_bag(path: Path, recording: Recording, storage: str) -> None:
+    library = _rosbag2()
+    store = _typestore()
+    types = store.types
+    time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
+    joint_state, poses = types[JOINT_STATE], recording.poses
+    oriented = bool(poses.oriented.all())
+    kind = f'geometry_msgs/msg/{"PoseStamped" if oriented else "PointStamped"}'
+    noun = 'pose' if oriented else 'point'
+    none = np.zeros(0)
+    quats = to_quat(poses.rotations)
+
+    def head(stamp_ns: int, frame_id: str) -> Any:
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        return header(time(sec=seconds, nanosec=nanoseconds), frame_id)
+
+    def measured(k: int, stamp_ns: int) -> Any:
+        point = types['geometry_msgs/msg/Point'](*poses.positions[k].tolist())
+        if not oriented:
+            return types[kind](head(stamp_ns, 'tracker'), point)
+        turn = types['geometry_msgs/msg/Quaternion'](*quats[k].tolist())
+        pose = types['geometry_msgs/msg/Pose'](point, turn)
+        return types[kind](head(stamp_ns, 'tracker'), pose)
+
+    stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
+    names = list(recording.joint_names)
+    plugin = library.StoragePlugin[storage.upper()]
+    with library.Writer(path, version=9, storage_plugin=plugin) as writer:
+        joint_connection = writer.add_connection('/joint_states', JOINT_STATE, typestore=store)
+        pose_connections = [
+            writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)
+            for prefix in ('measured_', VALIDATION)[: 1 + int(recording.held_out.any())]
+        ]
+        for k in np.argsort(stamps, kind='stable').tolist():
+            stamp_ns = int(stamps[k])
+            if k < len(recording.joints):
+                values = np.ascontiguousarray(recording.joints[k])
+                message = joint_state(head(stamp_ns, ''), names, values, none, none)
+                data = store.serialize_cdr(message, JOINT_STATE)
+                writer.write(joint_connection, stamp_ns, data)
+                continue
+            k -= len(recording.joints)
+            data = store.serialize_cdr(measured(k, stamp_ns), kind)
+            writer.write(pose_connections[int(recording.held_out[k])], stamp_ns, data)

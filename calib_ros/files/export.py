@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A corrected chain in the forms that controllers and other software read.
+
+    dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta; exact
+    dh_standard.yaml, dh_modified.yaml the same as chain files, with base and tool; exact
+    kinematics.yaml                    x y z roll pitch yaw from joint to joint; exact
+    dh_without_beta.csv                the best table for controllers that know no beta
+    joint_offsets.csv                  the best correction by joint offsets alone
+
+Both conventions differ only in where a row is cut: Tx(a) Rx(alpha) Ry(beta) ends the row of a
+joint in the one and begins that of the next joint in the other. Every file is read back and held
+against the chain on random poses; an exact one that differs is refused, of the others the error
+that remains is written at their head.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib_ros.errors import CalibrationError
+from calib_ros.escapes import from_cell, to_cell
+from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import DH_KINDS, Chain, Frame, Joint, JointType
+from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain
+from calib_ros.kinematics.se3 import FloatArray
+
+EXACT = 1e-9
+"""Largest difference [m, and in rotation matrices] of an export that is called exact."""
+POSES = 1000
+FITTED = 200
+"""Poses to which a table that cannot be exact is fitted; it is judged on all."""
+FILES = (
+    *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
+    *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
+)
+CORRECTED_URDF = '_corrected.urdf'
+"""End of the name of a corrected URDF beside these files."""
+ROW = ('joint', 'type', 'sign', *DH_KINDS)
+
+
+class ExportError(CalibrationError):
+    """An export that does not say what the chain says."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """A file, and the largest position error [m] of the arm that it describes."""
+
+    name: str
+    content: str
+    error: float
+
+
+def exports(
+    chain: Chain,
+    nominal: Chain,
+    joints: FloatArray | None = None,
+    origin: Mapping[str, Any] | None = None,
+) -> tuple[Export, ...]:
+    """Return a corrected chain in all forms.
+
+    Parameters
+    ----------
+    chain, nominal : Chain
+        The corrected chain and the one that the controller has.
+    joints : (N, n), optional
+        Where tables that cannot be exact should be best [rad or m]; all over the joint range by
+        default.
+    origin : mapping, optional
+        Where the numbers come from, for the record.
+
+    Raises
+    ------
+    ExportError
+        When a file, read back, differs from the chain.
+
+    """
+    rng = np.random.default_rng(0)
+    q = chain.random_joints(POSES, rng)
+    arm = replace(chain, effects=())
+    lost = _distance(chain.forward(q), arm.forward(q)) if chain.effects else 0.0
+    found = []
+    for convention in ('standard', 'modified'):
+        form = converted(arm, convention)
+        what = f'{convention} Denavit-Hartenberg table'
+        text = _csv(form, what, lost)
+        again = _read_csv(text, form)
+        found.append(_checked(f'dh_{convention}.csv', text, arm, again.forward(q), q, lost))
+        text = head(form, what, lost) + dump_chain(form, origin)
+        again = parse_chain(text)
+        found.append(_checked(f'dh_{convention}.yaml', text, arm, again.forward(q), q, lost))
+    text = kinematics_yaml(arm, origin)
+    found.append(_checked('kinematics.yaml', text, arm, forward_of(text, arm, q), q, lost))
+    region = q if joints is None else np.asarray(joints, dtype=np.float64)
+    for name, kinds, what in (
+        ('dh_without_beta.csv', DH_KINDS[:4], 'table without beta, the best one'),
+        ('joint_offsets.csv', ('zero',), 'nominal table with corrected joint offsets only'),
+    ):
+        best = _approximated(chain, nominal, kinds, region)
+        error = _distance(best.forward(region), chain.forward(region))
+        found.append(Export(name, _csv(best, f'{nominal.convention} {what}', error), error))
+    return tuple(found)
+
+
+def converted(chain: Chain, convention: str) -> Chain:
+    """Return the same arm by another convention; what is cut off goes into base and tool."""
+    if chain.convention == convention:
+        return chain
+    tails = [(joint.a, joint.alpha, joint.beta) for joint in chain.joints]
+    base, tool = chain.frame('base'), chain.frame('tool')
+    if convention == 'modified':
+        tool = replace(tool, matrix=_tail(*tails[-1]) @ tool.matrix)
+        tails = [(0.0, 0.0, 0.0), *tails[:-1]]
+    else:
+        base = replace(base, matrix=base.matrix @ _tail(*tails[0]))
+        tails = [*tails[1:], (0.0, 0.0, 0.0)]
+    joints = tuple(
+        replace(joint, a=a, alpha=alpha, beta=beta)
+        for joint, (a, alpha, beta) in zip(chain.joints, tails, strict=True)
+    )
+    return Chain(
+        name=chain.name,
+        convention='modified' if convention == 'modified' else 'standard',
+        joints=joints,
+        base=base,
+        tool=tool,
+        effects=chain.effects,
+        gravity=chain.gravity,
+    )
+
+
+def _tail(a: float, alpha: float, beta: float) -> FloatArray:
+    """Return Tx(a) Rx(alpha) Ry(beta)."""
+    turn = se3.exp_rotation(np.array([alpha, 0.0, 0.0])) @ se3.exp_rotation(
+        np.array([0.0, beta, 0.0])
+    )
+    return se3.transform(turn, np.array([a, 0.0, 0.0]))
+
+
+def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
+    """Return the pose of each joint in the frame of the one before, as vendors write it.
+
+    The first is given in the arm's base, the last frame is the flange. A joint turns about, or
+    slides along, the z axis of its frame.
+    """
+    form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
+    names = (*chain.joint_names, 'flange')
+    poses = {name: xyz_rpy(place) for name, place in zip(names, origins(form), strict=True)}
+    document: dict[str, Any] = {
+        'kinematics': poses,
+        'signs': {joint.name: joint.sign for joint in form.joints},
+    }
+    digest = hashlib.sha256(dump_yaml(document).encode()).hexdigest()
+    document['hash'] = f'sha256_{digest}'
+    if origin:
+        document['calibration'] = dict(origin)
+    return dump_yaml(document)
+
+
+def origins(form: Chain) -> FloatArray:
+    """Return the frames of the joints of a modified chain, each in the one before, and the flange.
+
+    Shape (n + 1, 4, 4), at zero. The flange is the tool of the chain.
+    """
+    rows = [replace(joint, sign=1) for joint in form.joints]
+    chains = [Chain(form.name, 'modified', (row,), parallel=()) for row in rows]
+    places = [chain.forward(np.zeros((1, 1)))[0] for chain in chains]
+    return np.array([*places, form.frame('tool').matrix])
+
+
+def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
+    """Return the target's poses (N, 4, 4) by a kinematics file, in the frames of a chain."""
+    import yaml
+
+    document = yaml.safe_load(text)
+    poses, signs = document['kinematics'], document['signs']
+    pose = np.broadcast_to(chain.frame('base').matrix, (len(q), 4, 4))
+    for joint, values in zip(chain.joints, q.T, strict=True):
+        moved = np.tile(np.eye(4), (len(q), 1, 1))
+        if joint.type == 'revolute':
+            turn = np.zeros((len(q), 3))
+            turn[:, 2] = signs[joint.name] * values
+            moved[:, :3, :3] = se3.exp_rotation(turn)
+        else:
+            moved[:, 2, 3] = signs[joint.name] * values
+        pose = pose @ pose_matrix(poses[joint.name]) @ moved
+    return np.asarray(pose @ pose_matrix(poses['flange']) @ chain.frame('tool').matrix)
+
+
+def xyz_rpy(matrix: FloatArray) -> dict[str, float]:
+    """Return a pose (4, 4) as x, y, z [m] and the angles [rad] about fixed axes."""
+    angles = Rotation.from_matrix(matrix[:3, :3]).as_euler('xyz')
+    numbers = [*matrix[:3, 3].tolist(), *angles.tolist()]
+    return dict(zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), numbers, strict=True))
+
+
+def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
+    """Return the pose (4, 4) that x, y, z, roll, pitch, yaw say."""
+    rotation = Rotation.from_euler('xyz', [pose[k] for k in ('roll', 'pitch', 'yaw')])
+    return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
+
+
+def head(chain: Chain, what: str, error: float) -> str:
+    """Return the line that says what a file is, and how far [m] from the calibrated arm."""
+    name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
+    exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
+    return f'# {name}: {what}; metres and radians; {exact}\n'
+
+
+def _csv(chain: Chain, what: str, error: float) -> str:
+    """Return the table of a chain with a line that says what it is."""
+    text = io.StringIO()
+    text.write(head(chain, what, error))
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(ROW)
+    for joint in chain.joints:
+        numbers = [repr(float(getattr(joint, kind))) for kind in DH_KINDS]
+        writer.writerow([to_cell(joint.name), joint.type, joint.sign, *numbers])
+    return text.getvalue()
+
+
+def _read_csv(text: str, form: Chain) -> Chain:
+    """Return a chain with the rows of a table, in the frames of another one."""
+    joints = []
+    for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
+        kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'
+        a, alpha, d, theta, beta = (float(row[name]) for name in DH_KINDS)
+        name = from_cell(row['joint'])
+        joints.append(Joint(name, kind, a, alpha, d, theta, beta, int(row['sign'])))
+    return replace(form, joints=tuple(joints))
+
+
+def _checked(
+    name: str, text: str, chain: Chain, again: FloatArray, q: FloatArray, lost: float
+) -> Export:
+    difference = float(np.abs(again - chain.forward(q)).max())
+    if not difference <= EXACT:
+        raise ExportError(
+            f'{name}, read back, differs from the calibration by {difference:.3g} m or more in '
+            'rotation: it is not written'
+        )
+    return Export(name, text, lost)
+
+
+def _distance(first: FloatArray, second: FloatArray) -> float:
+    return float(np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max())
+
+
+def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: FloatArray) -> Chain:
+    """Return the nominal chain with some kinds of parameters fitted to another one.
+
+    `zero` stands for the joints' offsets. Base and tool are fitted as well.
+    """
+    start = replace(
+        nominal,
+        parallel=(),
+        base=chain.frame('base'),
+        tool=chain.frame('tool'),
+        frames=(),
+        effects=(),
+    )
+    driven = {
+        f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}' for joint in start.joints
+    }
+    names = [
+        name
+        for name in start.parameter_names
+        if start.owns_frame(name)
+        or name.partition('.')[2] in kinds
+        or ('zero' in kinds and name in driven)
+    ]
+    joints = joints[:: max(1, len(joints) // FITTED)]
+    poses = chain.forward(joints)
+    observations = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
+    system = System((Samples(observations, 1e-4, 1e-3),))
+    return minimise(start, structurally_independent(start, names), system).chain

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The journal: every sample at once on disk, in a table that can be identified by itself.
+
+A row is written by one call, so that a process that is killed leaves whole rows; a row that a
+crash of the machine cut off is left out when the journal is read again. A sample that is taken
+back gets a second row, marked `removed`; nothing is ever deleted.
+"""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from calib_ros.errors import InputError
+from calib_ros.files.tables import cells, columns
+from calib_ros.sampling.sample import Sample
+
+
+class Journal:
+    """An open journal, which only grows and which no other process can open meanwhile.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it is made if there is none, else rows are added.
+    joints : int
+        Number of joints.
+
+    Raises
+    ------
+    InputError
+        When the file is that of another robot, or another process writes it.
+    OSError
+        When it cannot be written.
+
+    """
+
+    def __init__(self, path: Path, joints: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            self._lock()
+            self._begin(columns(joints))
+        except BaseException:
+            self.close()
+            raise
+
+    def add(self, sample: Sample) -> None:
+        """Write a sample.
+
+        Raises
+        ------
+        OSError
+            When the disk is full, say; what was written before is whole.
+
+        """
+        self._write(cells(sample))
+
+    def remove(self, sample: Sample) -> None:
+        """Write that a sample was taken back."""
+        self._write(cells(sample, 'removed'))
+
+    def sync(self) -> None:
+        """Wait until everything is on the disk, to survive a power failure too."""
+        os.fsync(self._file)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _lock(self) -> None:
+        """Keep others out until the file is closed or the process has ended."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f'{self.path} is being written by another process: give each robot a serial or '
+                'a data_dir of its own'
+            ) from None
+        except OSError:  # a file system without locks: a journal without one is better than none
+            return
+
+    def _begin(self, header: Sequence[str]) -> None:
+        """Write the header into a new file; leave out what a crash cut off."""
+        expected = ','.join(header).encode() + b'\n'
+        found = os.pread(self._file, len(expected), 0)
+        if not expected.startswith(found):
+            raise InputError(
+                f'{self.path} has not the columns of a journal of this robot: move it away'
+            )
+        if found != expected:
+            os.ftruncate(self._file, 0)
+            self._write(header)
+            return
+        size = os.fstat(self._file).st_size
+        if os.pread(self._file, 1, size - 1) != b'\n':
+            os.ftruncate(self._file, _last_line(self._file, size))
+
+    def _write(self, row: Sequence[str]) -> None:
+        text = io.StringIO()
+        csv.writer(text).writerow(row)  # by its own end of lines it quotes names with any
+        data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
+        begin = os.fstat(self._file).st_size
+        written = os.write(self._file, data)
+        if written < len(data):  # the disk is full: no half row may stay
+            os.ftruncate(self._file, begin)
+            raise OSError(f'{self.path}: the disk is full, the sample was not written')
+
+
+def _last_line(file: int, size: int) -> int:
+    """Return where the last, unfinished line begins."""
+    data = os.pread(file, min(size, 1 << 16), max(0, size - (1 << 16)))
+    return size - len(data) + data.rfind(b'\n') + 1

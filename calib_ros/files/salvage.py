@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What can still be read of a damaged recording: cut off, or never closed by its recorder.
+
+An intact recording is read by its index. A damaged one has none, so its files are read from
+their beginning up to the damage. So are those that the library, which trusts them, must not open.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import sqlite3
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files import mcap
+from calib_ros.texts import parse_yaml, read_text
+
+LARGEST_METADATA = 1_000_000
+"""Bytes of a metadata.yaml."""
+PART = 1 << 20
+"""Bytes of a file that are unpacked at once."""
+NOT_CLOSED = 'the recording was not closed'
+GROWING = {
+    'topics': 'SELECT id FROM topics NOT INDEXED',
+    'messages': 'SELECT id FROM messages NOT INDEXED',
+    'message_definitions': 'SELECT id FROM message_definitions NOT INDEXED',
+    'timestamp_idx': 'SELECT timestamp, id FROM messages INDEXED BY timestamp_idx ORDER BY 1, 2',
+}
+"""What must grow from row to row; in a file that was made to be endless it comes again."""
+_PLAIN = re.compile(r'CREATE (TABLE|INDEX) (?!.*\b(AS|GENERATED)\b)', re.IGNORECASE | re.DOTALL)
+_NUMBERED = re.compile(r'[^(]*\(\s*id INTEGER PRIMARY KEY', re.IGNORECASE)
+
+Stream = TypeVar('Stream')
+
+
+def recorded(path: Path) -> int | None:
+    """Return how many messages the recorder says it has written; None when it does not."""
+    try:
+        text = read_text(path / 'metadata.yaml', LARGEST_METADATA)
+    except ConfigError:
+        return None
+    found = re.search(r'^  message_count: ([0-9]{1,15})\s*$', text, re.MULTILINE)
+    return None if found is None else int(found.group(1))
+
+
+@contextmanager
+def unpacked_files(path: Path) -> Iterator[Path]:
+    """Give a bag folder whose files are not compressed: it itself, or one that goes away again.
+
+    Raises
+    ------
+    InputError
+        When a file unpacks to more than any recording does.
+
+    """
+    packed = sorted(path.glob('*.zstd')) if path.is_dir() else []
+    if not packed:
+        yield path
+        return
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for file in packed:
+            _unpack_file(file, folder / file.stem)
+        with suppress(ConfigError):
+            text = read_text(path / 'metadata.yaml', LARGEST_METADATA)
+            text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
+            (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
+        yield folder
+
+
+def _unpack_file(file: Path, target: Path) -> None:
+    """Unpack a file, as far as it is whole."""
+    left = mcap.LARGEST_CHUNK + mcap.LARGEST_RATIO * file.stat().st_size
+    try:
+        with target.open('wb') as out, mcap.open_zstd(file) as packed:
+            while part := packed.read(PART):
+                left -= len(part)
+                if left < 0:
+                    raise InputError(f'{file} unpacks to {mcap.LARGEST_RATIO} times its size')
+                out.write(part)
+    except (InputError, OSError):  # the latter of a full disk
+        raise
+    except Exception:  # decompressors have errors of their own; what is missing will be told
+        return
+
+
+def check(path: Path) -> None:
+    """Refuse a bag folder or file that the library must not open, though messages may be in it.
+
+    Raises
+    ------
+    CalibrationError, ValueError, sqlite3.Error
+        When it may stand for more than it holds, or is damaged.
+
+    """
+    metadata = path / 'metadata.yaml'
+    if metadata.exists():
+        parse_yaml(read_text(metadata, LARGEST_METADATA), str(metadata))
+    for file in _files(path):
+        if file.suffix == '.db3':
+            with closing(_open(file)) as connection:
+                _check_layout(connection)
+                _check_rows(connection)
+        elif not mcap.is_indexed(file):
+            raise ValueError('it has no index, and no messages could be found without')
+
+
+@dataclass
+class Salvage:
+    """Topics with their types, how many messages there are, and what is wrong; empty if nothing.
+
+    `whole` tells whether each file could be read to its end.
+    """
+
+    files: tuple[Path, ...]
+    topics: dict[str, str] = field(default_factory=dict)
+    count: int = 0
+    problem: str = ''
+    whole: bool = True
+
+    def messages(self) -> Iterator[tuple[str, bytes]]:
+        """Yield the serialised messages as (topic, data), up to the damage in each file."""
+        for file in self.files:
+            yield from (_of_sqlite3 if file.suffix == '.db3' else _of_mcap)(file, self)
+
+    def note(self, problem: str) -> None:
+        """Note why a file could not be read to its end."""
+        self.problem, self.whole = problem, False
+
+    def on(self, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+        """Yield the messages on some topics, as what these carry."""
+        return ((streams[topic], data) for topic, data in self.messages() if topic in streams)
+
+
+def salvage(path: Path) -> Salvage | None:
+    """Return what can be read of a bag folder or file; None when nothing can."""
+    found = Salvage(_files(path))
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        found.problem = NOT_CLOSED
+    found.count = sum(1 for _ in found.messages())
+    return found if found.count else None
+
+
+def _files(path: Path) -> tuple[Path, ...]:
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return tuple(file for file in files if file.suffix in ('.mcap', '.db3'))
+
+
+def _open(file: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f'{file.resolve().as_uri()}?mode=ro&immutable=1', uri=True)
+
+
+def _check_layout(connection: sqlite3.Connection) -> None:
+    """Refuse a database that computes what it holds: views, virtual tables and columns."""
+    for name, statement in connection.execute('SELECT name, sql FROM sqlite_master'):
+        if statement is None:  # an index that comes with a table
+            continue
+        plain = isinstance(statement, str) and _PLAIN.match(statement)
+        if not plain or (name in ('topics', 'messages') and not _NUMBERED.match(statement)):
+            raise ValueError(f'"{name}" is not what a recorder makes')
+
+
+def _check_rows(connection: sqlite3.Connection) -> None:
+    """Refuse a database that holds a part of itself again, and so never ends."""
+    names = {name for (name,) in connection.execute('SELECT name FROM sqlite_master')}
+    for name in names & set(GROWING):
+        for _ in _growing(connection.execute(GROWING[name]), name):
+            pass
+
+
+def _growing(rows: Iterable[tuple[Any, ...]], name: str) -> Iterator[tuple[Any, ...]]:
+    """Yield rows whose first cell grows, or the first two together."""
+    before: tuple[Any, ...] | None = None
+    for row in rows:
+        if before is not None and row[:2] <= before:
+            raise ValueError(f'rows of "{name}" come again')
+        before = row[:2]
+        yield row
+
+
+def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
+    with closing(_open(file)) as connection:
+        try:
+            connection.execute('PRAGMA writable_schema=ON')
+            _check_layout(connection)
+            rows = connection.execute('SELECT id, name, type FROM topics')
+            topics = {key: (name, kind) for key, name, kind in _growing(rows, 'topics')}
+            found.topics |= dict(topics.values())
+            rows = connection.execute('SELECT id, topic_id, data FROM messages ORDER BY id')
+            for _, key, data in _growing(rows, 'messages'):
+                yield topics[key][0], data
+            (pages,) = connection.execute('PRAGMA page_count').fetchone()
+            (size,) = connection.execute('PRAGMA page_size').fetchone()
+            if pages * size > file.stat().st_size:
+                found.note('the file is cut off')
+        except Exception as err:  # numbers, texts and names may be anything
+            found.note(str(err) or type(err).__name__)
+
+
+def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
+    schemas: dict[int, str] = {}
+    channels: dict[int, str] = {}
+    try:
+        with (
+            file.open('rb') as opened,
+            closing(mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ)) as content,
+        ):
+            if content[: len(mcap.MAGIC)] != mcap.MAGIC:
+                raise ValueError('no mcap file')
+            for kind, record in mcap.records(content, len(mcap.MAGIC)):
+                if kind == mcap.SCHEMA:
+                    (key,) = struct.unpack_from('<H', record)
+                    schemas[key] = mcap.string(record, 2)
+                elif kind == mcap.CHANNEL:
+                    key, schema = struct.unpack_from('<HH', record)
+                    channels[key] = mcap.string(record, 4)
+                    found.topics[channels[key]] = schemas[schema]
+                elif kind == mcap.MESSAGE:
+                    (key,) = struct.unpack_from('<H', record)
+                    yield channels[key], record[mcap.MESSAGE_HEAD :]
+                elif kind == mcap.DATA_END:
+                    return
+        found.problem = NOT_CLOSED
+    except Exception as err:  # decompressors have errors of their own
+        found.note(f'cut off or damaged: {err}')

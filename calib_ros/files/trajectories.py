@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Robot programs in files: tables of joint values (CSV) and JointTrajectory messages (YAML).
+
+What is not a joint value, velocity or acceleration of the arm is written as it was read.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros.apply.compensation import Program
+from calib_ros.errors import InputError
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, parse_yaml, read_text
+from calib_ros.values import parse_number, parse_numbers
+
+RATES = ('positions', 'velocities', 'accelerations')
+"""What a point of a JointTrajectory holds that a correction changes."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramFile:
+    """A program, where each of its samples stands in the file, and how to write it again."""
+
+    program: Program
+    places: tuple[str, ...]
+    text_with: Callable[[Program], str]
+
+
+def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
+    """Read a program for an arm with the named joints: CSV, or YAML by the file's suffix.
+
+    CSV: joint values in q1 ... qn, in the order of the arm; s1 ... sn, if present, are the signs
+    of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic echo` prints
+    it.
+
+    Raises
+    ------
+    InputError
+        For a file that is neither, or that lacks something; the message names the place.
+
+    """
+    readers = {'.csv': _read_csv, '.yaml': _read_yaml, '.yml': _read_yaml}
+    if path.suffix.lower() not in readers:
+        raise InputError(
+            f'{path} must be a table (.csv with q1 ... qn) or a JointTrajectory (.yaml)'
+        )
+    reader = readers[path.suffix.lower()]
+    largest = LARGEST_TABLE if reader is _read_csv else LARGEST_TEXT
+    return reader(read_text(path, largest, InputError), str(path), joints)
+
+
+def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
+    reader = csv.reader(io.StringIO(text, newline=''))
+    try:
+        lines = [(reader.line_num, row) for row in reader if row]
+    except csv.Error as err:
+        raise InputError(f'cannot read {where}: {err}') from err
+    if len(lines) < 2:
+        raise InputError(f'{where} has no rows')
+    (_, header), *rows = lines
+    names = [f'q{k + 1}' for k in range(len(joints))]
+    for name in names:
+        if header.count(name) != 1:
+            raise InputError(
+                f'{where} must have one column {name}, not {header.count(name)}; expected '
+                f'{", ".join(names)}, found {", ".join(header)}'
+            )
+    if f'q{len(joints) + 1}' in header:
+        raise InputError(
+            f'{where} has a column q{len(joints) + 1}, but the arm has {len(joints)} joints only'
+        )
+    for line, row in rows:
+        if len(row) != len(header):
+            raise InputError(f'{where}, line {line}: {len(row)} values for {len(header)} columns')
+
+    def values(columns: Sequence[str]) -> FloatArray:
+        index = [header.index(name) for name in columns]
+        return np.array(
+            [
+                [
+                    parse_number(row[i], f'{where}, line {line}: {header[i]}', InputError)
+                    for i in index
+                ]
+                for line, row in rows
+            ]
+        )
+
+    signs = [f's{k + 1}' for k in range(len(joints))]
+    program = Program(
+        tuple(joints),
+        values(names),
+        approach=np.sign(values(signs)) if set(signs) <= set(header) else None,
+    )
+
+    def text_with(corrected: Program) -> str:
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator='\n')
+        writer.writerow(header)
+        for (_, row), joint_values in zip(rows, corrected.positions.tolist(), strict=True):
+            new = dict(zip(names, map(repr, joint_values), strict=True))
+            writer.writerow([new.get(name, cell) for name, cell in zip(header, row, strict=True)])
+        return out.getvalue()
+
+    return ProgramFile(program, tuple(f'line {line}' for line, _ in rows), text_with)
+
+
+def _read_yaml(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
+    import yaml
+
+    message = parse_yaml(text, where, InputError)
+    names = message.get('joint_names') if isinstance(message, dict) else None
+    points = message.get('points') if isinstance(message, dict) else None
+    if not isinstance(names, list) or not isinstance(points, list) or not points:
+        raise InputError(
+            f'{where} must be a trajectory_msgs/JointTrajectory with joint_names and points'
+        )
+    for k, point in enumerate(points):
+        if not isinstance(point, dict):
+            raise InputError(
+                f'{where}, point {k + 1} must be a mapping, not {point!r}; a message that was cut '
+                'short is printed as a whole by ros2 topic echo --full-length'
+            )
+    program = trajectory_program(names, points, where)
+
+    def text_with(corrected: Program) -> str:
+        arrays = {
+            key: array.tolist() for key in RATES if (array := getattr(corrected, key)) is not None
+        }
+        new = [
+            point | {key: rows[k] for key, rows in arrays.items()}
+            for k, point in enumerate(points)
+        ]
+        dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
+        return str(
+            yaml.dump(
+                message | {'points': new},
+                Dumper=dumper,
+                sort_keys=False,
+                default_flow_style=None,
+                width=1000,
+            )
+        )
+
+    return ProgramFile(program, tuple(f'point {k + 1}' for k in range(len(points))), text_with)
+
+
+def trajectory_program(
+    names: Sequence[object], points: Sequence[Mapping[str, Any]], where: str
+) -> Program:
+    """Return the program of a JointTrajectory: joint names, and points with lists of numbers.
+
+    Velocities and accelerations are those of all points or of none.
+
+    Raises
+    ------
+    InputError
+        For lists that do not fit the names, and values that are no numbers; `where` names it.
+
+    """
+
+    def values(key: str) -> FloatArray | None:
+        given = [point.get(key) or [] for point in points]
+        if not any(given):
+            return None
+        return np.array(
+            [
+                parse_numbers(row, len(names), f'{where}, point {k + 1}: {key}', InputError)
+                for k, row in enumerate(given)
+            ]
+        )
+
+    positions = values('positions')
+    if positions is None:
+        raise InputError(f'{where} has no positions')
+    return Program(
+        tuple(map(str, names)), positions, values('velocities'), values('accelerations')
+    )

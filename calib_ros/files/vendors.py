@@ -1,0 +1,255 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Kinematics files of vendors' own descriptions, so that these make the corrected arm.
+
+    ur_kinematics.yaml      kinematics_params_file of ur_description and the UR driver
+    franka_kinematics.yaml  kinematics.yaml of a robot of franka_description
+
+Both hold x y z roll pitch yaw for each joint: the origin of a frame that turns about its z, in the
+frame of the joint before. Where such a frame lies along its axis and how it is turned about it
+does not matter to the arm, but to all that is drawn in it. The frames are those of the URDF if
+there is one, else those that the nominal table has by the modified convention, which are the
+vendors'. What an arm has that is not laid out like this gets no file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from calib_ros.errors import ConfigError
+from calib_ros.files.export import (
+    EXACT,
+    POSES,
+    Export,
+    ExportError,
+    converted,
+    head,
+    origins,
+    pose_matrix,
+    xyz_rpy,
+)
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.chain_file import dump_yaml
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.kinematics.urdf_tree import parse_urdf
+
+SAME_LAYOUT = 0.1
+"""Largest difference [rad] of nominal rotations between joints from those of the vendor."""
+SAME_LENGTH = 0.01
+"""Likewise [m] of the flange behind the last axis: elsewhere a tool is part of the table."""
+
+
+@dataclass(frozen=True)
+class Vendor:
+    """How a vendor's description names the joints and lays out their frames.
+
+    `joints` are the ends of names in a chain or URDF, `keys` those in the file; `rolls` [rad] of
+    each frame about x of the one before. `end` is the fixed joint behind the last, if the file
+    has one, and `height` [m] where it ends along the last axis. `families` are what names of
+    joints must contain, where their ends are common ones.
+    """
+
+    file: str
+    joints: tuple[str, ...]
+    keys: tuple[str, ...]
+    rolls: tuple[float, ...]
+    end: str | None = None
+    height: float = 0.0
+    families: tuple[str, ...] = ('',)
+
+    def describes(self, chain: Chain) -> bool:
+        """Tell whether a chain has the joints of this vendor's arms."""
+        names = chain.joint_names
+        return (
+            len(names) == len(self.joints)
+            and all(map(str.endswith, names, self.joints))
+            and any(family in names[0] for family in self.families)
+            and all(joint.type == 'revolute' and joint.sign == 1 for joint in chain.joints)
+        )
+
+    def has_layout(self, places: FloatArray) -> bool:
+        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths."""
+        rolls = np.zeros((len(self.rolls), 3))
+        rolls[:, 0] = self.rolls
+        off = np.swapaxes(se3.exp_rotation(rolls), 1, 2) @ places[:, :3, :3]
+        turned = np.linalg.norm(se3.log_rotation(off), axis=1).max()
+        end = [0.0, 0.0, self.height] if self.end else places[-1, :3, 3]
+        shifted = np.linalg.norm(places[-1, :3, 3] - end)
+        return bool(turned < SAME_LAYOUT and shifted < SAME_LENGTH)
+
+
+_TURN = np.pi / 2
+UR = Vendor(
+    'ur_kinematics.yaml',
+    (
+        *('shoulder_pan_joint', 'shoulder_lift_joint', 'elbow_joint'),
+        *('wrist_1_joint', 'wrist_2_joint', 'wrist_3_joint'),
+    ),
+    ('shoulder', 'upper_arm', 'forearm', 'wrist_1', 'wrist_2', 'wrist_3'),
+    (0.0, _TURN, 0.0, 0.0, _TURN, -_TURN),
+)
+FRANKA = Vendor(
+    'franka_kinematics.yaml',
+    tuple(f'_joint{k}' for k in range(1, 8)),
+    tuple(f'joint{k}' for k in range(1, 8)),
+    (0.0, -_TURN, _TURN, _TURN, -_TURN, _TURN, _TURN, 0.0),
+    'joint8',
+    0.107,
+    ('panda', 'fer', 'fr3', 'fp3'),
+)
+VENDOR_FILES = (UR.file, FRANKA.file)
+
+
+def vendor_files(
+    chain: Chain,
+    nominal: Chain,
+    origin: Mapping[str, Any] | None = None,
+    urdf: str = '',
+    links: Mapping[str, str | None] | None = None,
+    checksum: str = '',
+) -> tuple[Export, ...]:
+    """Return a corrected chain as the files of the vendor that its joints are named by, if any.
+
+    Parameters
+    ----------
+    chain, nominal : Chain
+        The corrected chain and the one that it was identified from.
+    origin : mapping, optional
+        Where the numbers come from, for the record.
+    urdf : str, optional
+        The nominal URDF, whose frames are kept.
+    links : mapping, optional
+        `base_link` and `tip_link` between which the URDF has the chain.
+    checksum : str, optional
+        For Universal Robots: the checksum of the robot's factory calibration, by which its driver
+        tells whether a file belongs to the robot. A hash of the numbers by default, which the
+        driver reports as a mismatch, and goes on.
+
+    Raises
+    ------
+    ConfigError
+        When the chain is not one of the URDF, or the checksum is none.
+    ExportError
+        When a file, read back, differs from the chain.
+
+    """
+    if checksum and not re.fullmatch(r'calib_\d+', checksum):
+        raise ConfigError(
+            f'"{checksum}" is no checksum of Universal Robots: the driver prints it at its start '
+            'as calib_ and digits'
+        )
+    found = []
+    for vendor in (UR, FRANKA):
+        if not vendor.describes(nominal):
+            continue
+        arm = replace(chain, effects=(), frames=())
+        if vendor.end is None and arm.convention == 'standard':
+            arm = _with_last_link_of(nominal, arm)
+        layouts = [_layout(vendor, each, urdf, links or {}) for each in (nominal, arm)]
+        if layouts[0] is None or layouts[1] is None or not vendor.has_layout(layouts[0][0]):
+            continue
+        places, reference = layouts[1]
+        q = chain.random_joints(POSES, np.random.default_rng(0))
+        shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
+        lost = float(np.linalg.norm(shift, axis=1).max())
+        content = head(chain, 'kinematics', lost) + _document(vendor, places, origin, checksum)
+        difference = float(np.abs(forward_of(content, vendor, q) - reference.forward(q)).max())
+        if not difference <= EXACT:
+            raise ExportError(
+                f'{vendor.file}, read back, differs from the calibration by {difference:.3g} m or '
+                'more in rotation: it is not written'
+            )
+        found.append(Export(vendor.file, content, lost))
+    return tuple(found)
+
+
+def forward_of(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
+    """Return the poses (N, 4, 4) of the last frame of a file in the frame of its first joint."""
+    import yaml
+
+    document = yaml.safe_load(text)
+    pose = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for key, values in zip(vendor.keys, q.T, strict=True):
+        turned = np.tile(np.eye(4), (len(q), 1, 1))
+        turned[:, :3, :3] = se3.exp_rotation(values[:, np.newaxis] * [0.0, 0.0, 1.0])
+        pose = pose @ pose_matrix(_entry(document, vendor, key)) @ turned
+    if vendor.end is not None:
+        pose = pose @ pose_matrix(_entry(document, vendor, vendor.end))
+    return np.asarray(pose)
+
+
+def _entry(document: Mapping[str, Any], vendor: Vendor, key: str) -> Mapping[str, float]:
+    entry: Mapping[str, float] = (
+        document['kinematics'][key] if vendor is UR else document[key]['kinematic']
+    )
+    return entry
+
+
+def _document(
+    vendor: Vendor, places: FloatArray, origin: Mapping[str, Any] | None, checksum: str
+) -> str:
+    keys = vendor.keys if vendor.end is None else (*vendor.keys, vendor.end)
+    poses = {key: xyz_rpy(place) for key, place in zip(keys, places, strict=True)}
+    if vendor is UR:
+        number = int(hashlib.sha256(dump_yaml(poses).encode()).hexdigest()[:16], 16)
+        document: dict[str, Any] = {'kinematics': {**poses, 'hash': checksum or f'calib_{number}'}}
+    else:
+        document = {key: {'kinematic': pose} for key, pose in poses.items()}
+    return dump_yaml({**document, 'calibration': dict(origin)} if origin else document)
+
+
+def _with_last_link_of(nominal: Chain, arm: Chain) -> Chain:
+    """Return an arm with what follows its last axis as it is nominally.
+
+    The last frame of the file is on that axis: the rest belongs to the tool.
+    """
+    last, before = arm.joints[-1], nominal.joints[-1]
+    last = replace(last, a=before.a, alpha=before.alpha, beta=before.beta)
+    return replace(arm, joints=(*arm.joints[:-1], last))
+
+
+def _layout(
+    vendor: Vendor, arm: Chain, urdf: str, links: Mapping[str, str | None]
+) -> tuple[FloatArray, Chain] | None:
+    """Return the origins of a file for an arm, and a chain between its first and last frame."""
+    if urdf:
+        return _layout_of_urdf(vendor, arm.joint_names, corrected_urdf(urdf, arm, **links))
+    arm = replace(arm, base=Frame(), tool=Frame())
+    form = converted(arm, 'modified')
+    places = origins(form)
+    if vendor.end is None:  # the flange of the table is the last frame
+        return (places[:-1], arm) if np.allclose(places[-1], np.eye(4), atol=EXACT) else None
+    # The vendor has what the table calls d of the last joint behind it.
+    last = form.joints[-1]
+    shift = np.eye(4)
+    shift[2, 3] = last.d
+    places = origins(replace(form, joints=(*form.joints[:-1], replace(last, d=0.0))))
+    places[-1] = shift @ places[-1]
+    return places, arm
+
+
+def _layout_of_urdf(
+    vendor: Vendor, names: Sequence[str], text: str
+) -> tuple[FloatArray, Chain] | None:
+    joints = {joint.name: joint for joint in parse_urdf(text).joints}
+    path = [joints[name] for name in names]
+    if any(not np.allclose(joint.axis, [0.0, 0.0, 1.0]) for joint in path):
+        return None
+    if vendor.end is not None:
+        prefix = names[-1].removesuffix(vendor.joints[-1])
+        if f'{prefix}_{vendor.end}' not in joints:
+            return None
+        path.append(joints[f'{prefix}_{vendor.end}'])
+    if any(after.parent != joint.child for joint, after in pairwise(path)):
+        return None
+    places = np.array([joint.origin for joint in path])
+    return places, chain_from_urdf(text, path[0].parent, path[-1].child)

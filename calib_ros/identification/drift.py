@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Is a gain chance, when what is measured in succession shares errors?
+
+A tracker drifts, so errors in succession are alike. Poses along a path change as slowly, and a
+model can follow the drift: it gains by it, even on poses that were left out between fitted ones.
+But a drift knows nothing of joint values; moved in time against them it would be explained as
+well. So the residuals are moved by every shift, and the model is fitted to each. Whatever the
+autocorrelation of stationary errors, what is explained where they belong has any rank among the
+shifts with equal probability (a randomisation test); a model that is true explains most there.
+
+Of residuals r, columns A beside the columns F of the model before them explain the share
+
+    (e(F, A) - e(F)) / (|r|^2 - e(F))        e(X) = r^T X (X^T X + L)^-1 X^T r
+
+where L holds the inverse variances of priors. A series is closed to a circle by its mirror image,
+and its slowest part, which is not stationary, is taken out of residuals and columns: a few
+cosines over the session. All shifts of X^T r are one circular correlation, by fast Fourier
+transforms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.identification.leastsquares import System
+from calib_ros.identification.observations import stops
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+SLOW = 3
+"""Cosines that are taken out of a series at most; no more than one for ten stops."""
+SHIFTS = 400
+"""Shifts that are tried at most; the first of them is none."""
+CONSTANT = 1e-9
+"""Share of a column below which what is left without its slowest part is rounding."""
+SINGULAR = 1e-10
+"""Eigenvalue of scaled normal equations from which a direction counts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns X of parameters, and what they have in common with the moved residuals.
+
+    Attributes
+    ----------
+    rows : (R, P)
+        By stop, without the slowest part.
+    products : (P, S)
+        X^T r by shift.
+    inverse : (P,)
+        1 / sigma of priors; zero without one.
+
+    """
+
+    rows: FloatArray
+    products: FloatArray
+    inverse: FloatArray
+
+    def __getitem__(self, index: slice | list[int]) -> Columns:
+        """Return some of the columns."""
+        return Columns(self.rows[:, index], self.products[index], self.inverse[index])
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Return the normal matrix (P, P), with that of the priors."""
+        return np.asarray(self.rows.T @ self.rows + np.diag(self.inverse**2))
+
+    @staticmethod
+    def side_by_side(parts: Sequence[Columns]) -> Columns:
+        """Return all columns as one."""
+        return Columns(
+            np.concatenate([part.rows for part in parts], axis=1),
+            np.concatenate([part.products for part in parts]),
+            np.concatenate([part.inverse for part in parts]),
+        )
+
+
+class Shifts:
+    """Residuals moved in time, those of every set by the same share of its length.
+
+    Parameters
+    ----------
+    system : System
+        Samples in the order in which they were taken; those of one stop move together.
+    residuals : sequence of (N, c)
+        Weighted residuals of each set, sample by sample.
+
+    """
+
+    def __init__(self, system: System, residuals: Sequence[FloatArray]) -> None:
+        numbers = [stops(samples.observations.joints) for samples in system.sets]
+        self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
+        count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
+        self._share = np.arange(count) / count
+        self._circles: list[NDArray[np.complex128]] = []
+        self._energy = np.zeros(count)
+        for begins, residual in zip(self._begins, residuals, strict=True):
+            series = _by_stop(residual, begins).T
+            circle = np.concatenate([series, series[:, ::-1]], axis=1)
+            self._circles.append(np.fft.rfft(circle))
+            length = len(begins)
+            squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
+            slow = _correlation(slow_cosines(length)[:, np.newaxis], self._circles[-1], length)
+            energy = squares[length : 3 * length] - squares[: 2 * length]
+            self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
+
+    def columns(self, columns: Sequence[FloatArray], inverse: FloatArray) -> Columns:
+        """Return weighted columns, (N, c, P) for each set, with their products."""
+        found = []
+        products = np.zeros((len(inverse), len(self._share)))
+        for begins, circle, column in zip(self._begins, self._circles, columns, strict=True):
+            series = _by_stop(column, begins)
+            whole = np.linalg.norm(series, axis=(0, 1))
+            slow = slow_cosines(len(begins))
+            series -= np.tensordot(slow, np.tensordot(slow, series, axes=1), axes=(0, 0))
+            series *= np.linalg.norm(series, axis=(0, 1)) > CONSTANT * whole
+            moved = _correlation(series.transpose(2, 1, 0), circle, len(begins)).sum(axis=1)
+            products += self._sampled(moved)
+            found.append(series.reshape(-1, series.shape[2]))
+        return Columns(np.concatenate(found), products, inverse)
+
+    def shares(self, before: Columns, groups: Sequence[Columns]) -> FloatArray:
+        """Return the share (G, S) that each group of columns explains beside those before.
+
+        By shift; each group is taken by itself.
+        """
+        matrix = before.matrix
+        root = inverse_root(matrix, np.diag(matrix))
+        known = root.T @ before.products
+        found = []
+        for group in groups:
+            cross = root.T @ (before.rows.T @ group.rows)
+            own = group.matrix
+            mine = inverse_root(own - cross.T @ cross, np.diag(own))
+            found.append(((mine.T @ (group.products - cross.T @ known)) ** 2).sum(axis=0))
+        left = np.maximum(self._energy - (known**2).sum(axis=0), 1e-300)
+        return np.asarray(np.array(found) / left)
+
+    def _sampled(self, shifted: FloatArray) -> FloatArray:
+        """Return (..., S) of all shifts (..., 2 n) of a set."""
+        return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
+
+
+def _by_stop(values: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
+    """Return (n, ...) the sums over each stop of (N, ...), by the root of their number."""
+    count = np.diff([*begins, len(values)])
+    sums = np.add.reduceat(values, begins, axis=0)
+    return np.asarray(sums / np.sqrt(count).reshape(-1, *[1] * (values.ndim - 1)))
+
+
+def slow_cosines(length: int) -> FloatArray:
+    """Return (K, length) orthonormal: the constant and the slowest cosines of a series."""
+    order = np.arange(1 + min(SLOW, length // 10))
+    waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
+    return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
+
+
+def _correlation(series: FloatArray, circle: NDArray[np.complex128], length: int) -> FloatArray:
+    """Return (..., c, 2 n): series (..., c, n) times the circle moved by each shift, summed."""
+    spectrum = np.conj(np.fft.rfft(series, 2 * length)) * circle
+    return np.asarray(np.fft.irfft(spectrum, 2 * length))
+
+
+def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
+    """Return T (P, k), T T^T being the inverse of (P, P) in the directions that count.
+
+    Those are seen with columns scaled to squared lengths `size` (P,).
+    """
+    scale = 1.0 / np.sqrt(np.maximum(size, 1e-300))
+    sizes, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    good = sizes > SINGULAR
+    return np.asarray(scale[:, np.newaxis] * vectors[:, good] / np.sqrt(sizes[good]))
+
+
+def chance(shares: FloatArray) -> float:
+    """Return how often moved residuals are explained as well as those in place, the first."""
+    return float(np.mean(shares[1:] >= shares[0]))
+
+
+def chance_of_gain(
+    chain: Chain, before: Sequence[str], added: Sequence[str], system: System
+) -> float:
+    """Return how probable it is that what parameters explain beside those before is chance.
+
+    The system is linearised at a chain that is fitted by those before.
+    """
+    names = [*before, *added]
+    rows = [samples.rows_of(chain, names) for samples in system.sets]
+    shifts = Shifts(system, [each[:, :, -1] for each in rows])
+    prior = system.prior
+    inverse = np.zeros(len(names)) if prior is None else prior.rows(chain, names)[0]
+    columns = shifts.columns([each[:, :, :-1] for each in rows], inverse)
+    known, more = columns[: len(before)], columns[len(before) :]
+    return chance(shifts.shares(known, [more])[0])

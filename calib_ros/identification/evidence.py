@@ -1,0 +1,325 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How large the errors of this arm are, told by its own data (empirical Bayes).
+
+Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there,
+and the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm are taken
+to be normal about zero, with one size for each group of parameters: lengths, angles, what drives
+do to a joint value (`ratio`, `sin_1`, ...), and what bends or has play. The sizes s maximise the
+probability of the data, parameters integrated out (evidence; MacKay 1992):
+
+    s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
+
+with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1. L is the normal matrix with
+the given sigmas, t the factor by which the noise is larger, shared errors included. gamma counts
+the parameters that the data determine. Where these are few, a hyperprior holds: a size is about
+TYPICAL, within a factor of SPREAD. Parameters that the data determine keep their values, and the
+others shrink to nominal. One error may be far larger than the others, as of a motor that was put
+in wrongly: the prior has the tails of Student's t with TAILS degrees of freedom, as a normal one
+with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 + V_ii) / s^2).
+
+Effects that a model leaves out are *considered*: they are columns of the same posterior with sizes
+of their own, so that the arm as it may be, effects included, can be held against the one that was
+fitted (`region.py`; Schmidt 1966 has the idea). So is the scale of the measuring device, which
+makes all lengths grow alike: positions are linear in all lengths L, so its column is the sum of
+L dp/dL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.identification.leastsquares import Samples, System, normal_equations
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+
+BENDING = ('gravity', 'compliance', 'backlash')
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, **dict.fromkeys(BENDING, 3e-4)}
+"""Size [m, rad] of the errors that arms have, by group."""
+SPREAD = 10.0
+"""Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation)."""
+TAILS = 3.0
+"""Degrees of freedom of the prior."""
+SURE = 2.0
+"""Standard deviations by which an offset that stands out is larger at first."""
+CONSIDERED = ('eccentricity', 'gravity')
+"""Effects that any arm may have, whether they are fitted or not."""
+SHOWN, REFUTED = 1.35, 3.0
+"""Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
+which those of usual size are refuted."""
+SCALE = 1e-4
+"""Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
+MOST = 2000
+"""Samples from which the sizes are told; of more, every so many are taken."""
+SETTLED = 0.02
+"""Change of the logarithm of a size from which on it stands still."""
+ROUNDS = 60
+ROUNDING = 1e-12
+"""Added to the scaled precision, so that rounding cannot make it singular."""
+LEAST = 1e-3
+"""Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
+
+
+def group_of(chain: Chain, name: str) -> str | None:
+    """Return the group of parameters whose errors are of one size; None for frames."""
+    if chain.owns_frame(name):
+        return None
+    if name.partition('.')[2] in DH_KINDS:
+        return 'length' if is_length(name) else 'angle'
+    group = effects.group_of(name)
+    return group if group in BENDING else 'drive'
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """What the data and the sizes of the errors tell about an arm that was fitted.
+
+    Attributes
+    ----------
+    chain : Chain
+        The fitted arm, with effects of no size where they were not fitted.
+    names : tuple of str
+        Fitted parameters and considered effects, (P,) in all.
+    offsets : (P,)
+        The fitted parameters less their nominal values; zero for frames.
+    shift : (P,)
+        The posterior mean less the fitted parameters.
+    covariance : (P, P)
+        Of the posterior.
+    priors : mapping of str to float
+        Standard deviation [m or rad] of every parameter that has a prior.
+    sizes : mapping of str to float
+        Size of the errors by group.
+    doubted : (P,), (P, P)
+        Mean and covariance of the offsets if the device may have a scale of its own, and if joint
+        values that were rounded are off.
+
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    offsets: FloatArray
+    shift: FloatArray
+    covariance: FloatArray
+    priors: Mapping[str, float]
+    sizes: Mapping[str, float]
+    doubted: tuple[FloatArray, FloatArray]
+
+    @cached_property
+    def square(self) -> FloatArray:
+        """Return the expected squares (P, P) of the fitted parameters' errors."""
+        return np.asarray(self.covariance + np.outer(self.shift, self.shift))
+
+    def expected(self, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> FloatArray:
+        """Return the expected squares (N, 6, 6) of errors of predicted poses [m, rad].
+
+        At joint values (N, n); position and rotation in world axes. What is not modelled counts.
+        """
+        rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
+        return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
+
+    def held(self, name: str) -> float:
+        """Return which share of a parameter's variance is that of its prior: 1 if untold."""
+        variance = float(self.covariance[self.names.index(name), self.names.index(name)])
+        return variance / self.priors[name] ** 2 if name in self.priors else 0.0
+
+
+def considered(chain: Chain, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the effects that an arm may have besides those among the names."""
+    every = [name for group in CONSIDERED for name in effects.members(chain, group)]
+    return tuple(name for name in every if name not in names)
+
+
+def posterior_of(
+    chain: Chain,
+    nominal: Chain,
+    names: Sequence[str],
+    system: System,
+    noise: float,
+    known: Mapping[str, float],
+    more: Sequence[str] = (),
+    doubts: Mapping[str, float] | None = None,
+) -> Posterior:
+    """Return the posterior of fitted parameters and considered effects, linearised at the fit.
+
+    Parameters
+    ----------
+    chain, nominal : Chain
+        The fitted arm, and the one whose offsets are normal about zero.
+    names : sequence of str
+        Parameters that were fitted.
+    system : System
+        The samples of the fit, with their weights.
+    noise : float
+        Size of the noise [sigma given].
+    known : mapping of str to float
+        Priors [m or rad] that were given.
+    more : sequence of str
+        Effects to consider.
+    doubts : mapping of str to float
+        Parameters that something else than the arm moves as well, with its standard deviation.
+
+    """
+    chain = chain.with_effects(more)
+    every = (*names, *more)
+    few, share = _few(system)
+    lengths = _lengths(chain, system) if more else {}
+    columns = tuple(dict.fromkeys([*every, *lengths]))
+    normal = normal_equations(chain, columns, few)
+    mixing = np.eye(len(columns), len(every))
+    beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
+    if lengths:
+        beside.append((lengths, SCALE))
+    for parts, _ in beside:
+        mixing = np.column_stack([mixing, [parts.get(name, 0.0) for name in columns]])
+    matrix = share / noise**2 * (mixing.T @ normal.matrix @ mixing)
+    gradient = share / noise**2 * (mixing.T @ normal.gradient)
+    size = len(gradient)
+    offsets = np.zeros(size)
+    for k, name in enumerate(names):
+        if not chain.owns_frame(name):
+            offsets[k] = chain.offset(name, nominal)
+    vector = matrix @ offsets + gradient
+    groups = [None if name in known else group_of(chain, name) for name in every]
+    groups += [None] * (size - len(every))
+    given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
+    evidence = _Evidence(matrix, vector, given, groups)
+    stds, sizes = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    own = stds[: len(every)].tolist()
+    priors = {name: std for name, std in zip(every, own, strict=True) if std < np.inf}
+    arm = np.s_[: len(every)]
+    mean, root, _ = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
+    doubted, doubt, _ = _solved(matrix, vector, stds**-2)
+    return Posterior(
+        chain,
+        every,
+        offsets[arm],
+        mean - offsets[arm],
+        root @ root.T,
+        priors,
+        sizes,
+        (doubted[arm], doubt[arm] @ doubt[arm].T),
+    )
+
+
+def _lengths(chain: Chain, system: System) -> dict[str, float]:
+    """Return all lengths [m] that positions are made of; none where no device has a scale.
+
+    A ball in a socket is where it is, and a prismatic joint has a length of its own.
+    """
+    sockets = any(samples.observations.socket for samples in system.sets)
+    if sockets or any(joint.type == 'prismatic' for joint in chain.joints):
+        return {}
+    names = [f'{frame}.{kind}' for frame in chain.frame_names for kind in FRAME_KINDS[:3]]
+    names += [f'{joint.name}.{kind}' for joint in chain.joints for kind in ('a', 'd')]
+    return {name: chain.value(name) for name in names}
+
+
+def _few(system: System) -> tuple[System, int]:
+    """Return the samples without priors, of many every so many, and how many each stands for."""
+    share = max(1, -(-system.count // MOST))
+    sets = []
+    for samples in system.sets:
+        few = samples
+        if share > 1:
+            chosen = np.arange(0, samples.count, share)
+            few = Samples(samples.observations.select(chosen), *samples.sigmas)
+            few.weights = None if samples.weights is None else samples.weights[chosen]
+        sets.append(few)
+    return System(tuple(sets), None, system.separations), share
+
+
+def _solved(
+    matrix: FloatArray, vector: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return mean (P,), a root (P, P) of the covariance, and its log determinant."""
+    whole = matrix + np.diag(precision)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    scaled = whole * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+    factor = linalg.cholesky(scaled, lower=True, check_finite=False)
+    inverse = linalg.solve_triangular(factor, np.diag(scale), lower=True, check_finite=False)
+    volume = 2.0 * float(np.log(scale).sum() - np.log(np.diag(factor)).sum())
+    return inverse.T @ (inverse @ vector), np.ascontiguousarray(inverse.T), volume
+
+
+class _Evidence:
+    """How probable sizes of the errors make the data."""
+
+    def __init__(
+        self,
+        matrix: FloatArray,
+        vector: FloatArray,
+        given: FloatArray,
+        groups: Sequence[str | None],
+    ) -> None:
+        self._matrix, self._vector, self._given = matrix, vector, given
+        self._names = [*dict.fromkeys(group for group in groups if group is not None)]
+        rows = [[group == name for group in groups] for name in self._names]
+        self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
+        self._typical = np.log([TYPICAL[name] for name in self._names])
+        self._own = np.array([group in ('length', 'angle') for group in groups])
+        self._tails = np.ones(len(groups))
+
+    def told(self, considered: set[str | None]) -> tuple[FloatArray, dict[str, float]]:
+        """Return the standard deviation (P,) of each parameter, and the size of each group.
+
+        Effects that are only considered are of no size where the data would show the usual ones,
+        and do not show any.
+        """
+        size, width = self._typical.copy(), np.log(SPREAD) ** -2
+        if self._own.sum() == self._member.sum():
+            free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
+            mean, root, _ = _solved(self._matrix, self._vector, free)
+            surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
+            self._lengthen(surely**2, 1.0, size)
+        for _ in range(ROUNDS):
+            weight = self._weight(size)
+            mean, root, _ = _solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
+            variance = (root**2).sum(axis=1)
+            told = (self._member - weight * variance).sum(axis=1)
+            slope = weight @ mean**2 - told - width * (size - self._typical)
+            step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
+            reach = -np.log(LEAST)
+            size = np.clip(size + step, self._typical - reach, self._typical + reach)
+            self._lengthen(mean**2 + variance, 0.0, size)
+            if np.abs(step).max(initial=0.0) < SETTLED:
+                break
+        for k, name in enumerate(self._names):
+            none, usual = (
+                np.where(np.arange(len(size)) == k, self._typical[k] + change, size)
+                for change in (np.log(LEAST), 0.0)
+            )
+            without = self._of(none)
+            shown = self._of(size) - without > SHOWN
+            if name in considered and not shown and without - self._of(usual) > REFUTED:
+                size = none
+        precision = self._given + self._weight(size).sum(axis=0)
+        with np.errstate(divide='ignore'):
+            stds = 1.0 / np.sqrt(precision)
+        return stds, dict(zip(self._names, np.exp(size).tolist(), strict=True))
+
+    def _lengthen(self, squares: FloatArray, more: float, size: FloatArray) -> None:
+        """Give offsets of expected squares (P,), larger by `more` sizes, the tails of the prior.
+
+        Effects have none: what a drive does is a matter of its make.
+        """
+        far = self._member.T @ np.exp(-2.0 * size) * squares + more
+        self._tails = np.where(self._own, (TAILS + 1.0) / (TAILS + far), 1.0)
+
+    def _weight(self, size: FloatArray) -> FloatArray:
+        """Return (G, P) the inverse variances of the parameters of each group."""
+        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
+
+    def _of(self, size: FloatArray) -> float:
+        """Return the logarithm of the evidence of sizes (G,), given by their logarithms."""
+        precision = self._given + self._weight(size).sum(axis=0)
+        mean, _, volume = _solved(self._matrix, self._vector, precision)
+        fit = float(self._vector @ mean) + volume
+        return 0.5 * fit - float(self._member.sum(axis=1) @ size)

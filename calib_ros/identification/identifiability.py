@@ -1,0 +1,270 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which parameters a set of poses determines, and how well.
+
+Works on the triangular factor R of the weighted Jacobian (R^T R = J^T W J), not on the normal
+matrix, which squares the condition number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+
+RANK_TOLERANCE = 1e-8
+"""A column is dependent when less than this share of it is left after the columns before it."""
+FRAME_TOLERANCE = 1e-3
+"""The same for base and tool frames. Orientations that vary by a milliradian vary by no more than
+an arm's own errors: a tool that follows from them would be anywhere, kilometres away as well."""
+
+
+def independent(
+    factor: FloatArray, names: Sequence[str], frame_tolerance: float = RANK_TOLERANCE
+) -> tuple[str, ...]:
+    """Return the parameters whose columns are independent of those before them.
+
+    The order of the names is their priority: of the parameters that trade against each other,
+    the last ones are left out (and so stay nominal). With the frames first, theirs are fitted.
+
+    Parameters
+    ----------
+    factor : (P, P)
+        Upper triangular factor of the weighted Jacobian, columns in the order of the names.
+    names : sequence of str
+        Parameters, the most wanted first.
+    frame_tolerance : float
+        Least share of a frame's column; of other columns RANK_TOLERANCE.
+
+    """
+    basis = np.zeros((len(factor), 0))
+    kept = []
+    for name, column in zip(names, factor.T, strict=True):
+        rest = column - basis @ (basis.T @ column)
+        rest -= basis @ (basis.T @ rest)  # once more: Gram-Schmidt loses orthogonality
+        size = float(np.linalg.norm(rest))
+        placed = name.partition('.')[2] in FRAME_KINDS
+        least = (frame_tolerance if placed else RANK_TOLERANCE) * float(np.linalg.norm(column))
+        if size > least and size > 0.0:
+            basis = np.column_stack([basis, rest / size])
+            kept.append(name)
+    return tuple(kept)
+
+
+def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the parameters that measured poses determine: frames by more than arms' errors."""
+    return independent(factor, names, FRAME_TOLERANCE)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a set of observations measures, and between which frames."""
+
+    oriented: bool = True
+    distance: bool = False
+    moving: bool = False
+    base: str = 'base'
+    tool: str = 'tool'
+    socket: bool = False
+
+    @property
+    def rows(self) -> int:
+        """Return the number of equations of one configuration."""
+        return 1 if self.distance else 6 if self.oriented else 3
+
+
+def structurally_independent(
+    chain: Chain,
+    names: Sequence[str],
+    kinds: Sequence[Kind] = (Kind(),),
+    extra: Callable[[Chain, Sequence[str]], tuple[FloatArray, FloatArray]] | None = None,
+) -> tuple[str, ...]:
+    """Return the parameters that a large number of arbitrary poses would determine.
+
+    What is left out is a gauge freedom of the chain, not a lack of measurements. Frames that are
+    not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
+    minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
+    by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
+    poses: turning the whole cell about it shows nowhere else than in residuals. `extra` returns
+    further equations at a chain.
+    """
+    rng = np.random.default_rng(0)
+    joints = chain.random_joints(100, rng)
+    frames = [name for name in names if chain.owns_frame(name)]
+    anywhere = chain.with_offsets(
+        dict(zip(frames, rng.uniform(0.1, 0.5, len(frames)), strict=True))
+    )
+    approach = rng.choice([-1.0, 1.0], joints.shape)
+    rows = np.zeros((0, len(names)))
+    velocity = rng.normal(size=joints.shape)
+    for number, kind in enumerate(kinds):
+        posed = joints
+        if kind.socket:
+            posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
+            shift = {f'{kind.base}.{axis}': -x for axis, x in zip('xyz', place, strict=True)}
+            anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
+        model = ErrorModel(anywhere, names, kind.base, kind.tool)
+        jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
+        if kind.distance:
+            line = anywhere.forward(posed, approach, kind.base, kind.tool)[:, :3, 3]
+            line /= np.linalg.norm(line, axis=1, keepdims=True)
+            jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
+        elif not kind.oriented:
+            jacobian = jacobian[:, :3]
+        rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
+    if extra is not None:
+        rows = np.concatenate([rows, extra(anywhere, names)[0]])
+    factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
+    return independent(factor, names)
+
+
+MEETING = 1e-10
+"""Distance [m] from which two places are one."""
+MEETING_STEPS = 100
+
+
+def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
+    """Return joint values (N, n) that bring the target to one place, and that place (3,) [m].
+
+    It is that of the first; the others are led there by damped Gauss-Newton steps.
+    """
+    driven = [f'{j.name}.{"theta" if j.type == "revolute" else "d"}' for j in chain.joints]
+    model = ErrorModel(chain, driven, kind.base, kind.tool)
+    signs = np.array([joint.sign for joint in chain.joints], dtype=float)
+    wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]
+    for _ in range(MEETING_STEPS):
+        left = wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+        if np.abs(left).max() < MEETING:
+            break
+        jacobian = model.jacobian(joints)[:, :3] * signs
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        step = np.linalg.solve(square, left[..., np.newaxis])
+        joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
+    return joints, wanted
+
+
+def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:
+    """Return the covariance (P, P) of the parameters from R, for weights in units of sigma.
+
+    For Gaussian noise of those sigmas (R^T R)^-1 is the Cramer-Rao bound. With noise of another
+    size it is (R^T R)^-1 M (R^T R)^-1, where `middle` M (P, P) is the normal matrix with every
+    equation weighted by its true variance (in units of the one assumed).
+    """
+    scale = 1.0 / np.linalg.norm(factor, axis=0)
+    inverse = scale[:, np.newaxis] * linalg.solve_triangular(factor * scale, np.eye(len(factor)))
+    if middle is None:
+        return np.asarray(inverse @ inverse.T)
+    sizes, directions = np.linalg.eigh(inverse.T @ middle @ inverse)
+    root = inverse @ (directions * np.sqrt(np.maximum(sizes, 0.0)))  # no rounding below zero
+    return np.asarray(root @ root.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Covariance of the fitted parameters, by source of error.
+
+    Attributes
+    ----------
+    parts : (K, P, P)
+        Share of each source: position, orientation, what was known before.
+    freedom : (K,)
+        Degrees of freedom from which the size of each source was estimated; infinite where it is
+        known.
+
+    """
+
+    parts: FloatArray
+    freedom: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Return the covariance (P, P) by all sources."""
+        return np.asarray(self.parts.sum(axis=0))
+
+    @property
+    def overall(self) -> float:
+        """Return the degrees of freedom of all parameters together."""
+        variances = np.einsum('kpp,pp->k', self.parts, np.diag(1.0 / np.diag(self.covariance)))
+        return float(self.freedom_of(variances))
+
+    def freedom_of(self, variances: FloatArray) -> FloatArray:
+        """Return the degrees of freedom (...) of a sum of variances (K, ...) from the sources.
+
+        That of Satterthwaite (1946): the spread of the sum is that of a single estimate.
+        """
+        shares = variances / np.maximum(variances.sum(axis=0), 1e-300)
+        with np.errstate(divide='ignore'):
+            return np.asarray(1.0 / np.tensordot(1.0 / self.freedom, shares**2, axes=1))
+
+
+TRADE = 1e-4
+"""Least share of a parameter in a trade to be named."""
+
+
+def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
+    """Return, for each parameter that was left out, the fitted ones that it trades against.
+
+    Moving the one, and the others by the right amounts, leaves every measured pose as it is.
+    """
+    columns = dict(zip(names, factor.T, strict=True))
+    scales = {name: float(np.linalg.norm(column)) for name, column in columns.items()}
+    basis = np.array([columns[name] / (scales[name] or 1.0) for name in kept]).T
+    partners: dict[str, list[str]] = {}
+    for name in names:
+        if name in kept:
+            continue
+        if scales[name] == 0.0:
+            partners[name] = []
+            continue
+        shares = np.linalg.lstsq(basis, columns[name] / scales[name], rcond=None)[0]
+        strong = np.abs(shares) > TRADE * np.abs(shares).max()
+        partners[name] = [other for other, yes in zip(kept, strong, strict=True) if yes]
+    return partners
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Observability indices of a set of poses from the singular values of the scaled Jacobian.
+
+    O1 Borm and Menq 1991, O2 Driels and Pathre 1990, O3 and O4 Nahvi et al. 1994 and 1996,
+    O5 Sun and Hollerbach 2008. Columns are in sigma of the measurement per metre or radian.
+    """
+
+    o1: float
+    o2: float
+    o3: float
+    o4: float
+    o5: float
+
+
+def observability(factor: FloatArray, poses: int) -> Observability:
+    """Return the indices from R (P, P) of the weighted Jacobian of a number of poses."""
+    singular = np.linalg.svd(factor, compute_uv=False)
+    smallest, largest = float(singular[-1]), float(singular[0])
+    return Observability(
+        o1=float(np.exp(np.mean(np.log(np.maximum(singular, 1e-300)))) / np.sqrt(poses)),
+        o2=smallest / largest,
+        o3=smallest,
+        o4=smallest**2 / largest,
+        o5=float(1.0 / np.sum(1.0 / np.maximum(singular, 1e-300))),
+    )
+
+
+def correlated(
+    matrix: FloatArray, names: Sequence[str], threshold: float
+) -> tuple[tuple[str, str, float], ...]:
+    """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
+    std = np.sqrt(np.diag(matrix))
+    correlation = matrix / np.outer(std, std)
+    rows, columns = np.nonzero(np.triu(np.abs(correlation) > threshold, 1))
+    pairs = [
+        (names[i], names[j], float(correlation[i, j]))
+        for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
+    ]
+    return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))

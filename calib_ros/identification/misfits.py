@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Are samples that a robust fit has given up gross errors, or what the arm really does?
+
+A device errs where it likes, an arm by its joint values. So samples taken for gross errors are
+the arm's own behaviour where
+
+- a joint hardly moves but in them,
+- all targets that were seen at a stop are off there, more often than by chance,
+- they go with the values of a joint. Moved in time against the joint values, as in `chance.py`,
+  outliers of a device do as well, also where they come in a row.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.identification.drift import chance
+from calib_ros.identification.observations import STILL, stops
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.robust import OUTLIER, Robust
+from calib_ros.kinematics.se3 import FloatArray
+
+LEFT = 0.1
+"""Share of a joint's range that is left without outliers, up to which only they move it."""
+BY_CHANCE = 1e-3
+"""Probability below which outliers of a device are not alike so much."""
+TOGETHER = 0.01
+"""Probability below which several targets are not off at the same stops."""
+FEWEST, LEAST_STOPS = 4, 50
+"""Outliers and stops from which on they are compared with the values of joints."""
+ADVICE = (
+    'what a device does wrong knows nothing of the joints, the arm does what the model lacks. Look'
+    ' for effects (model auto), or fit them with the others (loss none)'
+)
+
+
+def arms_own(problem: Problem, robust: Robust) -> str | None:
+    """Return in words why outliers look like the arm's own behaviour, None where they do not."""
+    if not robust.outliers.any() or any(each.socket for each in problem.sets):
+        return None
+    joints = np.concatenate([each.joints for each in problem.sets])
+    names = problem.chain.joint_names
+    whole = np.ptp(joints, axis=0)
+    kept = joints[~robust.outliers]
+    left = np.ptp(kept, axis=0) if len(kept) else np.zeros(len(names))
+    for name, part, all_of_it in zip(names, left, whole, strict=True):
+        if all_of_it > 10.0 * STILL and part < LEFT * all_of_it:
+            return f'{name} moves only in samples that were taken for gross errors: {ADVICE}'
+    shared, by_chance = _shared(problem, robust)
+    if shared > 1 and by_chance < TOGETHER:
+        return f'at {shared} stops all targets were taken for gross errors: {ADVICE}'
+    order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
+    joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
+    if by_chance < BY_CHANCE:
+        return f'samples that were taken for gross errors go with the values of {joint}: {ADVICE}'
+    return None
+
+
+def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
+    """Return at how many configurations all of several targets are off, and how probable it is."""
+    count = 1 + max(int(each.max()) for each in problem.configurations)
+    targets = dict.fromkeys(each.tool for each in problem.sets)
+    seen, off = np.zeros((2, len(targets), count))
+    for each, numbers, far in zip(
+        problem.sets, problem.configurations, robust.distances, strict=True
+    ):
+        row = list(targets).index(each.tool)
+        seen[row] += np.bincount(numbers, minlength=count)
+        off[row] += np.bincount(numbers, far > OUTLIER, count)
+    several = (seen > 0).sum(axis=0) > 1
+    wrong = (off > 0.5 * seen) & (seen > 0)
+    both = several & (wrong == (seen > 0)).all(axis=0)
+    rates = wrong.sum(axis=1) / np.maximum((seen > 0).sum(axis=1), 1)
+    expected = np.prod(np.where(seen > 0, rates[:, np.newaxis], 1.0), axis=0)[several].sum()
+    found = int(both.sum())
+    return found, float(special.gammainc(found, expected)) if found else 1.0
+
+
+def _with_a_joint(
+    problem: Problem, joints: FloatArray, outliers: NDArray[np.bool_]
+) -> tuple[str, float]:
+    """Return the joint whose values (N, n) go with outliers (N,) most, and by what chance."""
+    number = stops(joints)
+    begins = np.flatnonzero(np.diff(number, prepend=-1))
+    off = np.bincount(number, outliers) > 0.5 * np.bincount(number)
+    names = problem.chain.joint_names
+    if len(begins) < LEAST_STOPS or not FEWEST <= off.sum() <= len(off) - FEWEST:
+        return '', 1.0
+    turning = np.array([joint.type == 'revolute' for joint in problem.chain.joints])
+    angle = joints[begins]
+    waves = np.stack([np.where(turning, np.cos(angle), angle), np.sin(angle) * turning])
+    waves -= waves.mean(axis=1, keepdims=True)
+    spread = waves.std(axis=1, keepdims=True)
+    waves = np.where(spread > STILL, waves / np.maximum(spread, STILL), 0.0)
+    spectrum = np.conj(np.fft.rfft(waves, axis=1)) * np.fft.rfft(off)[:, np.newaxis]
+    shifted = (np.fft.irfft(spectrum, len(off), axis=1) ** 2).sum(axis=0).T  # joint, shift
+    most = int(np.argmax(shifted[:, 0]))
+    variance = off.sum() * (1.0 - off.mean())  # of each wave, were they anywhere
+    anywhere = len(names) * float(np.exp(-0.5 * shifted[most, 0] / variance))
+    return names[most], max(anywhere, chance(shifted.max(axis=0)))

@@ -1,0 +1,296 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which non-geometric effects pay for themselves, by cross-validation.
+
+At the geometric fit every effect is one more column of the linear model, so all candidates are
+compared without refitting: the residual of a part left out is r - J_S beta, with beta from the
+other parts. Parts are dealt out twice, one by one and in blocks of what was measured in
+succession, and both must agree, because neighbours share errors. Groups of effects are added one
+by one, the best first, as long as the position error on the configurations left out falls by more
+than chance explains, and explain more of the residuals than of the same moved in time
+(`chance.py`), as a drift would be. Then the spectrum of what is left is searched, joint by joint,
+for harmonics of gears: the one that explains most is added while it pays as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from calib_ros.identification.drift import Columns, Shifts, chance
+from calib_ros.identification.evidence import ROUNDING, group_of
+from calib_ros.identification.identifiability import RANK_TOLERANCE
+from calib_ros.identification.identification import Identification, identify
+from calib_ros.identification.observations import numbered
+from calib_ros.identification.problem import Learned, Problem
+from calib_ros.identification.validation import log_gain
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.effects import Verdict
+from calib_ros.kinematics.se3 import FloatArray
+
+PAYS = 0.999
+"""One-sided confidence that the gain of a group or harmonic must have."""
+CHANCE = 0.01
+"""Probability from which a gain may be that of a drift (see `chance.py`)."""
+LEAST_GAIN = 0.005
+"""Least decrease of the RMS error that is worth a group or a harmonic."""
+HARMONICS = range(3, 41)
+"""Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
+MOST_HARMONICS = 24
+SUBSET = 3000
+
+
+def _unheard(stage: str) -> None:
+    """Tell nobody which stage begins."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The effects that pay for themselves, and the verdicts on all that were tried."""
+
+    effects: tuple[str, ...]
+    verdicts: tuple[Verdict, ...]
+
+
+def identify_model(
+    problem: Problem, model: str, progress: Callable[[str], None] = _unheard
+) -> Identification:
+    """Identify with the errors that `model` names; `auto` chooses by cross-validation.
+
+    A choice that cannot be fitted, or is refused where the geometric result is not, leaves that
+    one, with the verdicts and a remark. `progress` is called with each stage that begins; what it
+    raises ends the work.
+    """
+    progress(f'model {"geometric" if model == "auto" else model}')
+    result = identify(problem)
+    if model != 'auto':
+        return result
+    selection = choose_effects(problem, result, progress)
+    if selection.effects:
+        progress(f'model with {len(selection.effects)} effects')
+        richer = identify(replace(problem, effects=selection.effects), result)
+        reasons: tuple[str, ...] = ()
+        if not richer.converged:
+            reasons = ('its fit has not converged',)
+        if result.accepted:
+            reasons = reasons or richer.refusals
+        if reasons:
+            remark = f'the richer model is not used, because {"; ".join(reasons)}'
+            result = replace(result, remarks=(*result.remarks, remark))
+        else:
+            result = richer
+    return replace(result, verdicts=selection.verdicts)
+
+
+def choose_effects(
+    problem: Problem, geometric: Identification, progress: Callable[[str], None] = _unheard
+) -> Selection:
+    """Choose the effects for a problem from its geometric result."""
+    progress('effects')
+    model = _Linear(problem, geometric)
+    chosen: list[str] = []
+    verdicts: dict[str, Verdict] = {}
+    groups = {name: model.useful(effects.members(problem.chain, name)) for name in effects.GROUPS}
+    while True:
+        tried = []
+        for group, names in groups.items():
+            if names and not set(names) <= set(chosen):
+                progress(f'effects: {group}')
+                tried.append((model.judge(chosen, names, group), group))
+        if not tried:
+            break
+        for verdict, group in tried:
+            verdicts[group] = verdict
+        paying = [pair for pair in tried if pair[0].pays]
+        if not paying:
+            break
+        best, group = min(paying, key=lambda pair: pair[0].rms_mm_after)
+        verdicts[group] = best
+        chosen += groups[group]
+    found = list(verdicts.values())
+    for _ in range(MOST_HARMONICS):
+        harmonic = model.strongest_harmonic(chosen, progress)
+        if harmonic is None:
+            break
+        verdict = model.judge(chosen, harmonic, f'{harmonic[0].replace(".sin_", ", ")} per turn')
+        found.append(verdict)
+        if not verdict.pays:
+            break
+        chosen += harmonic
+    return Selection(tuple(chosen), tuple(found))
+
+
+class _Linear:
+    """The linear model about the geometric fit, with columns of effects made when asked for.
+
+    Rows are sample by sample. Nothing measures at sockets that could drift, so nothing is moved
+    in time there, and no spectrum is searched.
+    """
+
+    def __init__(self, problem: Problem, geometric: Identification) -> None:
+        self._chain = geometric.chain
+        self._names = geometric.names
+        posterior = geometric.posterior
+        priors = {n: s for n, s in posterior.priors.items() if n in self._names}
+        self._noise, self._sizes = geometric.noise.size, posterior.sizes
+        problem = replace(problem, learned=Learned(priors, self._noise))
+        self._problem = problem
+        judged = np.split(
+            geometric.fitted.judged, np.cumsum([len(each) for each in problem.sets])[:-1]
+        )
+        share = max(1, -(-sum(map(len, problem.sets)) // SUBSET))
+        sets = [
+            each.select(np.flatnonzero(good)[::share])
+            for each, good in zip(problem.sets, judged, strict=True)
+        ]
+        self._system = problem.system(sets)
+        numbers = numbered(sets)
+        self._groups = np.concatenate(numbers)
+        blocks = np.full(int(self._groups.max(initial=-1)) + 1, -1)
+        for each in numbers:  # every fold has some of each set
+            new = np.unique(each[blocks[each] < 0])
+            blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
+        self._dealings = (self._groups % problem.folds, blocks[self._groups])
+        rows = self._rows(self._names)
+        self._base = _stacked(rows)[:, :-1]
+        self._residual = _stacked(rows)[:, -1]
+        self._ends = np.cumsum([each[:, :, -1].size for each in rows])
+        widths = np.concatenate([np.full(len(each), each.shape[1]) for each in rows])
+        self._owner = np.repeat(np.arange(len(widths)), widths)
+        self._columns: dict[str, FloatArray] = {}
+        self._seen: dict[str, Columns] = {}
+        self._pairs = [
+            tuple(f'{joint.name}.{wave}_{harmonic}' for wave in effects.WAVES)
+            for joint in self._chain.joints
+            if joint.type == 'revolute'
+            for harmonic in HARMONICS
+        ]
+        self._shifts: Shifts | None = None
+        if not any(each.socket for each in sets):
+            self._shifts = Shifts(self._system, [each[:, :, -1] for each in rows])
+
+    def useful(self, names: Sequence[str]) -> list[str]:
+        """Return those effects whose columns are independent of the geometric model."""
+        basis = np.linalg.qr(self._base)[0]
+        kept = []
+        for name, column in zip(names, self._of(names).T, strict=True):
+            rest = column - basis @ (basis.T @ column)
+            rest -= basis @ (basis.T @ rest)
+            size = float(np.linalg.norm(rest))
+            if size > 1e3 * RANK_TOLERANCE * float(np.linalg.norm(column)) and size > 0.0:
+                basis = np.column_stack([basis, rest / size])
+                kept.append(name)
+        return kept
+
+    def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> Verdict:
+        """Compare the errors on configurations left out, with and without some effects."""
+        new = [name for name in added if name not in chosen]
+        found, pays = [], True
+        for folds in self._dealings:
+            before, after = (self._left_out(names, folds) for names in (chosen, [*chosen, *new]))
+            gain, limit = log_gain(before, after, self._groups, PAYS)
+            pays = pays and gain > max(limit, LEAST_GAIN)
+            found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
+        if pays and self._shifts is not None:
+            known = self._moved([*self._names, *chosen])
+            pays = chance(self._shifts.shares(known, [self._moved(new)])[0]) < CHANCE
+        return Verdict(what, found[0], found[1], bool(pays))
+
+    def strongest_harmonic(
+        self, chosen: Sequence[str], progress: Callable[[str], None]
+    ) -> list[str] | None:
+        """Return sine and cosine of the harmonic that explains most of what is left.
+
+        None where the strongest one of residuals moved in time often explains as much.
+        """
+        pairs = [pair for pair in self._pairs if pair[0] not in chosen]
+        if self._shifts is None or not pairs:
+            return None
+        known = self._moved([*self._names, *chosen])
+        moved: list[Columns] = []
+        for joint, own in groupby(pairs, lambda pair: pair[0].partition('.')[0]):
+            progress(f'harmonics of {joint}')
+            moved += [self._moved(pair) for pair in own]
+        shares = self._shifts.shares(known, moved)
+        if chance(shares.max(axis=0)) >= CHANCE:
+            return None
+        return list(pairs[int(np.argmax(shares[:, 0]))])
+
+    def _moved(self, names: Sequence[str]) -> Columns:
+        """Return the columns of parameters beside the moved residuals, each made once."""
+        assert self._shifts is not None
+        missing = [name for name in names if name not in self._seen]
+        if missing:
+            columns = [each[:, :, :-1] for each in self._rows(missing)]
+            found = self._shifts.columns(columns, self._priors(missing))
+            self._seen |= {name: found[[k]] for k, name in enumerate(missing)}
+        return Columns.side_by_side([self._seen[name] for name in names])
+
+    def _of(self, names: Sequence[str]) -> FloatArray:
+        """Return the weighted columns (R, E) of effects, each made once."""
+        missing = [name for name in names if name not in self._columns]
+        if missing:
+            rows = _stacked(self._rows(missing))[:, :-1]
+            self._columns |= dict(zip(missing, rows.T, strict=True))
+        if not names:
+            return np.zeros((len(self._residual), 0))
+        return np.column_stack([self._columns[name] for name in names])
+
+    def _rows(self, names: Sequence[str]) -> list[FloatArray]:
+        """Return weighted Jacobian and residual (N, c, P + 1) of each set."""
+        chain = self._chain.with_effects([name for name in names if name not in self._names])
+        return [samples.rows_of(chain, names) for samples in self._system.sets]
+
+    def _left_out(self, chosen: Sequence[str], dealing: NDArray[np.intp]) -> FloatArray:
+        """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
+        columns = np.column_stack([self._base, self._of(chosen)])
+        extra, offset = self._extra(chosen)
+        errors = np.empty(len(self._residual))
+        whole = columns.T @ columns + extra.T @ extra
+        gradient = columns.T @ self._residual + extra.T @ offset
+        folds = dealing[self._owner]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))  # a fold may hold all of it
+        for fold in range(self._problem.folds):
+            inside = folds == fold
+            part = columns[inside]
+            scaled = (whole - part.T @ part) * np.outer(scale, scale) + ROUNDING * np.eye(
+                len(scale)
+            )
+            factor = linalg.cho_factor(scaled)
+            right = gradient - part.T @ self._residual[inside]
+            weights = scale * linalg.cho_solve(factor, scale * right)
+            errors[inside] = self._residual[inside] - part @ weights
+        parts = np.split(errors, self._ends[:-1])
+        sets = self._system.sets
+        return np.concatenate([s.position_errors(p) for s, p in zip(sets, parts, strict=True)])
+
+    def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""
+        extra, offset = self._system.extra_rows(self._chain, self._names)
+        wide = np.diag(self._priors(chosen))
+        return linalg.block_diag(extra, wide), np.append(offset, np.zeros(len(chosen)))
+
+    def _priors(self, names: Sequence[str]) -> FloatArray:
+        """Return noise / sigma (P,) of the priors; zero without one.
+
+        Effects may be as large as usual, or as large as the data show.
+        """
+        sigmas = self._problem.prior_sigmas
+        found = np.zeros(len(names))
+        for k, name in enumerate(names):
+            size = sigmas.get(name, 0.0)
+            if name not in self._names:
+                group = str(group_of(self._chain, name))
+                size = max(effects.expected(name), self._sizes.get(group, 0.0))
+            found[k] = self._noise / size if size else 0.0
+        return found
+
+
+def _stacked(rows: Sequence[FloatArray]) -> FloatArray:
+    """Return (R, P) from (N, c, P) of each set."""
+    return np.concatenate([each.reshape(-1, each.shape[2]) for each in rows])

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How large the noise is, which pairs share it, and what follows for the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import special
+
+from calib_ros.identification import identifiability
+from calib_ros.identification.identifiability import Uncertainty
+from calib_ros.identification.leastsquares import Fit, System
+from calib_ros.identification.shared_errors import shared_errors
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+SHARED = 1.2
+"""Ratio from which the errors of one configuration's pairs are taken to be correlated."""
+SIGMA_TEST = 0.999
+"""Confidence at which the chi-squared test of the sigmas given lets them pass."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Size of the residuals in units of the sigma given, for position and orientation.
+
+    `consistent` tells whether a chi-squared test lets the sigmas pass; then they are taken as they
+    are for the standard deviations, else those found.
+
+    `successive` and `near` are the correlations of the residuals of configurations that follow
+    each other and that are near each other in joint space; `shared` names which of them a test
+    finds to share errors (`correlation.py`), and `widened` by what factor that makes the standard
+    deviations larger (median). `size` is that by which they are larger than the sigmas given
+    would make them, in all.
+    """
+
+    position: float
+    orientation: float | None
+    consistent: bool
+    successive: float
+    near: float
+    shared: tuple[str, ...]
+    widened: float = 1.0
+    size: float = 1.0
+
+
+def noise_of(
+    fit: Fit, names: Sequence[str], system: System, factor: FloatArray
+) -> tuple[Noise, Uncertainty]:
+    """Return the noise found, and the uncertainty of the parameters that follows from it.
+
+    `factor` R (P, P) is that of the weighted Jacobian, R^T R = H. Each part (position,
+    orientation) has as many degrees of freedom as equations, less its share of the parameters,
+    trace(H^-1 H_part). Pairs of one configuration share what the model lacks, and count for fewer.
+    """
+    plain = identifiability.covariance(factor)
+    taken = np.array([float(np.sum(plain * part)) for part in fit.normal.parts])
+    sums, counts, joint_sums, joint_counts = _squares(fit.chain, system)
+    if not fit.normal.parts[1].any():  # whitened as a whole, or no orientation
+        sums, counts, joint_sums, joint_counts = (
+            np.array([each.sum(), 0.0]) for each in (sums, counts, joint_sums, joint_counts)
+        )
+    freedom = counts - taken
+    known = freedom > 1e-9
+    variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
+    beyond = 0.5 * (1.0 - SIGMA_TEST)
+    low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
+    consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
+    neighbours = shared_errors(fit, names, system)
+    noise = Noise(
+        float(np.sqrt(variances[0])),
+        float(np.sqrt(variances[1])) if known[1] else None,
+        consistent,
+        neighbours.successive,
+        neighbours.near,
+        neighbours.found,
+    )
+    together = joint_sums / np.maximum(sums, 1e-300)
+    sizes = np.where(together > SHARED, together, 1.0) * (1.0 if consistent else variances)
+    middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
+    extra, _ = system.extra_rows(fit.chain, names)
+    if system.prior is not None:
+        extra[: len(names)] *= system.prior.noise
+    alike = neighbours.middles
+    estimated = np.array([not consistent or sizes[k] != 1.0 or k in alike for k in (0, 1)])
+    freedom = np.maximum(np.minimum(counts, joint_counts) - taken, 1.0)
+    freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
+    if not estimated.any():
+        return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))
+
+    def covariances(by_part: Sequence[FloatArray]) -> FloatArray:
+        sources = (*by_part, extra.T @ extra)
+        return np.array([identifiability.covariance(factor, middle) for middle in sources])
+
+    covariance = covariances([alike.get(k, middle) for k, middle in enumerate(middles)])
+    if alike:
+        alone = np.diag(covariances(middles).sum(axis=0))
+        widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
+        noise = replace(noise, widened=widened)
+    size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))
+    return replace(noise, size=size), Uncertainty(covariance, freedom)
+
+
+def _squares(
+    chain: Chain, system: System
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return by part (2,) the sums of squared residuals and their numbers, and both of the sums.
+
+    The latter are over the pairs of each configuration: if its pairs share no error, the squares
+    of the sums add up to as much as the squares.
+    """
+    sums, counts, joint_sums, joint_counts = np.zeros((4, 2))
+    for samples in system.sets:
+        for k, part in enumerate(samples.whitened_residuals(chain)):
+            weights = np.ones(len(part)) if samples.weights is None else samples.weights**2
+            known = ~np.isnan(part[:, 0])
+            sums[k] += weights[known] @ (part[known] ** 2).sum(axis=1)
+            counts[k] += part.shape[1] * weights[known].sum()
+            groups = samples.observations.configurations[known]
+            weighted = np.sqrt(weights[known]) * part[known].T
+            joint_sums[k] += sum((np.bincount(groups, row) ** 2).sum() for row in weighted)
+            joint_counts[k] += part.shape[1] * np.count_nonzero(np.bincount(groups))
+    return sums, counts, joint_sums, joint_counts

@@ -1,0 +1,309 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Observations: matched pairs of joint values and measurements, and their configurations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from calib_ros.errors import InputError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+
+_OPTIONAL = ('covariance', 'approach', 'distances', 'velocity', 'acceleration', 'delay')
+TURN = 2.0 * np.pi
+STILL = 1e-3
+"""Joint values [rad or m] that differ by less are one configuration."""
+SCATTER = 0.02
+"""Distance [rad or m] up to which visits of one configuration may scatter."""
+GAP = 5.0
+"""Ratio of the distance of configurations to that of the visits of one."""
+WIDEST = 2.0
+"""Size of a configuration's visits in units of the longest step between them."""
+FEWEST = 8
+"""Configurations from which on their distances tell what a visit is."""
+NEIGHBOURS = 8
+"""Nearest values among which visits are looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """N matched pairs of joint values and measured poses, in the order of their stamps.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64
+    joints : (N, n) [rad or m]
+    positions : (N, 3) [m]
+        Of the target in the measuring device's frame, the world.
+    rotations : (N, 3, 3)
+        Of the target in the world; the identity where none was measured.
+    oriented : (N,) bool
+        True where the orientation was measured.
+    covariance : (N, 6, 6), optional
+        Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
+        PoseWithCovariance; NaN rows where the measurement brought none.
+    approach : (N, n), optional
+        Signs of the velocities with which the joints came to their values, for backlash.
+    distances : (N,), optional
+        Distances [m] from the origin of the world to the target, for draw-wires and ball-bars.
+        Positions and rotations count for nothing then.
+    velocity, acceleration : (N, n), optional
+        Of the joints, where the arm was moving when it was measured.
+    delay : (N,), optional
+        How much earlier than the stamps the joints had these values [s].
+    base, tool : str
+        Frames of the chain that hold for these pairs.
+    socket : bool
+        The target, a ball, sat in a socket of unknown place: it was at the origin of the world all
+        the time, and the world's axes are those of the arm's base.
+
+    """
+
+    stamps_ns: NDArray[np.int64]
+    joints: FloatArray
+    positions: FloatArray
+    rotations: FloatArray
+    oriented: NDArray[np.bool_]
+    covariance: FloatArray | None = None
+    approach: FloatArray | None = None
+    distances: FloatArray | None = None
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
+    delay: FloatArray | None = None
+    base: str = 'base'
+    tool: str = 'tool'
+    socket: bool = False
+
+    def __post_init__(self) -> None:
+        """Check that the arrays fit together and hold only numbers."""
+        count = len(self.stamps_ns)
+        shapes = {
+            'joints': (count, *self.joints.shape[1:]),
+            'positions': (count, 3),
+            'rotations': (count, 3, 3),
+            'oriented': (count,),
+        }
+        if self.covariance is not None:
+            shapes['covariance'] = (count, 6, 6)
+        if self.delay is not None:
+            shapes['delay'] = (count,)
+        for name in ('approach', 'velocity', 'acceleration'):
+            if getattr(self, name) is not None:
+                shapes[name] = self.joints.shape
+        if self.distances is not None:
+            shapes['distances'] = (count,)
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise InputError(
+                    f'{name} of {count} observations must have the shape {shape}, not '
+                    f'{getattr(self, name).shape}'
+                )
+        for name in ('joints', 'positions', 'rotations', *_OPTIONAL):
+            if name == 'covariance' or getattr(self, name) is None:
+                continue
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(f'{name} of the observations hold NaN or infinite values')
+
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+        return len(self.stamps_ns)
+
+    @classmethod
+    def from_arrays(
+        cls, joints: FloatArray, positions: FloatArray, rotations: FloatArray | None = None
+    ) -> Observations:
+        """Make observations (N) from arrays; position only when `rotations` is None."""
+        count = len(joints)
+        return cls(
+            np.arange(1, count + 1, dtype=np.int64) * 1_000_000_000,
+            np.asarray(joints, dtype=np.float64),
+            np.asarray(positions, dtype=np.float64),
+            np.broadcast_to(np.eye(3), (count, 3, 3)) if rotations is None else rotations,
+            np.full(count, rotations is not None),
+        )
+
+    def select(self, mask: NDArray[np.generic]) -> Observations:
+        """Return the pairs chosen by a mask or by indices."""
+        names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
+        present = [name for name in _OPTIONAL if getattr(self, name) is not None]
+        chosen = replace(self, **{name: getattr(self, name)[mask] for name in (*names, *present)})
+        if 'configurations' in vars(self):  # takes longer to find than all the rest
+            _, vars(chosen)['configurations'] = np.unique(
+                self.configurations[mask], return_inverse=True
+            )
+        return chosen
+
+    def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
+        """Return the poses the other way round: a camera on the flange sees a fixed target.
+
+        The measured pose of the target in the camera becomes that of the camera in the target's
+        frame, which takes the place of the world. Covariances go along; `sigmas` (position [m],
+        orientation [rad]) make them where the measurement brought none, because the inverse is
+        uncertain by the orientation's sigma times the distance.
+        """
+        if not self.oriented.all():
+            raise InputError(
+                'poses of a camera on the flange need their orientation (qx qy qz qw): without it '
+                'they cannot be turned round'
+            )
+        turned = np.swapaxes(self.rotations, 1, 2)
+        positions = -np.einsum('nij,nj->ni', turned, self.positions)
+        covariance = self.covariance if sigmas is None else self.covariances(sigmas)
+        if covariance is not None:
+            jacobian = np.zeros((len(self), 6, 6))
+            jacobian[:, :3, :3] = -turned
+            jacobian[:, :3, 3:] = -turned @ se3.skew(self.positions)
+            jacobian[:, 3:, 3:] = -turned
+            covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+        return replace(self, positions=positions, rotations=turned, covariance=covariance)
+
+    def covariances(self, sigmas: tuple[float, float]) -> FloatArray:
+        """Return (N, 6, 6) the covariances, by `sigmas` [m, rad] where a measurement brought none.
+
+        One that is zero in all that concerns the rotation is that of the position alone.
+        """
+        given = np.diag(np.repeat(np.square(sigmas), 3))
+        found = np.tile(given, (len(self), 1, 1))
+        if self.covariance is not None:
+            own = ~np.isnan(self.covariance[:, 0, 0])
+            found[own] = self.covariance[own]
+            position_only = ~found[:, 3:].any(axis=(1, 2))
+            found[position_only, 3:, 3:] = given[3:, 3:]
+        return found
+
+    def at(self, stamps_ns: NDArray[np.int64]) -> Observations:
+        """Return the same pairs with other stamps (N,)."""
+        return replace(self, stamps_ns=stamps_ns)
+
+    def earlier(self, delay: float) -> Observations:
+        """Return the same measurements with the joint values of a delay [s] before the stamps.
+
+        By velocity and acceleration; without them the arm stood and nothing changes.
+        """
+        if self.velocity is None:
+            return self
+        more = np.full((len(self), 1), delay)
+        if self.delay is not None:
+            more -= self.delay[:, np.newaxis]
+        if not more.any():
+            return self
+        velocity, joints = self.velocity, self.joints - more * self.velocity
+        if self.acceleration is not None:
+            joints = joints + 0.5 * more**2 * self.acceleration
+            velocity = velocity - more * self.acceleration
+        return replace(
+            self, joints=joints, velocity=velocity, delay=np.full(len(self), float(delay))
+        )
+
+    @cached_property
+    def configurations(self) -> NDArray[np.intp]:
+        """Return (N,) the number of the standing configuration that each pair belongs to."""
+        return configurations(self.joints)
+
+
+def stops(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) the number of the stop at which joint values (N, n) in sequence were taken."""
+    if len(joints) == 0:
+        return np.zeros(0, dtype=np.intp)
+    return np.concatenate([[0], np.cumsum(_moved(joints))]).astype(np.intp)
+
+
+def _moved(joints: FloatArray) -> NDArray[np.bool_]:
+    """Return (N - 1,) whether the arm moved from one row to the next; angles modulo a turn."""
+    change = np.abs(np.diff(joints, axis=0)) % TURN
+    return np.asarray(np.minimum(change, TURN - change).max(axis=1) > STILL)
+
+
+def configurations(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) the number of the configuration that joint values (N, n) belong to.
+
+    Values within STILL of each other are one configuration, whenever they were taken: a program
+    that runs in a loop visits it again, it does not measure another one. So are those that lie
+    as close together beside their distance from all others. Angles count modulo a full turn.
+    """
+    if len(joints) == 0:
+        return np.zeros(0, dtype=np.intp)
+    standing = joints[np.concatenate([[True], _moved(joints)])]  # one row a stop
+    near = _near(standing)
+    links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(standing),) * 2)
+    _, label = connected_components(links, directed=False)
+    _, first = np.unique(label, return_index=True)
+    return np.asarray(_repeats(standing[first])[label[stops(joints)]], dtype=np.intp)
+
+
+def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
+    """Return the numbers (N,) of the configurations of each set, counted over all of them.
+
+    What several targets or sessions show of one configuration has its number in common.
+    """
+    if len(sets) == 1:
+        return (sets[0].configurations,)
+    numbers = configurations(np.concatenate([each.joints for each in sets]))
+    return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
+
+
+def _repeats(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) which joint values (N, n) are visits of one configuration that scatter.
+
+    Where the distances of nearest values leave a gap, from so much to GAP times as much, those
+    below it are visits, as long as each configuration is as small as they are.
+    """
+    count = len(joints)
+    apart = np.arange(count)
+    if count < FEWEST:
+        return apart
+    place = np.concatenate([np.cos(joints), np.sin(joints)], axis=1)
+    far, near = cKDTree(place).query(
+        place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
+    )
+    first, which = np.nonzero(np.isfinite(far))
+    if not (far < SCATTER).any():
+        return apart
+    graph = coo_array((far[first, which], (first, near[first, which])), shape=(count, count))
+    tree = minimum_spanning_tree(graph).tocoo()
+    lengths = np.append(np.sort(tree.data), GAP * SCATTER)
+    gaps = np.flatnonzero((lengths[1:] >= GAP * lengths[:-1]) & (lengths[:-1] <= SCATTER))
+    for reach in lengths[gaps[::-1]]:
+        close = tree.data <= reach
+        links = coo_array(
+            (tree.data[close], (tree.row[close], tree.col[close])), shape=(count, count)
+        )
+        number, label = connected_components(links, directed=False)
+        middle = np.stack([np.bincount(label, row) for row in place.T]) / np.bincount(label)
+        extent = np.linalg.norm(place - middle.T[label], axis=1).max()
+        if number >= FEWEST and extent <= WIDEST * reach:
+            return np.asarray(label, dtype=np.intp)
+    return apart
+
+
+def _near(joints: FloatArray) -> NDArray[np.intp]:
+    """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn.
+
+    Sums of cosines move by n times as much at most, and know no turns: in the order of one, rows
+    are compared with those after them as long as these two may be near.
+    """
+    phases = np.arange(joints.shape[1])
+    along, across = np.cos(joints + phases).sum(axis=1), np.sin(joints + phases).sum(axis=1)
+    order = np.argsort(along)
+    along, across = along[order], across[order]
+    reach = joints.shape[1] * STILL
+    found = []
+    first, step = np.arange(len(joints)), 0
+    while len(first):
+        step += 1
+        first = first[: np.searchsorted(first, len(joints) - step)]
+        first = first[along[first + step] - along[first] <= reach]
+        close = first[np.abs(across[first + step] - across[first]) <= reach]
+        pairs = np.column_stack([order[close], order[close + step]])
+        change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
+        found.append(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
+    return np.concatenate(found)

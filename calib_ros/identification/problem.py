@@ -1,0 +1,266 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is known before an identification."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.identification import identifiability
+from calib_ros.identification.leastsquares import Prior, Samples, System
+from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.robust import LOSSES
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain, is_length
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What a first fit has told: sizes of errors [m, rad] by parameter, and that of the noise.
+
+    The latter in units of the sigmas given.
+    """
+
+    priors: Mapping[str, float]
+    noise: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is known before an identification.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal chain. Frames that it does not fix are fitted.
+    observations : Observations
+        Pairs to fit.
+    separations : sequence of (str, str, float)
+        Pairs of base frames whose origins are a known distance [m] apart: sockets in which a ball
+        on the flange sat. Their worlds are parallel to the arm's base.
+    world_frame : str
+        Frame in which the poses were measured, for the record.
+    more : sequence of Observations
+        Further sets in the same fit: other sessions or targets with frames of their own, other
+        kinds of measurement.
+    held_out : Observations or several, optional
+        Pairs that are never fitted and judge the result. Without them the result is judged by
+        cross-validation over whole configurations.
+    sigma_position, sigma_orientation : float
+        Standard deviations [m, rad] of measurements without a covariance of their own. Their
+        ratio weighs position against orientation; the size of the noise is estimated.
+    loss : 'redescending', 'huber' or 'none'
+        How gross errors are kept from ruining the fit (`robust.py`).
+    priors : mapping of str to float
+        Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
+        such as `*.a`; the first pattern that fits holds. None by default.
+    effects : sequence of str
+        Non-geometric effects to fit, by name or by group (`effects.py`).
+    fixed : sequence of str
+        Parameters to hold at their nominal values; `*` and `?` match as in file names.
+    folds : int
+        Parts of the cross-validation.
+    largest_length, largest_angle : float
+        Offsets [m, rad] that no faulty but right robot has; with a larger one the result is not
+        accepted.
+    largest_error : float
+        RMS position error [m] on held-out poses beyond which nothing is accepted.
+    learned : Learned, optional
+        Priors that the data themselves have told, for parameters without one (`evidence.py`).
+
+    """
+
+    chain: Chain
+    observations: Observations
+    held_out: Observations | Sequence[Observations] | None = None
+    sigma_position: float = 1e-4
+    sigma_orientation: float = 1e-4 / 0.3
+    fixed: Sequence[str] = ()
+    folds: int = 5
+    largest_length: float = 0.05
+    largest_angle: float = 0.1
+    largest_error: float = 0.01
+    loss: str = 'redescending'
+    priors: Mapping[str, float] = field(default_factory=dict)
+    effects: Sequence[str] = ()
+    more: Sequence[Observations] = ()
+    world_frame: str = ''
+    separations: Sequence[tuple[str, str, float]] = ()
+    learned: Learned | None = None
+
+    def __post_init__(self) -> None:
+        """Check what does not depend on the measured values."""
+        for name in ('sigma_position', 'sigma_orientation'):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
+        if self.loss not in LOSSES:
+            raise UnknownNameError('loss', self.loss, LOSSES)
+        joints = len(self.chain.joints)
+        for observations in (*self.sets, *self.judging):
+            if observations.joints.shape[1:] != (joints,):
+                raise InputError(
+                    f'observations have {observations.joints.shape[1:]} joint values, chain '
+                    f'"{self.chain.name}" has {joints} joints'
+                )
+
+        names = self.model.parameter_names
+        for pattern in (*self.fixed, *self.priors):
+            if not fnmatch.filter(names, pattern):
+                raise UnknownNameError('parameter', pattern, names)
+        for pattern, sigma in self.priors.items():
+            if not 0.0 < sigma < np.inf:
+                raise ConfigError(f'the prior of {pattern} must be a positive number, not {sigma}')
+        for name in self.effects:
+            if not effects.resolve(self.chain, name):
+                raise ConfigError(
+                    f'this chain has nothing to fit in "{name}" (gear needs the gear_ratio of '
+                    'joints in the chain file)'
+                )
+            if effects.group_of(f'.{name}') == 'compliance' and not any(
+                joint.mass for joint in self.chain.joints
+            ):
+                raise ConfigError('compliance needs the masses of the links in the chain file')
+            if effects.group_of(f'.{name}') == 'backlash' and all(
+                each.approach is None for each in self.sets
+            ):
+                raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
+        for pattern in self.priors:
+            if pattern.partition('.')[0] in self.model.frame_names:
+                raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
+        sockets = {each.base for each in self.sets if each.socket}
+        for *pair, distance in self.separations:
+            for base in pair:
+                if base not in sockets:
+                    raise UnknownNameError('socket that is a known distance away', base, sockets)
+            if not distance > 0.0:
+                raise ConfigError(f'the distance of sockets must be positive, not {distance}')
+        for pattern in self.fixed:
+            if pattern.partition('.')[0] in self.model.frame_names:
+                raise ConfigError(
+                    f'a frame is held as a whole: give it in the chain file with "fixed: true", '
+                    f'instead of fixing "{pattern}"'
+                )
+        if not self.free:
+            raise ConfigError('every parameter is fixed: nothing is left to identify')
+
+    @cached_property
+    def sets(self) -> tuple[Observations, ...]:
+        """Return all sets of observations to fit."""
+        return (self.observations, *self.more)
+
+    @cached_property
+    def judging(self) -> tuple[Observations, ...]:
+        """Return the held-out sets that hold anything."""
+        held_out = self.held_out or ()
+        sets = (held_out,) if isinstance(held_out, Observations) else tuple(held_out)
+        return tuple(each for each in sets if len(each))
+
+    @cached_property
+    def configurations(self) -> tuple[NDArray[np.intp], ...]:
+        """Return the numbers (N,) of the configurations of each set to fit, over all of them."""
+        return numbered(self.sets)
+
+    @cached_property
+    def kinds(self) -> tuple[identifiability.Kind, ...]:
+        """Return what each set measures."""
+        return tuple(
+            identifiability.Kind(
+                bool(each.oriented.any()),
+                each.distances is not None,
+                each.velocity is not None,
+                each.base,
+                each.tool,
+                each.socket,
+            )
+            for each in self.sets
+        )
+
+    @cached_property
+    def model(self) -> Chain:
+        """Return the nominal chain with every frame and effect that is to be fitted."""
+        chain = self.chain
+        known = dict(chain.frames)
+        added = {n for each in self.sets for n in (each.base, each.tool)} - set(chain.frame_names)
+        chain = replace(chain, frames=tuple((known | dict.fromkeys(sorted(added))).items()))
+        for each in self.sets:
+            device = chain.frame(each.base)
+            if each.velocity is not None and device.delay is None:
+                start = 0.0 if each.delay is None else float(np.median(each.delay))
+                chain = chain.with_frame(each.base, replace(device, delay=start))
+        wanted = [each for name in self.effects for each in effects.resolve(chain, name)]
+        return chain.with_effects(wanted)
+
+    @cached_property
+    def prior_sigmas(self) -> Mapping[str, float]:
+        """Return the standard deviations [m, rad] of the priors of all parameters that have one.
+
+        Frames have none; effects always have one.
+        """
+        sigmas = (
+            dict(self.given) if self.learned is None else {**self.learned.priors, **self.given}
+        )
+        for name, _ in self.model.effects:
+            sigmas.setdefault(name, effects.expected(name))
+        return sigmas
+
+    @cached_property
+    def given(self) -> Mapping[str, float]:
+        """Return the standard deviations [m, rad] of the priors that were given, by name."""
+        sigmas: dict[str, float] = {}
+        for name in self.free:
+            for pattern, sigma in self.priors.items():
+                if fnmatch.fnmatchcase(name, pattern) and not self.model.owns_frame(name):
+                    sigmas.setdefault(name, sigma)
+        return sigmas
+
+    @cached_property
+    def informed(self) -> frozenset[str]:
+        """Return the DH parameters whose prior says more than common sense does."""
+        known = dict(self.model.effects)
+        return frozenset(
+            name
+            for name, sigma in self.given.items()
+            if name not in known and sigma < self.common_sense(name)
+        )
+
+    def common_sense(self, name: str) -> float:
+        """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
+        return (self.largest_length if is_length(name) else self.largest_angle) / 3.0
+
+    def system(self, sets: Sequence[Observations]) -> System:
+        """Return sets of observations, and the priors, as the solver takes them."""
+        sigmas = self.prior_sigmas
+        noise = 1.0 if self.learned is None else self.learned.noise
+        prior = Prior(self.model, sigmas, noise) if sigmas else None
+        samples = [Samples(each, self.sigma_position, self.sigma_orientation) for each in sets]
+        present = {each.base for each in sets}
+        apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
+        return System(tuple(samples), prior, apart)
+
+    @cached_property
+    def free(self) -> tuple[str, ...]:
+        """Return the parameters that may be fitted, in the order of their priority.
+
+        Of parameters that trade against each other the last are kept nominal: effects, and before
+        them lengths d, which are what grows absurd between nearly parallel axes.
+        """
+        model = self.model
+        used = {name for each in self.sets for name in (each.base, each.tool)}
+        held = [f'{k}.*' for k in model.frame_names if model.frame(k).fixed or k not in used]
+        held += [f'{each.base}.r?' for each in self.sets if each.socket]
+        known = dict(model.effects)
+        ordered = sorted(
+            model.parameter_names, key=lambda name: 2 * (name in known) + name.endswith('.d')
+        )
+        return tuple(
+            name
+            for name in ordered
+            if not any(fnmatch.fnmatchcase(name, pattern) for pattern in (*self.fixed, *held))
+        )

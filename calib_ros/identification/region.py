@@ -1,0 +1,247 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a calibration may be used: where it is known to bring the arm closer, not only near.
+
+By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C), those
+of the calibration x^. At poses with the Jacobian A, base and tool frames projected out, the errors
+are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse over these poses if
+
+    |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
+
+whose left side is normal: this *risk* is one value of the normal distribution. The calibration is
+used at the poses measured if the risk there is below RISK, and further out, in shells of growing
+standard deviation of the predicted position, as far as the risk in each shell is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification.evidence import ROUNDING, Posterior
+from calib_ros.identification.leastsquares import BLOCK
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+
+RISK = 0.01
+"""Probability at which a calibration may make the arm worse over the poses of a shell."""
+DRAWN = 200
+"""Random configurations that stand for the range of the joints."""
+MEASURED = 100
+"""Measured configurations that stand for all of them."""
+KNOWN = 1e9
+"""Degrees of freedom that are as good as infinite."""
+SHELL = 10
+"""Random configurations of a shell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """The joint values at which a calibration may be used.
+
+    Attributes
+    ----------
+    chain : Chain
+        The calibrated arm, with the effects considered.
+    names : tuple of str
+        Parameters, (P,) in all.
+    square : (P, P)
+        Expected squares of their errors.
+    limit : float
+        Expected error [m] of predicted positions up to which the calibration is used; infinite
+        where it is used over the whole range of the joints.
+    share : float
+        Of the range of the joints in which it is used.
+    base, tool : str
+        Frames between which it was measured.
+
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    square: FloatArray
+    limit: float
+    share: float
+    base: str = 'base'
+    tool: str = 'tool'
+
+    def sigma(self, joints: FloatArray) -> FloatArray:
+        """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
+        model = ErrorModel(self.chain, self.names, self.base, self.tool)
+        starts = range(0, len(joints), BLOCK)
+        parts = [joints[first : first + BLOCK] for first in starts]
+        lengths = [_length(model.jacobian(part)[:, :3], self.square) for part in parts]
+        return np.concatenate(lengths) if lengths else np.zeros(0)
+
+    def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
+        """Tell (N,) at which joint values (N, n) the calibration may be used."""
+        if np.isinf(self.limit):
+            return np.ones(len(joints), dtype=bool)
+        return np.asarray(self.sigma(joints) <= self.limit)
+
+    @property
+    def whole(self) -> bool:
+        """Tell whether it is the whole range of the joints."""
+        return bool(np.isinf(self.limit))
+
+    def in_words(self) -> str:
+        """Return where the calibration may be used."""
+        if self.whole:
+            return 'valid over the whole joint range'
+        where = f'{100.0 * self.share:.0f} % of the joint range' if self.share else ''
+        return (
+            f'valid near the measured poses only{", " * bool(where)}{where}: where the expected '
+            f'error is below {1e3 * self.limit:.3f} mm'
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values: the squares by the rows of their Cholesky factor."""
+        scale = np.sqrt(np.maximum(np.diag(self.square), 1e-300))
+        scaled = self.square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+        root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
+        return {
+            'limit': None if self.whole else self.limit,
+            'share': self.share,
+            'base': self.base,
+            'tool': self.tool,
+            'names': list(self.names),
+            'root': [' '.join(f'{x:.6e}' for x in row[: k + 1]) for k, row in enumerate(root)],
+        }
+
+
+def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
+    """Return the region of a calibrated chain from its record; None where it names none.
+
+    Raises
+    ------
+    ConfigError
+        When it is not what `Region.document` makes; `where` names it.
+
+    """
+    document = record.get('region')
+    if document is None:
+        return None
+    try:
+        names = tuple(str(name) for name in document['names'])
+        root = np.zeros((len(names), len(names)))
+        for k, row in enumerate(document['root']):
+            root[k, : k + 1] = [float(part) for part in row.split()]
+        chain = chain.with_effects([n for n in names if not _is_geometric(chain, n)])
+        ErrorModel(chain, names)
+        limit = document['limit']
+        region = Region(
+            chain,
+            names,
+            root @ root.T,
+            np.inf if limit is None else float(limit),
+            float(document['share']),
+            str(document['base']),
+            str(document['tool']),
+        )
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
+        raise ConfigError(
+            f'{where}: calibration.region is damaged ({type(err).__name__}): identify again'
+        ) from err
+    known = np.isfinite(region.square).all() and region.limit > 0.0 and 0.0 <= region.share <= 1.0
+    if not known or len(document['root']) != len(names):
+        raise ConfigError(f'{where}: calibration.region is damaged: identify again')
+    for frame in (region.base, region.tool):
+        if frame not in chain.frame_names:
+            raise UnknownNameError(
+                f'frame in {where}: calibration.region', frame, chain.frame_names
+            )
+    return region
+
+
+def _is_geometric(chain: Chain, name: str) -> bool:
+    return chain.owns_frame(name) or name.partition('.')[2] in DH_KINDS
+
+
+def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
+    """Return where a calibration may be used; None where not even at the poses measured.
+
+    `freedom` are the degrees of freedom from which the noise was estimated.
+    """
+    ends = sets[0]
+    measured = np.concatenate([_spread(each) for each in sets])
+    drawn = posterior.chain.random_joints(DRAWN, np.random.default_rng(0))
+    judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
+    near, far = np.split(judge.sigma, [len(measured)])
+    limit = float(near.max())
+    order = np.argsort(far)
+    inner = [*range(len(measured)), *(len(measured) + order[far[order] <= limit]).tolist()]
+    if not judge.risk(inner, inner) < RISK:
+        return None
+    shells = len(measured) + order[far[order] > limit]
+    for first in range(0, len(shells), SHELL):
+        shell = shells[first : first + SHELL].tolist()
+        if not judge.risk(shell, inner + shell) < RISK:
+            break
+        inner += shell
+        limit = float(judge.sigma[shell[-1]])
+    share = float(np.mean(far <= limit))
+    return Region(
+        posterior.chain,
+        posterior.names,
+        posterior.square,
+        np.inf if share == 1.0 else limit,
+        share,
+        ends.base,
+        ends.tool,
+    )
+
+
+def _length(rows: FloatArray, square: FloatArray) -> FloatArray:
+    """Return the roots (N,) of the expected squared lengths of J x, J (N, 3, P)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    squares = ((flat @ square) * flat).sum(axis=1).reshape(-1, 3).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+
+def _spread(observations: Observations) -> FloatArray:
+    """Return joint values of some of the pairs, evenly over the session."""
+    return observations.joints[:: 1 + len(observations) // MEASURED]
+
+
+class _Judge:
+    """Tells how probable it is that a calibration makes the arm worse at some poses."""
+
+    def __init__(
+        self, posterior: Posterior, joints: FloatArray, ends: Observations, freedom: float
+    ) -> None:
+        chain, names = posterior.chain, posterior.names
+        frames = [f'{ends.base}.{kind}' for kind in FRAME_KINDS]
+        frames += [f'{ends.tool}.{kind}' for kind in FRAME_KINDS[:3]]
+        every = list(dict.fromkeys([*frames, *names]))
+        rows = ErrorModel(chain, every, ends.base, ends.tool).jacobian(joints)[:, :3]
+        column = {name: k for k, name in enumerate(every)}
+        own = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        self.sigma = _length(rows[:, :, [column[name] for name in names]], posterior.square)
+        self._frames = rows[:, :, : len(frames)]
+        self._rows = rows[:, :, [column[names[k]] for k in own]]
+        self._offsets = posterior.offsets[own]
+        mean, covariance = posterior.doubted
+        self._mean, self._covariance = mean[own], covariance[np.ix_(own, own)]
+        self._freedom = freedom
+
+    def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
+        """Return it for some poses, in frames fitted to those around."""
+        frames, rows = self._frames[around], self._rows[around]
+        known = frames.reshape(-1, frames.shape[2])
+        taken = np.linalg.lstsq(known, rows.reshape(len(known), -1), rcond=1e-9)[0]
+        left = (self._rows[which] - self._frames[which] @ taken).reshape(-1, rows.shape[2])
+        gain = left @ self._offsets
+        slope = left.T @ gain
+        margin = float(slope @ self._mean) - 0.5 * float(gain @ gain)
+        spread = float(np.sqrt(max(float(slope @ self._covariance @ slope), 0.0)))
+        if spread == 0.0:
+            return 0.0 if margin > 0.0 else 1.0
+        return float(special.stdtr(min(self._freedom, KNOWN), -margin / spread))

@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Least squares that gross errors do not ruin, and their names.
+
+A sample's distance is the length of its residual in units of a scale estimated from the data (the
+median of all lengths), the larger one of position and orientation. Weights follow it, and the fit
+is repeated until they stand still (iteratively reweighted least squares; Holland and Welsch 1977):
+
+    first        w = min(1, 1 / distance)                  the fit of least absolute lengths
+    redescending w = 1 below INNER, 0 beyond OUTER, falling in between (Hampel 1974)
+    huber        w = min(1, INNER / distance)              (Huber 1964)
+
+Clean data keep the weight 1 throughout, so nothing is lost against least squares.
+
+Gross errors that agree with each other, as from a target that was bumped, are a second model that
+the first fit may settle between or even at. Where it names outliers, or leaves more than the
+sigmas given explain, the fit is repeated from the best half of the samples (`trimmed.py`), and
+counts when half of the residuals shrink by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.errors import UnknownNameError
+from calib_ros.identification.leastsquares import Fit, System, minimise
+from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+Loss: TypeAlias = Literal['redescending', 'huber', 'none']
+LOSSES: tuple[str, ...] = get_args(Loss)
+INNER, OUTER = 5.0, 7.0
+"""Distances [scale] at which a sample begins to lose weight, and has none left. Of Gaussian
+errors in three directions 2 of 100,000 lie beyond the first."""
+OUTLIER = 6.0
+"""Distance beyond which a sample is named as an outlier."""
+REWEIGHTINGS = 40
+SUSPICIOUS = 1.2
+"""RMS residual [sigma] from which gross errors may hide in it."""
+SHRUNK = 0.5
+"""Ratio of half of the residuals from which a fit is another one, not a detail of the first."""
+NOISE_FREE = 1e-6
+"""Least scale [sigma]: below, residuals are rounding errors and no outliers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Robust:
+    """A robust fit: the fit itself, and the distances (N,) of all samples of each set."""
+
+    fit: Fit
+    distances: tuple[FloatArray, ...]
+    settled: bool
+    iterations: int
+    loss: str
+
+    @property
+    def outliers(self) -> NDArray[np.bool_]:
+        """Return (N,) which samples of all sets, one after the other, are of gross error."""
+        return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')
+
+
+def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious.
+
+    The weights of the sets are left as they were used last.
+    """
+    first = robust_fit(chain, names, system, loss)
+    suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
+    if loss != 'redescending' or not suspicious:
+        return first
+    weights = [samples.weights for samples in system.sets]
+    second = reweighted(trimmed_start(chain, names, system), names, system, loss)
+    sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
+    if sums[1] < SHRUNK**2 * sums[0]:
+        return replace(second, iterations=first.iterations + second.iterations)
+    for samples, weight in zip(system.sets, weights, strict=True):
+        samples.weights = weight
+    return first
+
+
+def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+    """Fit the named parameters, giving gross errors no weight.
+
+    The weights of the sets are left as they were used last.
+    """
+    if loss not in LOSSES:
+        raise UnknownNameError('loss', loss, LOSSES)
+    for samples in system.sets:
+        samples.weights = None
+    fit = minimise(chain, names, system)
+    iterations = fit.iterations
+    distances = distances_of(fit.chain, names, system)
+    if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
+        return Robust(fit, distances, True, iterations, loss)
+    if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # led away from a good start
+        fit = replace(fit, chain=chain)
+        distances = distances_of(chain, names, system)
+    for _ in range(REWEIGHTINGS):
+        before = distances
+        _weigh(system, [np.minimum(1.0, 1.0 / np.maximum(d, 1e-12)) for d in distances])
+        fit = minimise(fit.chain, names, system, iterations=2)
+        iterations += fit.iterations
+        distances = distances_of(fit.chain, names, system)
+        if all(
+            np.allclose(d, b, rtol=0.1, atol=0.1) for d, b in zip(distances, before, strict=True)
+        ):
+            break
+    robust = reweighted(fit.chain, names, system, loss)
+    return replace(robust, iterations=iterations + robust.iterations)
+
+
+def reweighted(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    loss: str,
+    simpler: Sequence[FloatArray] | None = None,
+) -> Robust:
+    """Fit with the weights of a loss from a start that is good enough to tell gross errors.
+
+    With the distances (N,) of all samples by a `simpler` model, samples that it explains are no
+    gross errors: a richer model has to explain them as well. The weights of the sets are left as
+    they were used last.
+    """
+
+    def judged(chain: Chain) -> tuple[FloatArray, ...]:
+        found = distances_of(chain, names, system)
+        if simpler is None:
+            return found
+        return tuple(np.minimum(d, s) for d, s in zip(found, simpler, strict=True))
+
+    distances = judged(chain)
+    iterations = 0
+    settled = False
+    weights = [np.ones(0)] * len(system.sets)
+    for _ in range(REWEIGHTINGS):
+        last, weights = weights, [weights_of(d, loss) for d in distances]
+        settled = all(
+            len(w) == len(b) and np.allclose(w, b, rtol=0, atol=1e-4)
+            for w, b in zip(weights, last, strict=True)
+        )
+        if settled:
+            break
+        _weigh(system, weights)
+        fit = minimise(chain, names, system, tolerance=1e-3)
+        chain, iterations = fit.chain, iterations + fit.iterations
+        distances = judged(chain)
+        if not fit.converged:  # nor will the next one
+            break
+    fit = minimise(chain, names, system)
+    return Robust(fit, distances, settled, iterations + fit.iterations, loss)
+
+
+def weights_of(distance: FloatArray, loss: str) -> FloatArray:
+    """Return the weights (N,) of samples at distances (N,)."""
+    if loss == 'none':
+        return np.ones(len(distance))
+    if loss == 'huber':
+        return np.minimum(1.0, INNER / np.maximum(distance, 1e-12))
+    return np.clip((OUTER - distance) / (OUTER - INNER), 0.0, 1.0)
+
+
+def _weigh(system: System, weights: Sequence[FloatArray]) -> None:
+    for samples, weight in zip(system.sets, weights, strict=True):
+        samples.weights = np.sqrt(weight)
+
+
+def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[FloatArray, ...]:
+    """Return the distance (N,) of every sample, set by set."""
+    share = max(1.0 - len(names) / system.rows, 0.1)  # residuals are shorter than errors
+    found = []
+    for samples in system.sets:
+        largest = np.zeros(samples.count)
+        for part in samples.whitened_residuals(chain):
+            known = ~np.isnan(part[:, 0])
+            if known.any():
+                length = np.linalg.norm(part[known], axis=1) / np.sqrt(share)
+                scale = np.median(length) / _median_length(part.shape[1])
+                largest[known] = np.maximum(largest[known], length / max(scale, NOISE_FREE))
+        found.append(largest)
+    return tuple(found)
+
+
+def _median_length(dimensions: int) -> float:
+    """Return the median length of a vector of standard normal components."""
+    return float(np.sqrt(special.chdtri(dimensions, 0.5)))

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Joint values that were rounded: is the gain the arm's, or that of rounding?
+
+Values that are multiples of a step are off by up to half of it, alike wherever a joint has the
+same value: in grids, and wherever other joints move meanwhile. A model follows that, also on poses
+left out at the same values. So two explanations of the nominal residuals y are compared, frames
+projected out, by their evidence (the marginal likelihood, Gaussian throughout):
+
+    rounding      y ~ N(0, k I + C C^T)                 C: a column for each value of each joint
+    and the arm   y ~ N(0, k I + C C^T + s J J^T)       J: the arm's columns, times usual errors
+
+with the variance of the noise k and the size s of the arm's errors at their best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import DH_KINDS, Chain, is_length
+from calib_ros.kinematics.se3 import FloatArray
+
+STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
+"""Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are wanted."""
+WIDER = 5
+"""How many times as wide a step must not fit as well."""
+EXACT = 1e-3
+"""Share of a step by which multiples of it may be off."""
+FEW = 0.5
+"""Values of a joint beside the number of stops, up to which they repeat."""
+SAMPLES = 150
+"""Samples that are looked at; of more, evenly spread ones."""
+USUAL = (5e-4, 1e-3)
+"""Errors [m, rad] of an arm, whose size is found."""
+SIZES = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+NOISES = np.geomspace(0.2, 20.0, 15)
+SURE = 4.0
+"""Logarithm of the ratio of evidences from which on a gain is the arm's."""
+
+
+def rounded(problem: Problem) -> dict[str, float]:
+    """Return the joints whose values are multiples of a step [rad or m], with the step."""
+    joints = np.concatenate([each.joints for each in problem.sets])
+    steps = {name: _step(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
+    return {name: step for name, step in steps.items() if step > 0.0}
+
+
+def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, float]:
+    """Return the error [rad or m] that rounding gives to each joint's zero, by parameter.
+
+    The root of the mean square of the mean over all values, uniform within a step; a value that
+    most poses share hardly averages out.
+    """
+    joints = np.concatenate([each.joints for each in problem.sets])
+    found = {}
+    for joint, values in zip(problem.chain.joints, joints.T, strict=True):
+        if joint.name in coarse:
+            shares = np.unique(values, return_counts=True)[1] / len(values)
+            kind = 'theta' if joint.type == 'revolute' else 'd'
+            size = coarse[joint.name] / np.sqrt(12.0) * np.sqrt(np.sum(shares**2))
+            found[f'{joint.name}.{kind}'] = float(size)
+    return found
+
+
+def _step(values: FloatArray) -> float:
+    """Return the step that different values (N,) are multiples of; zero where there is none."""
+    different = np.unique(values)
+    if len(different) < 3:
+        return 0.0
+    for step in sorted(STEPS, reverse=True):
+        if _are_multiples(different, step):
+            return 0.0 if _are_multiples(different, WIDER * step) else step
+    return 0.0
+
+
+def _are_multiples(values: FloatArray, step: float) -> bool:
+    return bool(np.abs(values / step - np.round(values / step)).max() < EXACT)
+
+
+def may_be_rounding(
+    problem: Problem,
+    before: Chain,
+    names: Sequence[str],
+    steps: Mapping[str, float],
+    good: Sequence[NDArray[np.bool_]],
+) -> bool:
+    """Tell whether rounding of joint values explains what the nominal chain leaves as well.
+
+    `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
+    of rounded joints, and `good` (N,) tells which samples of each set are no outliers.
+    """
+    share = -(-sum(map(len, problem.sets)) // SAMPLES)
+    pairs = zip(problem.sets, good, strict=True)
+    sets = [each.select(np.flatnonzero(which)[::share]) for each, which in pairs]
+    joints = np.concatenate([each.joints for each in sets])
+    levels = {}
+    for number, joint in enumerate(problem.chain.joints):
+        value, level = np.unique(joints[:, number], return_inverse=True)
+        if joint.name in steps and len(value) <= FEW * len(joints):
+            levels[f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}'] = level
+    if not levels:
+        return False
+    arm = [name for name in names if not before.owns_frame(name)]
+    frames = [name for name in names if before.owns_frame(name)]
+    chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
+    system = problem.system(sets)
+    wanted = list(dict.fromkeys([*frames, *arm, *levels]))
+    parts = [samples.rows_of(chain, wanted) for samples in system.sets]
+    each = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
+    owner = np.repeat(np.arange(len(joints)), each)
+    rows = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
+    basis = linalg.qr(rows[:, : len(frames)], mode='economic', check_finite=False)[0]
+    columns = rows[:, len(frames) : len(frames) + len(arm)] * [_usual(name) for name in arm]
+    alike = []
+    for name, level in levels.items():
+        size = steps[name.partition('.')[0]] / np.sqrt(12.0)
+        column = size * rows[:, [wanted.index(name)]]
+        alike.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
+    everything = np.column_stack([*alike, columns, rows[:, -1]])
+    everything -= basis @ (basis.T @ everything)
+    width = sum(part.shape[1] for part in alike)
+    freedom = len(rows) - len(frames)
+    found = {
+        (with_rounding, size): _evidence(
+            everything[:, :-1] * np.repeat([with_rounding, size], [width, len(arm)]),
+            everything[:, -1],
+            freedom,
+        )
+        for with_rounding in (0.0, 1.0)
+        for size in SIZES
+    }
+    healthy = max(found[key] for key in found if key[1] == 0.0)
+    return bool(max(found.values()) - healthy < SURE)
+
+
+def _usual(name: str) -> float:
+    kind = name.partition('.')[2]
+    return USUAL[0 if is_length(name) else 1] if kind in DH_KINDS else effects.expected(name)
+
+
+def _evidence(columns: FloatArray, values: FloatArray, freedom: int) -> float:
+    """Return the log evidence of values ~ N(0, k I + columns columns^T) for the best noise k."""
+    sizes, vectors = np.linalg.eigh(columns.T @ columns)
+    good = sizes > 1e-12 * max(float(sizes.max(initial=0.0)), 1e-300)
+    sizes = sizes[good]
+    inside = (vectors[:, good].T @ (columns.T @ values)) ** 2 / sizes
+    outside = max(float(values @ values) - float(inside.sum()), 0.0)
+    noise = NOISES[:, np.newaxis] ** 2
+    total = noise + sizes
+    squares = (inside / total).sum(axis=1) + outside / noise[:, 0]
+    logs = np.log(total).sum(axis=1) + (freedom - len(sizes)) * np.log(noise[:, 0])
+    return float((-0.5 * (squares + logs)).max())

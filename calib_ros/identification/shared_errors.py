@@ -1,0 +1,370 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that neighbouring configurations share.
+
+A tracker drifts, and what a model lacks changes slowly over the joint space, so neighbours err
+alike and tell less than their number. Configurations are neighbours in succession or near each
+other in joint space. Residuals r of white noise of unit variance have the covariance B = I - Q Q^T
+(Q: orthonormal columns of the Jacobian), so a quadratic form r^T A r has
+
+    mean tr(A B)        covariance with r^T C r: 2 tr(A B C B)
+
+With A the links of neighbours, r^T A r / r^T r is tested against its mean (Moran's I of residuals,
+Cliff and Ord 1972; for successive ones that of Durbin and Watson 1950). Where the test finds
+neighbours alike, the noise is taken as a sum of what is independent and what fades with distance,
+
+    V = v_0 I + sum_k v_k K_k        K_k = exp(-distance / length_k)
+
+and the sizes v_k >= 0 follow from making the forms r^T K_k r equal to their expected values
+(MINQUE, Rao 1971), which allows for the errors that the fit itself has taken up. The covariance of
+the parameters is then H^-1 (J^T V J) H^-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, special
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from calib_ros.identification.leastsquares import Fit, Samples, System
+from calib_ros.identification.observations import stops
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+CONFIDENCE = 0.99
+"""Confidence of all tests together at which neighbours are said to share errors."""
+LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
+"""Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
+NEAREST = 3
+"""Neighbours in joint space of each configuration that are tested."""
+MOST = 400
+"""Stops on which sizes are estimated; of more, every so many runs of RUN are taken."""
+RUN = 20
+FEWEST = 8
+"""Stops from which on neighbours are looked at."""
+APART = 1e9
+"""Distance of the stops of different sets, which are no neighbours."""
+ROUNDING = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """How alike neighbours are, and the noise by parts (position, orientation) where they are.
+
+    Attributes
+    ----------
+    successive, near : float
+        Correlation of the residuals of neighbours, the larger one of the parts.
+    found : tuple of str
+        The kinds of neighbours that share errors by the test.
+    middles : dict of int to (P, P)
+        J^T V J of each part (0 position, 1 orientation) in which neighbours share errors.
+
+    """
+
+    successive: float
+    near: float
+    found: tuple[str, ...]
+    middles: dict[int, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class _Stops:
+    """Rows of stops, added up over the samples of each.
+
+    `parts` are (P + 1, c, n), by position and orientation, zero where nothing was measured;
+    `count` (n,) samples a stop; `place` (n, D) in joint space, angles on the unit circle, and
+    `time` (n,) the number of the stop; both far apart between sets.
+    """
+
+    parts: list[FloatArray]
+    count: FloatArray
+    place: FloatArray
+    time: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def distances(self, kind: str) -> FloatArray:
+        if kind == 'near':
+            return np.asarray(cdist(self.place, self.place))
+        return np.asarray(np.abs(self.time[:, np.newaxis] - self.time))
+
+    def links(self, kind: str) -> csr_array:
+        """Return (n, n): 1 where two stops are neighbours."""
+        count = len(self)
+        if kind == 'successive':
+            first = np.flatnonzero(np.diff(self.time) == 1.0)
+            second = first + 1
+        else:
+            far, nearest = cKDTree(self.place).query(self.place, k=NEAREST + 1)
+            first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
+            good = (first != second) & (far.ravel() < APART / 2)
+            pairs = np.sort(np.column_stack([first, second])[good], axis=1)
+            first, second = np.unique(pairs, axis=0).T
+        links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
+        return csr_array(links + links.T)
+
+    def kernel(self, kind: str, length: float) -> FloatArray:
+        """Return (n, n): covariance of the sums over each stop's samples, per root of count."""
+        root = np.sqrt(self.count)
+        return np.asarray(np.outer(root, root) * np.exp(-self.distances(kind) / length))
+
+
+def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
+    """Return which neighbours share errors, and the noise that follows."""
+    kinds = tuple(LENGTHS)
+    total = sum(int(stops(samples.observations.joints)[-1]) + 1 for samples in system.sets)
+    share = max(1, -(-total // MOST))
+    few = _gather(fit.chain, names, system, share, RUN)
+    correlations = dict.fromkeys(kinds, 0.0)
+    if len(few) < FEWEST:
+        return Shared(**correlations, found=(), middles={})
+    extra, _ = system.extra_rows(fit.chain, names)
+    forms = _Forms(few, extra)
+    limit = special.ndtri(1.0 - (1.0 - CONFIDENCE) / (len(kinds) * len(forms.parts)))
+    alike: dict[int, list[str]] = {}
+    for kind in kinds:
+        links = few.links(kind)
+        for part in forms.parts:
+            correlation, score = forms.test(part, links)
+            correlations[kind] = max(correlations[kind], correlation)
+            if score > limit:
+                alike.setdefault(part, []).append(kind)
+    if not alike:
+        return Shared(**correlations, found=(), middles={})
+    kernels = {
+        part: [(kind, length) for kind in kinds if kind in found for length in LENGTHS[kind]]
+        for part, found in alike.items()
+    }
+    sizes = forms.sizes(kernels)
+    even = few if share == 1 else _gather(fit.chain, names, system, share, 1)
+    middles = {}
+    for part in alike:
+        white, *rest = sizes[part]
+        middle = white * fit.normal.parts[part]
+        by_time = []
+        for (kind, length), size in zip(kernels[part], rest, strict=True):
+            if size > 0.0 and kind == 'near':
+                middle = middle + size * _near(even, part, length, share)
+            elif size > 0.0:
+                by_time.append((length, size))
+        if by_time:
+            middle = middle + _successive(fit.chain, names, system, part, by_time)
+        middles[part] = middle
+    found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
+    return Shared(**correlations, found=found, middles=middles)
+
+
+class _Forms:
+    """Quadratic forms of residuals, and their moments, for stops of which the rows are known."""
+
+    def __init__(self, units: _Stops, extra: FloatArray) -> None:
+        self._units = units
+        width = extra.shape[1]
+        rows = [part.reshape(width + 1, -1).T for part in units.parts]
+        stacked = np.concatenate([*rows, np.pad(extra, ((0, 0), (0, 1)))])
+        basis = linalg.qr(stacked[:, :-1], mode='economic', check_finite=False)[0]
+        left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
+        self._basis: dict[int, FloatArray] = {}
+        self._residual: dict[int, FloatArray] = {}
+        self._known: dict[int, FloatArray] = {}
+        self.parts: list[int] = []
+        first = 0
+        for part, each in enumerate(units.parts):
+            shape = each.shape[1:]
+            here = slice(first, first + shape[0] * shape[1])
+            first = here.stop
+            if not each.any():
+                continue
+            self._basis[part] = basis[here].reshape(*shape, -1).transpose(1, 0, 2)
+            self._residual[part] = left[here].reshape(shape).T
+            self._known[part] = each.any(axis=0).T.astype(float)
+            self.parts.append(part)
+
+    def _form(self, part: int, matrix: FloatArray) -> _Form:
+        basis, residual = self._basis[part], self._residual[part]
+        product = self._product(part, matrix)
+        return _Form(
+            part,
+            matrix,
+            product,
+            np.einsum('ncp,ncr->pr', basis, product, optimize=True),
+            float((residual * (matrix @ residual)).sum()),
+        )
+
+    def _product(self, part: int, matrix: FloatArray | csr_array) -> FloatArray:
+        """Return A Q (n, c, P), zero in rows that were not measured."""
+        basis = self._basis[part]
+        product = (matrix @ basis.reshape(len(basis), -1)).reshape(basis.shape)
+        return np.asarray(product * self._known[part][:, :, np.newaxis])
+
+    def _trace(self, first: _Form, second: _Form) -> float:
+        """Return tr(A B C B) of two forms A and C."""
+        found = float((first.inner * second.inner).sum())
+        if first.part == second.part:
+            known = self._known[first.part]
+            found += float((known * ((first.matrix * second.matrix) @ known)).sum())
+            found -= 2.0 * float((first.product * second.product).sum())
+        return found
+
+    def test(self, part: int, links: csr_array) -> tuple[float, float]:
+        """Return the correlation of linked residuals beyond the expected one, and its score.
+
+        The score is standard normal where nothing is shared.
+        """
+        basis, residual, known = self._basis[part], self._residual[part], self._known[part]
+        product = self._product(part, links)
+        white = np.einsum('ncp,ncr->pr', basis, basis, optimize=True)
+        linked = np.einsum('ncp,ncr->pr', basis, product, optimize=True)
+        pairs = float((known * (links @ known)).sum())
+        size = float((residual**2).sum())
+        freedom = float(known.sum() - np.trace(white))
+        if not (size > 0.0 and pairs > 0.0 and freedom > 1.0):
+            return 0.0, 0.0
+        ratio = -float(np.trace(linked)) / freedom
+        both = float((linked**2).sum() + pairs - 2.0 * (product**2).sum())
+        mixed = float((linked * white).sum() - 2.0 * (product * basis).sum())
+        alone = float((white**2).sum() + known.sum() - 2.0 * (basis**2).sum())
+        variance = 2.0 * max(both - 2.0 * ratio * mixed + ratio**2 * alone, 1e-300)
+        excess = float((residual * (links @ residual)).sum()) * freedom / size - ratio * freedom
+        return excess / pairs, excess / float(np.sqrt(variance))
+
+    def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
+        """Return, by part, the sizes (1 + K,) of what is independent and of each kernel."""
+        from scipy import optimize  # as below, what most fits do not need
+
+        forms = []
+        for part in self.parts:
+            matrices = [np.eye(len(self._units))]
+            matrices += [self._units.kernel(*kernel) for kernel in kernels.get(part, ())]
+            forms += [self._form(part, matrix) for matrix in matrices]
+        moments = np.array([[self._trace(first, second) for second in forms] for first in forms])
+        scale = np.sqrt(np.diag(moments))
+        scaled = moments / np.outer(scale, scale)
+        # the covariance of the forms under white noise weighs the equations
+        factor = linalg.cholesky(scaled + ROUNDING * np.eye(len(scale)), lower=True)
+        values = np.array([form.value for form in forms]) / scale
+        found = optimize.nnls(
+            linalg.solve_triangular(factor, scaled, lower=True),
+            linalg.solve_triangular(factor, values, lower=True),
+        )[0]
+        sizes = found / scale
+        return {
+            part: sizes[[k for k, form in enumerate(forms) if form.part == part]]
+            for part in self.parts
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """A form r^T A r of one part: A (n, n), A Q (n, c, P), Q^T A Q (P, P), and its value."""
+
+    part: int
+    matrix: FloatArray
+    product: FloatArray
+    inner: FloatArray
+    value: float
+
+
+def _sums(
+    chain: Chain, names: Sequence[str], samples: Samples, numbers: NDArray[np.intp]
+) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
+    """Yield numbers (n,) of stops and the sums of their rows, (P + 1, c, n) by part, in blocks."""
+    first = 0
+    for block in samples.parts(chain, names):
+        index = numbers[first : first + block[0].shape[2]]
+        first += len(index)
+        begins = np.flatnonzero(np.diff(index, prepend=-1))
+        yield index[begins], tuple(np.add.reduceat(part, begins, axis=2) for part in block)
+
+
+def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:
+    """Return the stops of all sets; of many, every `share`-th run of so many."""
+    widths = (max(samples.width for samples in system.sets), 3)
+    parts: list[list[FloatArray]] = [[], []]
+    counts, places, times = [], [], []
+    circular = np.array([joint.type == 'revolute' for joint in chain.joints])
+    for number, samples in enumerate(system.sets):
+        all_numbers = stops(samples.observations.joints)
+        chosen = all_numbers // run % share == 0
+        if samples.weights is not None:
+            chosen &= samples.weights > 0.0
+        if not chosen.any():
+            continue
+        few = Samples(samples.observations.select(chosen), *samples.sigmas)
+        few.weights = None if samples.weights is None else samples.weights[chosen]
+        numbers = all_numbers[chosen]
+        pieces = list(_sums(chain, names, few, numbers))
+        index = np.concatenate([piece[0] for piece in pieces])
+        again = np.flatnonzero(np.diff(index, prepend=-1))  # stops across the end of a block
+        begins = np.flatnonzero(np.diff(numbers, prepend=-1))
+        count = np.diff([*begins, len(numbers)]).astype(float)
+        for part, width in enumerate(widths):
+            rows = np.zeros((len(names) + 1, width, len(begins)))
+            if part < len(pieces[0][1]):
+                whole = np.concatenate([piece[1][part] for piece in pieces], axis=2)
+                added = np.add.reduceat(whole, again, axis=2)
+                rows[:, : added.shape[1]] = added / np.sqrt(count)
+            parts[part].append(rows)
+        q = few.observations.joints[begins]
+        turned = [np.cos(q[:, circular]), np.sin(q[:, circular]), q[:, ~circular]]
+        places.append(np.column_stack([*turned, np.full(len(q), APART * number)]))
+        times.append(numbers[begins] + APART * number)
+        counts.append(count)
+    if not counts:
+        return _Stops([], np.zeros(0), np.zeros((0, 0)), np.zeros(0))
+    return _Stops(
+        [np.concatenate(part, axis=2) for part in parts],
+        *(np.concatenate(each) for each in (counts, places, times)),
+    )
+
+
+def _near(units: _Stops, part: int, length: float, share: int) -> FloatArray:
+    """Return J^T K J of errors that fade in joint space, from every `share`-th stop.
+
+    Pairs of stops grow with the square of their number.
+    """
+    kernel = units.kernel('near', length)
+    own = np.diag(kernel) * (share - share**2)
+    kernel = share**2 * kernel + np.diag(own)
+    rows = units.parts[part][:-1]
+    return np.asarray(np.einsum('pcn,rcn->pr', rows @ kernel, rows, optimize=True))
+
+
+def _successive(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    part: int,
+    kernels: Sequence[tuple[float, float]],
+) -> FloatArray:
+    """Return J^T K J of errors that fade in succession, for (length, size) each.
+
+    The sum over all stops so far follows the recursion y_j = decay y_{j-1} + s_j, a system of
+    equations with two diagonals.
+    """
+    found = np.zeros((len(names), len(names)))
+    for samples in system.sets:
+        before = [np.zeros((len(names), samples.width if part == 0 else 3))] * len(kernels)
+        for _, sums in _sums(chain, names, samples, stops(samples.observations.joints)):
+            if part >= len(sums):
+                continue
+            rows = sums[part][:-1]
+            own = np.einsum('pcn,rcn->pr', rows, rows, optimize=True)
+            for k, (length, size) in enumerate(kernels):
+                decay = float(np.exp(-1.0 / length))
+                added = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
+                bands = np.tile([[1.0], [-decay]], added.shape[2])
+                flat = linalg.solve_banded((1, 0), bands, added.reshape(-1, added.shape[2]).T)
+                so_far = flat.T.reshape(added.shape)
+                before[k] = so_far[..., -1]
+                cross = decay * np.einsum('pcn,rcn->pr', rows, so_far[..., :-1], optimize=True)
+                found += size * (own + cross + cross.T)
+    return found

@@ -1,0 +1,247 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Starting values for unknown base and tool frames, without a guess from the user.
+
+With the nominal arm K_i = A_1 ... A_n, a measured pose is M_i = T_world_base K_i T_flange_target.
+
+Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading singular vectors
+of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013).
+Positions: a point set registration of the flange positions (Umeyama 1991) that leaves the tool
+out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row.
+Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
+is the shortest one, the base takes the rest, and rotations come from the registration.
+Distances: their squares are linear in the base's position and its square, solved for the better
+half of the samples. Every start is polished by least squares on the frames
+alone; the best one counts. Where none fits (few or degenerate poses), the 24 rotations of a cube
+are tried as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
+from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.robust import robust_fit
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import FRAME_KINDS, Chain, Frame
+from calib_ros.kinematics.se3 import FloatArray
+
+SUBSET = 200
+DRAWS, DRAWN = 500, 8
+"""How many starts a place by distances has, and from how many samples, of 4 unknowns."""
+ONE_ORIENTATION = 0.9999
+"""Ratio of the leading singular values from which orientations are one, within 0.01 rad."""
+CONVINCING = 0.03
+"""A start is taken without a search when its RMS error is below this share of the spread."""
+
+
+def start_frames(
+    chain: Chain,
+    sets: Sequence[Observations],
+    sigma_position: float,
+    sigma_orientation: float,
+    loss: str,
+) -> Chain:
+    """Return the chain with base and tool frames that bring it close to the measurements.
+
+    Sets are taken one after the other; frames that an earlier set has found are kept for later
+    ones.
+    """
+    found: set[str] = set()
+    for observations in sets:
+        ends = {'base': observations.base, 'tool': observations.tool}
+        frames = {}
+        for key, name in ends.items():
+            frames[key] = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}[name]
+            if name in found:
+                frames[key] = replace(chain.frame(name), fixed=True)
+        view = replace(chain, base=frames['base'], tool=frames['tool'])
+        alone = replace(observations, base='base', tool='tool')
+        view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
+        for key, name in ends.items():
+            frame = replace(view.frame(key), fixed=chain.frame(name).fixed)
+            chain = chain.with_frame(name, frame)
+        found |= set(ends.values())
+    return chain
+
+
+def _start_one(
+    chain: Chain,
+    observations: Observations,
+    sigma_position: float,
+    sigma_orientation: float,
+    loss: str,
+) -> Chain:
+    """Return the chain with frames for one set of observations."""
+    oriented = bool(observations.oriented.any()) and observations.distances is None
+    names = [
+        f'{key}.{kind}'
+        for key in ('base', 'tool')
+        if not chain.frame(key).fixed
+        for kind in FRAME_KINDS
+        if oriented or key == 'base' or not kind.startswith('r')
+    ]
+    if not names:
+        return chain
+    if observations.socket:
+        return _in_socket(chain, observations)
+    index = np.unique(np.linspace(0, len(observations) - 1, SUBSET).round().astype(int))
+    subset = observations.select(index)
+    system = System((Samples(subset, sigma_position, sigma_orientation),))
+    arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
+    if subset.distances is not None:
+        start = _trilaterated(chain, arm, subset, loss != 'none')
+        return robust_fit(start, names, system, loss).fit.chain
+    spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
+    best, best_error = chain, np.inf
+    determined: tuple[str, ...] = ()
+    for candidates in (_closed_form(chain, arm, subset), _search()):
+        for rotation in candidates:
+            start = _complete(chain, arm, subset, rotation)
+            if not determined:
+                determined = excited(triangular_factor(start, names, system), names)
+            fitted = minimise(start, determined, system, tolerance=1e-3).chain
+            error = _typical_error(fitted, subset)
+            if error < best_error:
+                best, best_error = fitted, error
+        if best_error <= CONVINCING * spread:
+            break
+    return robust_fit(best, determined, system, loss).fit.chain
+
+
+def _in_socket(chain: Chain, observations: Observations) -> Chain:
+    """Return the chain with its base moved, not turned, so that the tool stays at the origin.
+
+    0 = b + p_K + R_K t is linear in b and the tool's offset t.
+    """
+    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
+    tool, base = chain.frame('tool'), chain.frame('base')
+    tool_matrix, base_matrix = tool.matrix.copy(), np.eye(4)
+    if not tool.fixed:
+        turned = arm[:, :3, :3]
+        tool_matrix[:3, 3] += _shortest(turned, -(arm @ tool.matrix)[:, :3, 3], True)
+    base_matrix[:3, 3] = -(arm @ tool_matrix)[:, :3, 3].mean(axis=0)
+    return replace(
+        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
+    )
+
+
+def _typical_error(chain: Chain, observations: Observations) -> float:
+    """Return the median distance [m], which gross errors do not touch."""
+    predicted = chain.forward(observations.joints, observations.approach)[:, :3, 3]
+    return float(np.median(np.linalg.norm(observations.positions - predicted, axis=1)))
+
+
+def _trilaterated(
+    chain: Chain, arm: FloatArray, observations: Observations, robust: bool
+) -> Chain:
+    """Return the chain placed by distances from the world's origin.
+
+    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
+    world, because no distance from its origin tells. Against gross errors it is solved for the
+    half of the samples that fits best, by the least median of many draws (Rousseeuw 1984).
+    """
+    if chain.frame('base').fixed:
+        return chain
+    assert observations.distances is not None
+    points = arm[:, :3, 3] + arm[:, :3, :3] @ chain.frame('tool').matrix[:3, 3]
+    columns = np.column_stack([2.0 * points, np.ones(len(points))])
+    wanted = observations.distances**2 - (points**2).sum(axis=1)
+    chosen = np.arange(len(points))
+    if robust and len(points) > DRAWN:
+        draws = np.random.default_rng(0).random((DRAWS, len(points))).argsort(axis=1)[:, :DRAWN]
+        found = (np.linalg.pinv(columns[draws]) @ wanted[draws, np.newaxis])[:, :3, 0]
+        lengths = np.linalg.norm(points + found[:, np.newaxis], axis=2)
+        misfits = np.abs(lengths - observations.distances)
+        best = misfits[np.argmin(np.median(misfits, axis=1))]
+        chosen = np.argsort(best)[: max(len(points) // 2, DRAWN)]
+    matrix = np.eye(4)
+    matrix[:3, 3] = np.linalg.lstsq(columns[chosen], wanted[chosen], rcond=None)[0][:3]
+    return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
+
+
+def _closed_form(
+    chain: Chain, arm: FloatArray, observations: Observations
+) -> Iterator[FloatArray]:
+    """Yield rotations of the base (3, 3) from what is given and from closed forms."""
+    if chain.base is not None:
+        yield chain.base.matrix[:3, :3]
+        if chain.base.fixed:
+            return
+    oriented = observations.oriented
+    if oriented.any():
+        rotations, measured = arm[oriented, :3, :3], observations.rotations[oriented]
+        if chain.tool is not None:
+            tool = chain.tool.matrix[:3, :3]
+            yield se3.nearest_rotation(
+                np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
+            )
+        system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
+        _, sizes, right = np.linalg.svd(system)
+        for sign in (1.0, -1.0):  # the singular vector's sign is open, its determinant is not
+            matrix = sign * right[0].reshape(3, 3, order='F')
+            if np.linalg.det(matrix) > 0.0:
+                yield se3.nearest_rotation(matrix)
+        if sizes[1] < ONE_ORIENTATION * sizes[0]:
+            return
+    positions = observations.positions - observations.positions.mean(axis=0)
+    tool_point = chain.frame('tool').matrix[:3, 3]
+    reached = arm[:, :3, 3] + arm[:, :3, :3] @ tool_point
+    yield se3.nearest_rotation(positions.T @ (reached - reached.mean(axis=0)))
+    if len(arm) >= 16 and chain.tool is None:
+        columns = np.concatenate([arm[:, :3, :3].reshape(-1, 9), arm[:, :3, 3]], axis=1)
+        solution = np.linalg.lstsq(columns - columns.mean(axis=0), positions, rcond=1e-9)[0]
+        yield se3.nearest_rotation(solution[9:].T)
+
+
+def _search() -> Iterator[FloatArray]:
+    """Yield the 24 rotations of a cube."""
+    yield from Rotation.create_group('O').as_matrix()
+
+
+def _complete(
+    chain: Chain, arm: FloatArray, observations: Observations, rotation: FloatArray
+) -> Chain:
+    """Return the chain with the rest of its frames in closed form, the base's rotation given."""
+    base, tool = chain.frame('base'), chain.frame('tool')
+    base_matrix, tool_matrix = base.matrix.copy(), tool.matrix.copy()
+    oriented = observations.oriented
+    if not base.fixed:
+        base_matrix[:3, :3] = rotation
+    if not tool.fixed and oriented.any():
+        turned = rotation @ arm[oriented, :3, :3]
+        tool_matrix[:3, :3] = se3.nearest_rotation(
+            np.einsum('nji,njk->ik', turned, observations.rotations[oriented])
+        )
+    # p = R_B p_K + R_B R_K t + b, with b and t unknown unless their frame is fixed
+    turned = rotation @ arm[:, :3, :3]
+    wanted = observations.positions - arm[:, :3, 3] @ rotation.T - turned @ tool_matrix[:3, 3]
+    if not tool.fixed:
+        left = wanted - base_matrix[:3, 3] if base.fixed else wanted
+        shift = _shortest(turned, left, not base.fixed)
+        tool_matrix[:3, 3] += shift
+        wanted -= turned @ shift
+    if not base.fixed:
+        base_matrix[:3, 3] = wanted.mean(axis=0)
+    return replace(
+        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
+    )
+
+
+def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
+    """Return the shortest t (3,) [m] with which R_i t + b comes near wanted (N, 3) [m].
+
+    Directions in which rotations (N, 3, 3) hardly vary stay zero. b is anywhere where it is
+    `free`, else zero.
+    """
+    if free:
+        turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
+    left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
+    known = sizes > FRAME_TOLERANCE * np.sqrt(len(turned))
+    return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))

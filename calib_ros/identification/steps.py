@@ -1,0 +1,328 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Something moved while it was measured: one step in time of a base, a tool or a joint's zero.
+
+A bumped target, a tracker that was moved or an encoder that slipped is one more group of columns
+X of the linear model, switched on at some stop. At the fit, with J the columns of the parameters
+and r the residuals, a group explains of the squares that are left
+
+    e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
+
+Products of all columns with each other are made once, part by part of the session, and summed
+from its end; they serve every stop. What a robust fit has given up as gross errors is looked at
+as well, with bounded influence: a step may hide there.
+
+Effects that the model lacks follow the joints, and no step in time explains more than half of
+what they leave. A drift is no step: a few cosines over the session explain it better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.identification.drift import inverse_root, slow_cosines
+from calib_ros.identification.observations import stops
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.robust import Robust, weights_of
+from calib_ros.kinematics.chain import FRAME_KINDS
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+
+MOVED = 0.5
+"""Share of the squares of the residuals from which on a step explains them."""
+SUSPECTED = 0.4
+"""The same at a stop near by, where not all are looked at first."""
+PLACES = 40
+"""Stops at which steps are looked for first."""
+LEAST = 3
+"""Stops before and after a step: fewer are gross errors."""
+MOST = 500
+"""Samples that are looked at; of more, evenly spread ones."""
+BY_CHANCE = 1e-3
+"""Probability of so large a share at any place of white residuals; few samples need more."""
+SINGULAR = 1e-8
+"""Eigenvalue of scaled normal equations from which a direction counts."""
+NOISE_FREE = 1e-6
+"""RMS residual [sigma] below which nothing but rounding is left."""
+ONE_SIDED = 0.1
+"""Mean weight of one side of a step up to which the fit is that of the other side alone."""
+ROWS_NS = 10**15
+"""Whole seconds below that are the numbers of rows, in place of stamps."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What moved, when and by how much.
+
+    Attributes
+    ----------
+    what : str
+        A base or tool frame, or a joint.
+    kind : str
+        'base', 'tool' or 'joint'.
+    set, sample, stamp_ns : int
+        The first sample after it.
+    size : float
+        RMS change of the positions or, where it weighs more, of the orientations; of a joint that
+        of its zero.
+    unit : str
+        'm' or 'rad'.
+    share : float
+        Of the squares of the residuals that it explains beyond as many useless parameters.
+    outside : bool
+        What was measured on one side of it are outliers, so that the fit is not spoilt by it.
+
+    """
+
+    what: str
+    kind: str
+    set: int
+    sample: int
+    stamp_ns: int
+    size: float
+    unit: str
+    share: float
+    outside: bool
+
+    @property
+    def harmful(self) -> bool:
+        """Tell whether the fit is that of no arm: of none before or after, or of one no more."""
+        return self.kind == 'joint' or not self.outside
+
+    def __str__(self) -> str:
+        """Return what moved and what to do about it."""
+        when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
+        if self.stamp_ns < ROWS_NS and self.stamp_ns % 10**9 == 0:
+            when = f'line {self.stamp_ns // 10**9}, without stamps the order of the rows is taken'
+        text = f'something moved at sample {self.sample + 1}'
+        text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
+        size = f'{1e3 * self.size:.2g} m{self.unit}'
+        if self.kind == 'joint':
+            return (
+                f'{text}the zero of {self.what} ({size}). Did its encoder slip? Only what was '
+                'measured since tells of the arm as it is: leave out the rest, or measure again'
+            )
+        thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
+        text += f'{thing} ({self.what}, {size})'
+        if self.outside:
+            text += '; what was measured on one side of it carries no weight'
+        return (
+            f'{text}. Fasten it and measure again, or fit what was measured before and after as '
+            'two sessions: two names in the column session of the table or journal, and --session '
+            'with both'
+        )
+
+
+def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:
+    """Return the step that explains more than half of the residuals of a fit, if there is one."""
+    scan = _Scan(problem, names, robust)
+    places = np.arange(LEAST, scan.stops - LEAST + 1)
+    if not len(places):
+        return None
+    coarse = places[:: 1 + (len(places) - 1) // PLACES]
+    found = scan.best(coarse, SUSPECTED) if len(places) else None
+    if found is None:
+        return None
+    near = np.abs(places - found.stop) <= np.diff(coarse).max(initial=0)
+    found = scan.best(places[near], MOVED)
+    return None if found is None or scan.drifts(found) else scan.described(found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Columns that are switched on together: a frame of some sets, or the zero of a joint."""
+
+    what: str
+    kind: str
+    names: tuple[str, ...]
+    sets: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A step: its group, its first stop, its size by parameter, and what it leaves.
+
+    `share` is what it explains of the squares, `variance` what it leaves for each degree of
+    freedom.
+    """
+
+    group: _Group
+    stop: int
+    size: FloatArray
+    share: float
+    variance: float
+
+
+class _Scan:
+    """The linear model at a fit, with columns of all that may have moved."""
+
+    def __init__(self, problem: Problem, names: Sequence[str], robust: Robust) -> None:
+        self._chain = robust.fit.chain
+        self._groups = _groups(problem)
+        self._fitted = len(names)
+        added = dict.fromkeys(name for group in self._groups for name in group.names)
+        self._names = [*names, *(name for name in added if name not in names)]
+        share = -(-sum(map(len, problem.sets)) // MOST)
+        self._chosen = [np.arange(0, len(each), share) for each in problem.sets]
+        pairs = list(zip(problem.sets, self._chosen, strict=True))
+        self._sets = sets = [each.select(index) for each, index in pairs]
+        self._sigmas = (problem.sigma_position, problem.sigma_orientation)
+        self._oriented = any(kind.oriented for kind in problem.kinds)
+        system = problem.system(sets)
+        self._equations = np.array([float(samples.rows) for samples in system.sets])
+        self._rows, self._weights = [], []
+        bounded = 'none' if robust.loss == 'none' else 'huber'
+        for samples, far, index in zip(system.sets, robust.distances, self._chosen, strict=True):
+            samples.weights = np.sqrt(weights_of(far[index], bounded))
+            self._rows.append(samples.rows_of(self._chain, self._names))
+            self._weights.append(weights_of(far[index], robust.loss))
+        order = np.argsort(np.concatenate([each.stamps_ns for each in sets]), kind='stable')
+        number = np.empty(len(order), dtype=np.intp)
+        number[order] = stops(np.concatenate([each.joints for each in sets])[order])
+        self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
+        self.stops = int(number.max(initial=-1)) + 1
+        extra, offset = system.extra_rows(self._chain, names)
+        whole = np.array([_product(rows) for rows in self._rows])
+        matrix = whole.sum(axis=0)[: self._fitted]
+        normal = matrix[:, : self._fitted] + extra.T @ extra
+        self._root = inverse_root(normal, np.diag(normal))
+        self._known = self._root.T @ (matrix[:, -1] + extra.T @ offset)
+        left = np.zeros(len(self._names) + 1)
+        left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
+        self._left = np.einsum('i,sij,j->s', left, whole, left)
+
+    def best(self, places: NDArray[np.intp], least: float) -> _Found | None:
+        """Return the best step at one of the stops, if it explains more than the least share."""
+        products = self._to_the_end(places)
+        cross = self._root.T @ products[:, : self._fitted, :-1]
+        matrix = products[:, :-1, :-1] - np.swapaxes(cross, 1, 2) @ cross
+        vector = products[:, :-1, -1] - self._known @ cross
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum('bii->bi', products[:, :-1, :-1]), 1e-300))
+        found: _Found | None = None
+        lowest = np.inf
+        for group in self._groups:
+            columns = [self._names.index(name) for name in group.names]
+            size = scale[:, columns]
+            own = matrix[:, columns][:, :, columns] * size[:, :, np.newaxis] * size[:, np.newaxis]
+            values, axes = np.linalg.eigh(own)
+            good = values > SINGULAR
+            rank = good.sum(axis=1)
+            along = np.einsum('bij,bi->bj', axes, size * vector[:, columns]) * good
+            inverse = 1.0 / np.where(good, values, 1.0)
+            equations = self._equations[list(group.sets)].sum()
+            freedom = equations * (1.0 - self._fitted / self._equations.sum())
+            left = self._left[list(group.sets)].sum()
+            if left <= NOISE_FREE**2 * equations or freedom <= rank.max() + 1.0:
+                continue
+            share = np.minimum((along**2 * inverse).sum(axis=1) / left, 1.0 - 1e-12)
+            k = int(np.argmax(share))
+            more, rest = max(int(rank[k]), 1), (1.0 - share[k]) / (freedom - rank[k])
+            beyond = 1.0 - rest * freedom
+            trials = PLACES * len(self._groups)
+            chance = trials * special.fdtrc(more, freedom - rank[k], share[k] / more / rest)
+            criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
+            if beyond > least and chance < BY_CHANCE and criterion < lowest:
+                lowest = criterion
+                change = size[k] * (axes[k] @ (along[k] * inverse[k]))
+                found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))
+        return found
+
+    def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
+        """Return (B, K + 1, K + 1) the products of the rows from each of the stops to the end."""
+        size = len(self._names) + 1
+        found = np.zeros((len(places), size, size))
+        for rows, numbers in zip(self._rows, self._numbers, strict=True):
+            part = np.searchsorted(places, numbers, side='right')
+            order = np.argsort(part, kind='stable')
+            bounds = np.searchsorted(part[order], np.arange(1, len(places) + 2))
+            for k, (first, last) in enumerate(pairwise(bounds)):
+                found[k] += _product(rows[order[first:last]])
+        return np.asarray(np.cumsum(found[::-1], axis=0)[::-1])
+
+    def drifts(self, found: _Found) -> bool:
+        """Tell whether a slow drift of the same group explains more than the step."""
+        slow = slow_cosines(self.stops)[1:]
+        if not len(slow):
+            return False
+        columns = [self._names.index(name) for name in found.group.names]
+        size = len(self._names)
+        matrix = np.zeros((self._fitted + len(columns) * len(slow) + 1,) * 2)
+        for rows, numbers in zip(self._rows, self._numbers, strict=True):
+            moving = (
+                slow[:, numbers].T[:, np.newaxis, :, np.newaxis] * rows[:, :, np.newaxis, columns]
+            )
+            wide = moving.reshape(*rows.shape[:2], -1)
+            matrix += _product(
+                np.concatenate([rows[:, :, : self._fitted], wide, rows[:, :, size:]], axis=2)
+            )
+        cross = self._root.T @ matrix[: self._fitted, self._fitted : -1]
+        own = matrix[self._fitted : -1, self._fitted : -1]
+        root = inverse_root(own - cross.T @ cross, np.diag(own))
+        gain = root.T @ (matrix[self._fitted : -1, -1] - cross.T @ self._known)
+        sets = list(found.group.sets)
+        equations = self._equations[sets].sum()
+        freedom = equations * (1.0 - self._fitted / self._equations.sum()) - root.shape[1]
+        if freedom <= 0.0:
+            return False
+        return bool((self._left[sets].sum() - gain @ gain) / freedom < found.variance)
+
+    def described(self, found: _Found) -> Step:
+        """Return a step with its first sample, and the size of what it did to the poses."""
+        group = found.group
+        first: list[tuple[int, int, int]] = []
+        moved: list[FloatArray] = []
+        weights: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+        for number in group.sets:
+            each = self._sets[number]
+            after = self._numbers[number] >= found.stop
+            stamps = each.stamps_ns[after].tolist()
+            samples = self._chosen[number][after].tolist()
+            first += [(stamp, number, k) for stamp, k in zip(stamps, samples, strict=True)]
+            model = ErrorModel(self._chain, group.names, each.base, each.tool)
+            moved.append(model.jacobian(each.joints[after]) @ found.size)
+            for side, which in zip(weights, (~after, after), strict=True):
+                side.append(self._weights[number][which])
+        stamp, of_set, sample = min(first)
+        change = np.sqrt((np.concatenate(moved) ** 2).mean(axis=0))
+        shift, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+        if group.kind == 'joint':
+            size, unit = (
+                abs(float(found.size[0])),
+                'rad' if group.names[0].endswith('theta') else 'm',
+            )
+        elif self._oriented and turn * self._sigmas[0] > shift * self._sigmas[1]:
+            size, unit = turn, 'rad'
+        else:
+            size, unit = shift, 'm'
+        outside = min(float(np.concatenate(side).mean()) for side in weights) < ONE_SIDED
+        return Step(
+            group.what, group.kind, of_set, sample, stamp, size, unit, found.share, outside
+        )
+
+
+def _groups(problem: Problem) -> list[_Group]:
+    """Return what may have moved."""
+    found = []
+    for kind in ('base', 'tool'):
+        for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
+            sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
+            socket = kind == 'base' and problem.sets[sets[0]].socket  # the ball turns in it
+            names = tuple(f'{frame}.{k}' for k in FRAME_KINDS[: 3 if socket else 6])
+            found.append(_Group(frame, kind, names, tuple(sets)))
+    everywhere = tuple(range(len(problem.sets)))
+    for joint in problem.chain.joints:
+        zero = 'theta' if joint.type == 'revolute' else 'd'
+        found.append(_Group(joint.name, 'joint', (f'{joint.name}.{zero}',), everywhere))
+    return found
+
+
+def _product(rows: FloatArray) -> FloatArray:
+    """Return (K, K) the products of the columns of rows (N, c, K) with each other."""
+    flat = rows.reshape(-1, rows.shape[2])
+    return np.asarray(flat.T @ flat)

@@ -1,0 +1,252 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What looks wrong in a result that is good by its figures: one sentence each, and what to do.
+
+Scale. A measuring device whose metre is wrong by s lets all lengths of the arm seem to grow alike;
+so does its temperature. With L the derivative of the fitted lengths by s (the frames take up their
+share), x their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s, with
+tau as the scatter about the line says (Paule and Mandel 1982). Arms have offsets of their own:
+they scatter, and make s uncertain. No arm grows by more than LARGEST_SCALE: aluminium does by 23
+ppm a degree. What is certainly beyond is the device's, and such a result is refused, because it is
+good in the device's metres only; below, it may be the arm's own growth, and is said.
+
+Sister. Of the shipped robots with as many joints one may be much nearer to the arm found, by the
+positions that both reach in the best base and tool, than the nominal one is.
+
+Gravity. Where effects of gravity are fitted, another direction may explain clearly more than the
+one given. The base frame found tells nothing about up: the device stands anyhow.
+
+Coupling. Joint values that lack the couplings of a wrist leave residuals that these explain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.identification.identifiability import excited
+from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.robust import SUSPICIOUS
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.chain_file import load_chain, shipped_robots
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+
+if TYPE_CHECKING:
+    from calib_ros.identification.identification import Identification
+
+CHANCE = 1e-4
+"""Probability of a scale as significant in an arm whose offsets only scatter."""
+LEAST_SCALE = 5e-5
+LARGEST_SCALE = 1e-3
+"""Growth of an arm by 40 degrees, if all of it is of aluminium."""
+SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
+"""Standard deviations [m] of arms' own offsets of lengths that are tried."""
+MANY = 300
+POSES = 24
+"""Poses, spread evenly over those measured, that tell enough: of gravity, of all else."""
+ANOTHER = (2e-3, 5e-3)
+"""Least offset [m, rad] of an arm that may be another one than the nominal."""
+NEARER = 0.3
+"""Ratio of the distances from which a shipped robot is named instead of the nominal one."""
+EXPLAINED = 0.5
+"""Share of the residual squares that couplings explain, or that gravity must explain more."""
+
+
+def remarked(problem: Problem, result: Identification) -> Identification:
+    """Return the result with what is suspicious in it, refused where it cannot be right."""
+    if any(each.socket for each in problem.sets):
+        return result  # one place tells nothing of what follows
+    sister = _sister(problem, result)
+    scale, certain = ('', False) if sister else _scale(problem, result)
+    refusals = (*result.refusals, scale) if certain else result.refusals
+    found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
+    said = (*result.remarks, *(each for each in found if each))
+    return replace(result, remarks=said, refusals=refusals)
+
+
+def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:
+    """Return the common scale of all lengths, its standard deviation, and degrees of freedom.
+
+    The freedom is zero where there are not three lengths to tell.
+    """
+    chain = result.chain
+    arm = [n for n in chain.parameter_names if not chain.owns_frame(n)]
+    lengths = [n for n in arm if n.endswith(('.a', '.d')) and chain.value(n) != 0.0]
+    fitted = [i for i, n in enumerate(result.names) if n in arm and n.endswith(('.a', '.d'))]
+    if len(fitted) < 3 or not lengths:
+        return 0.0, np.inf, 0.0
+    grown = np.array([problem.model.value(n) for n in lengths])
+    first = problem.sets[0]
+    joints = first.joints[_few(len(first))]
+    names = tuple(dict.fromkeys((*result.names, *lengths)))
+    rows = ErrorModel(chain, names, first.base, first.tool).jacobian(joints)
+    if not first.oriented.any():
+        rows = rows[:, :3]
+    rows = rows.reshape(-1, rows.shape[2])
+    size = len(result.names)
+    reach = np.linalg.norm(rows[:, :size], axis=0)
+    reach[reach == 0.0] = 1.0
+    seen = rows[:, [names.index(n) for n in lengths]] @ grown
+    growth = np.linalg.lstsq(rows[:, :size] / reach, seen, rcond=1e-10)[0] / reach
+    offsets = {p.name: p.offset for p in result.parameters}
+    return _common(
+        np.array([offsets[result.names[i]] for i in fitted]),
+        growth[fitted],
+        result.covariance[np.ix_(fitted, fitted)],
+    )
+
+
+def _common(
+    offsets: FloatArray, growth: FloatArray, covariance: FloatArray
+) -> tuple[float, float, float]:
+    """Return s, its standard deviation and freedom of offsets (P,) = s * growth (P,) + noise."""
+    freedom = len(offsets) - 1
+    variances, axes = np.linalg.eigh(covariance)
+    offsets, growth = axes.T @ offsets, axes.T @ growth
+    weights = 1.0 / (np.maximum(variances, 1e-16) + SCATTERS[:, np.newaxis] ** 2)
+    weight = weights @ growth**2
+    scale = (weights @ (growth * offsets)) / np.maximum(weight, 1e-300)
+    left = (weights * (offsets - scale[:, np.newaxis] * growth) ** 2).sum(axis=1)
+    k = int(np.argmax(left <= freedom))  # the least that lets the offsets scatter as they do
+    return float(scale[k]), float(max(weight[k], 1e-300) ** -0.5), float(freedom)
+
+
+def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
+    """Return the suspicion of a common scale in words, and whether no arm has it."""
+    scale, std, freedom = scale_of(problem, result)
+    if freedom < 2.0 or abs(scale) < LEAST_SCALE:
+        return '', False
+    limit = special.stdtrit(freedom, 1.0 - 0.5 * CHANCE) * std
+    if abs(scale) < limit:
+        return '', False
+    certain = abs(scale) - limit > LARGEST_SCALE
+    growth = f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by '
+    growth += f'{1e6 * abs(scale):.0f} ppm (sigma {1e6 * std:.0f} ppm): '
+    if certain:
+        return f'{growth}no arm does, check the scale of the measuring device', True
+    return f'{growth}check the scale of the measuring device, and the temperature', False
+
+
+@lru_cache(maxsize=1)
+def _shipped() -> tuple[Chain, ...]:
+    return tuple(load_chain(name) for name in shipped_robots())
+
+
+def _sister(problem: Problem, result: Identification) -> str:
+    """Return in words which shipped robot is much nearer to the arm found than the nominal."""
+    if not any(
+        p.std is not None
+        and p.name.partition('.')[0] in problem.chain.joint_names
+        and p.name.partition('.')[2] in ('a', 'd', 'alpha', 'theta', 'beta')
+        and abs(p.offset) - 3.0 * p.std > ANOTHER[0 if is_length(p.name) else 1]
+        for p in result.parameters
+    ):
+        return ''
+    types = [joint.type for joint in problem.chain.joints]
+    joints = problem.sets[0].joints[_few(len(problem.sets[0]))]
+    nominal = _apart(problem.chain, result.chain, joints)
+    found = []
+    for each in _shipped():
+        if [joint.type for joint in each.joints] == types:
+            found.append((_apart(each, result.chain, joints), each.name))
+    distance, name = min(found, default=(np.inf, ''))
+    if distance > NEARER * nominal:
+        return ''
+    return (
+        f'the arm found is nearer to the shipped {name} ({1e3 * distance:.2f} mm) than to the '
+        f'nominal {problem.chain.name} ({1e3 * nominal:.2f} mm): is it the right chain file?'
+    )
+
+
+def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
+    """Return the RMS distance [m] of two arms' targets at (N, n), in the best base and tool."""
+    exact = found.forward(joints)
+    poses = Observations.from_arrays(joints, exact[:, :3, 3], exact[:, :3, :3])
+    start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
+    names = [f'{frame}.{kind}' for frame in ('base', 'tool') for kind in FRAME_KINDS]
+    system = System((Samples(poses, 1e-4, 1e-4 / 0.3),))
+    names = list(excited(triangular_factor(start, names, system), names))
+    near = minimise(start, names, system, tolerance=1e-2).chain
+    away = near.forward(joints)[:, :3, 3] - poses.positions
+    return float(np.sqrt((away**2).sum(axis=1).mean()))
+
+
+def _gravity(problem: Problem, result: Identification) -> str:
+    """Return in words which direction of gravity explains clearly more than the one given."""
+    bent = [n for n, _ in result.chain.effects if effects.group_of(n) in ('gravity', 'compliance')]
+    if not bent:
+        return ''
+    rest = [name for name in result.names if name not in bent]
+    straight = result.chain.with_offsets({n: -result.chain.value(n) for n in bent})
+    size = float(np.linalg.norm(problem.chain.gravity))
+    explained = {}
+    for k, words in enumerate('xyz'):  # the sign is the coefficients'
+        x, y, z = (size * np.eye(3)[k]).tolist()
+        chain = replace(straight, gravity=(x, y, z))
+        explained[words] = _explained(problem, chain, rest, bent, MANY)
+    given = _explained(problem, straight, rest, bent, MANY)
+    words, best = max(explained.items(), key=lambda pair: pair[1])
+    if not best - given > EXPLAINED * (1.0 - given):
+        return ''
+    return (
+        f'gravity along {words} of the base explains {100.0 * best:.0f} % of the residuals, '
+        f'along the direction given {100.0 * given:.0f} %: is the arm mounted on a wall? Set '
+        'gravity in the chain file'
+    )
+
+
+def _coupling(problem: Problem, result: Identification) -> str:
+    """Return in words whether couplings of the wrist explain what is left."""
+    known = [name for name, _ in result.chain.effects]
+    names = [n for n in effects.members(problem.chain, 'coupling') if n not in known]
+    if not names or result.noise.position < SUSPICIOUS:  # nothing is left to explain
+        return ''
+    chain = result.chain.with_effects([*known, *names])
+    share = _explained(problem, chain, result.names, names)
+    if share < EXPLAINED:
+        return ''
+    return (
+        f'couplings of the last joints explain {100.0 * share:.0f} % of the residuals: are the '
+        'joint values those of the joints, not of the motors? Else add the effects "coupling"'
+    )
+
+
+def _explained(
+    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str], poses: int = POSES
+) -> float:
+    """Return the share of the residual squares that added parameters explain, linearly."""
+    parts = []
+    few = [each.select(_few(len(each), poses)) for each in problem.sets]
+    for samples in problem.system(few).sets:
+        rows = samples.rows_of(chain, (*fitted, *added))
+        parts.append(rows.reshape(-1, rows.shape[2]))
+    rows = np.concatenate(parts)
+    count = len(fitted)
+    scale = np.linalg.norm(rows, axis=0)
+    scale[scale == 0.0] = 1.0
+    rows = rows / scale
+    basis, _ = np.linalg.qr(rows[:, :count])
+    rest = rows[:, count:] - basis @ (basis.T @ rows[:, count:])
+    residual = rest[:, -1]
+    total = float(residual @ residual)
+    solution = np.linalg.lstsq(rest[:, :-1], residual, rcond=1e-6)[0]
+    gone = residual - rest[:, :-1] @ solution
+    left = float(gone @ gone)
+    spare = len(rows) - count - len(added)
+    if not total > 0.0 or spare < len(rows) // 3:
+        return 0.0
+    return 1.0 - left / total
+
+
+def _few(count: int, poses: int = POSES) -> NDArray[np.intp]:
+    return np.arange(0, count, 1 + count // poses)

@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A start that gross errors cannot lead astray, even where they agree with each other.
+
+Least trimmed squares: the fit to that half of the samples that fits best (Rousseeuw 1984), found
+as in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few configurations drawn
+at random, as near to the start as they allow. From each, concentration steps lead downhill: take
+the half with the shortest residuals, fit it, and again. On the linearised model all fits are done
+at once, as products of matrices; it is linearised anew at the best one until its half stands
+still.
+
+Half means half of every set of observations, and somewhat more: with P parameters and R equations
+(1 + P / R) / 2 of the samples, which stands the most gross errors, (1 - P / R) / 2 of them
+(Rousseeuw and Leroy 1987).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+STARTS = 500
+STEPS = 4
+"""Concentration steps from every start; then only the BEST are followed to their end."""
+BEST = 10
+MOST_STEPS = 30
+RELINEARISATIONS = 5
+SUBSET = 300
+"""Samples that are searched, evenly spread over all; the fit that follows takes all."""
+LEAST = 30
+"""Samples of a set that are searched, however many sets there are."""
+DRAWN = 0.5
+"""Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
+RIDGE = 1e-9
+"""Weight that keeps what a start leaves open where it is, against that of all samples."""
+
+
+def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
+    """Return the chain fitted to the best half of the samples, found from `chain`.
+
+    Samples are searched without the weights that they carry. A system without spare equations is
+    left as it is.
+    """
+    few = _thinned(system)
+    need = _need(names, few)
+    if need >= 1.0:
+        return chain
+    halves = _Halves(few, need)
+    masks = halves.draw(need)
+    linear = _Linear(chain, names, few)
+    for _ in range(STEPS):
+        masks, sums = halves.concentrate(linear.squares(masks))
+    masks = masks[np.argsort(sums)[:BEST]]
+    half = masks[0]
+    for _ in range(RELINEARISATIONS):
+        for _ in range(MOST_STEPS):
+            before = masks
+            masks, sums = halves.concentrate(linear.squares(masks))
+            if np.array_equal(masks, before):
+                break
+        last, half = half, masks[np.argmin(sums)]
+        for samples, part in zip(few.sets, halves.parts, strict=True):
+            samples.weights = half[part].astype(float)
+        chain = minimise(chain, names, few, tolerance=1e-3).chain
+        for samples in few.sets:
+            samples.weights = None
+        if np.array_equal(half, last):
+            break
+        linear = _Linear(chain, names, few)
+    return chain
+
+
+def trimmed_sum(chain: Chain, system: System) -> float:
+    """Return the sum of the shorter half of the squared residuals of every set, in sigma."""
+    total = 0.0
+    for samples in system.sets:
+        parts = [np.nan_to_num(part) for part in samples.whitened_residuals(chain)]
+        squares = np.sort(sum((part**2).sum(axis=1) for part in parts))
+        total += float(squares[: (samples.count + 1) // 2].sum())
+    return total
+
+
+def _thinned(system: System) -> System:
+    """Return a part of the samples, without weights."""
+    most = max(SUBSET // len(system.sets), LEAST)
+    sets = []
+    for samples in system.sets:
+        index = np.arange(0, samples.count, -(-samples.count // most))
+        sets.append(Samples(samples.observations.select(index), *samples.sigmas))
+    return replace(system, sets=tuple(sets))
+
+
+def _need(names: Sequence[str], system: System) -> float:
+    """Return parameters per equation: those without a prior, and one sample a configuration."""
+    known = {} if system.prior is None else system.prior.sigmas
+    unknown = sum(name not in known for name in names)
+    rows = sum(
+        samples.rows / samples.count * (samples.observations.configurations.max() + 1)
+        for samples in system.sets
+        if samples.count
+    )
+    return float(unknown / rows)
+
+
+class _Halves:
+    """Which samples of each set to draw and to keep; masks are (S, N) over all sets."""
+
+    def __init__(self, system: System, need: float) -> None:
+        ends = np.cumsum([0, *(samples.count for samples in system.sets)]).tolist()
+        self.parts = [slice(first, last) for first, last in pairwise(ends)]
+        self._groups = [samples.observations.configurations for samples in system.sets]
+        self._sizes = [int(np.ceil(0.5 * (1.0 + need) * s.count)) for s in system.sets]
+
+    def draw(self, need: float) -> NDArray[np.bool_]:
+        """Return seeded starts: some configurations of every set."""
+        rng = np.random.default_rng(0)
+        masks = []
+        for group in self._groups:
+            count = int(group.max(initial=-1)) + 1
+            rank = np.argsort(rng.random((STARTS, count)), axis=1)
+            masks.append((rank < np.ceil(DRAWN * need * count))[:, group])
+        return np.concatenate(masks, axis=1)
+
+    def concentrate(self, squares: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+        """Return the samples of the shortest residuals, and the sums (S,) of their squares."""
+        masks = np.zeros(squares.shape, dtype=bool)
+        for part, size in zip(self.parts, self._sizes, strict=True):
+            if size:
+                index = np.argpartition(squares[:, part], size - 1, axis=1)[:, :size]
+                np.put_along_axis(masks[:, part], index, True, axis=1)
+        return masks, (squares * masks).sum(axis=1)
+
+
+class _Linear:
+    """The model linearised at a chain, for fits to many masks (S, N) at once."""
+
+    def __init__(self, chain: Chain, names: Sequence[str], system: System) -> None:
+        parts = [samples.rows_of(chain, names) for samples in system.sets]
+        width = max(part.shape[1] for part in parts)
+        rows = np.concatenate(
+            [np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0))) for part in parts]
+        )
+        columns, self._residual = rows[..., :-1], rows[..., -1]
+        extra, offset = system.extra_rows(chain, names)
+        size = np.sqrt((columns**2).sum(axis=(0, 1)) + (extra**2).sum(axis=0))
+        scale = 1.0 / np.where(size > 0.0, size, 1.0)
+        self._columns, extra = columns * scale, extra * scale
+        self._matrices = np.einsum('ncp,ncq->npq', self._columns, self._columns, optimize=True)
+        self._gradients = np.einsum('ncp,nc->np', self._columns, self._residual)
+        self._matrix = extra.T @ extra + RIDGE * np.eye(len(names))
+        self._gradient = extra.T @ offset
+
+    def squares(self, masks: NDArray[np.bool_]) -> FloatArray:
+        """Return the squared residuals (S, N) of all samples after a fit to those of each mask."""
+        count, width, size = self._columns.shape
+        chosen = masks.astype(float)
+        matrices = (chosen @ self._matrices.reshape(count, -1)).reshape(-1, size, size)
+        gradients = chosen @ self._gradients + self._gradient
+        steps = np.linalg.solve(matrices + self._matrix, gradients[..., np.newaxis])[..., 0]
+        left = self._residual.ravel() - steps @ self._columns.reshape(-1, size).T
+        return np.asarray((left.reshape(-1, count, width) ** 2).sum(axis=2))

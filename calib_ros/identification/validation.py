@@ -1,0 +1,495 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Judging a result on poses that were not fitted, and the rules of acceptance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.identification.leastsquares import System, minimise, residual_arrays, without_each
+from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.region import KNOWN, Region
+from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weights_of
+from calib_ros.identification.steps import Step
+from calib_ros.kinematics.chain import DH_KINDS, Chain, is_length
+from calib_ros.kinematics.se3 import FloatArray
+
+CONFIDENCE = 0.95
+"""One-sided confidence that a gain on held-out poses must have to be claimed."""
+CERTAIN = 0.99
+"""The same to claim that the error with outliers got worse."""
+WORSE = 0.01
+"""Growth of that error that counts, of the RMS; less is how metres happen to lie."""
+SPARE = 6
+"""Equations that a fit to a part of the configurations must have to spare."""
+MOST_OUTLIERS = 0.35
+"""Share of outliers beyond which nothing is accepted."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of the model: m for lengths, rad for angles.
+
+    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
+    do not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
+    degrees of freedom from which `std` was estimated; infinite where the noise is known.
+    """
+
+    name: str
+    value: float
+    offset: float
+    std: float | None
+    status: str
+    freedom: float = np.inf
+
+    def half_width(self, level: float = 0.95) -> float | None:
+        """Return half the width of the interval that holds the truth, by Student's t."""
+        if self.std is None:
+            return None
+        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
+
+
+@dataclass(frozen=True)
+class ErrorFigures:
+    """Figures of the distance to the measurement over a set of poses, as ISO 9283 has them."""
+
+    count: int
+    rms_mm: float
+    mean_mm: float
+    max_mm: float
+    mean_plus_3_sigma_mm: float
+    rms_mrad: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
+
+    Both in the world; the rotation is NaN where no orientation was measured. `configurations`
+    (N,) tells which pairs belong to one standing configuration.
+    """
+
+    position: FloatArray
+    orientation: FloatArray
+    configurations: NDArray[np.intp]
+
+    def figures(self, which: NDArray[np.bool_]) -> ErrorFigures:
+        """Return RMS, mean and maximum over the pairs of a mask (N,)."""
+        distance = 1e3 * np.linalg.norm(self.position[which], axis=1)
+        angle = 1e3 * np.linalg.norm(self.orientation[which], axis=1)
+        angle = angle[~np.isnan(angle)]
+        return ErrorFigures(
+            len(distance),
+            float(np.sqrt(np.mean(distance**2))),
+            float(distance.mean()),
+            float(distance.max()),
+            float(distance.mean() + 3.0 * distance.std()),
+            float(np.sqrt(np.mean(angle**2))) if angle.size else None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Residuals of the same poses before and after.
+
+    Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's
+    and not the frames'. `judged` (N,) is False for outliers; `repeated` (N,) is True for
+    held-out pairs at fitted configurations, which count in the figures and decide nothing.
+    """
+
+    before: Residuals
+    after: Residuals
+    judged: NDArray[np.bool_]
+    repeated: NDArray[np.bool_] | None = None
+
+    @property
+    def deciding(self) -> NDArray[np.bool_]:
+        """Return (N,) which pairs the rules of acceptance go by."""
+        return self.judged if self.repeated is None else self.judged & ~self.repeated
+
+    @property
+    def outliers(self) -> int:
+        """Return how many pairs are named as outliers and left out of the figures."""
+        return int((~self.judged).sum())
+
+    @property
+    def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
+        """Return the figures before and after, without outliers."""
+        return self.before.figures(self.judged), self.after.figures(self.judged)
+
+    @property
+    def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
+        """Return the figures before and after with outliers."""
+        everything = np.ones_like(self.judged)
+        return self.before.figures(everything), self.after.figures(everything)
+
+
+def residuals(chain: Chain, observations: Observations) -> Residuals:
+    """Return measured minus predicted for every pair."""
+    position, orientation = residual_arrays(chain, observations)
+    if position.shape[1] == 1:  # a distance
+        position = np.pad(position, ((0, 0), (0, 2)))
+    return Residuals(position, orientation, observations.configurations)
+
+
+def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
+    """Return the residuals of all sets, one after the other, by both chains."""
+    parts = [(residuals(before, each), residuals(after, each)) for each in sets]
+    numbers = np.concatenate(numbered(sets))
+    index = np.arange(len(numbers))
+    return Comparison(
+        _joined([first for first, _ in parts], numbers, index),
+        _joined([second for _, second in parts], numbers, index),
+        np.ones(len(numbers), dtype=bool),
+    )
+
+
+def validate(
+    problem: Problem,
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+    explained: NDArray[np.bool_] | None = None,
+) -> tuple[Comparison | None, str]:
+    """Judge both chains on pairs that were not fitted.
+
+    Held-out pairs are outliers unless they are near what the fit predicts, or were `explained`
+    (N,) by a simpler model.
+
+    Configurations are dealt out to the folds one by one, so that none is on both sides.
+    Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
+    """
+    repeated = _repeated(problem)
+    if problem.judging and not repeated.all():
+        comparison = replace(compare(before, after, problem.judging), repeated=repeated)
+        if problem.loss != 'none':
+            distances = distances_of(after, names, problem.system(problem.judging))
+            judged = np.concatenate(distances) <= OUTLIER
+            if explained is not None:
+                judged |= explained
+            comparison = replace(comparison, judged=judged)
+        text = f'{len(comparison.judged)} held-out samples'
+        if repeated.any():
+            text += f', of which {repeated.sum()} at fitted configurations decide nothing'
+        return comparison, text
+    places = _places(problem)
+    if len(places) > 1 and all(each.socket for each in problem.sets):
+        return _leave_one_place_out(problem, places, before, after, names, robust)
+    groups = problem.configurations
+    count = len(np.unique(np.concatenate(groups)))
+    rows = sum(
+        len(np.unique(group)) * kind.rows
+        for group, kind in zip(groups, problem.kinds, strict=True)
+    )
+    folds = _folds(problem, names, count, rows)
+    if folds < 2:
+        return None, 'nothing: too few configurations to hold any out'
+    frames = [name for name in names if before.owns_frame(name)]
+    firsts = np.cumsum([0, *(len(each) for each in problem.sets)])
+
+    def part(fold: int, inside: bool) -> tuple[list[NDArray[np.intp]], System]:
+        chosen = [np.flatnonzero((group % folds == fold) == inside) for group in groups]
+        sets = [each.select(index) for each, index in zip(problem.sets, chosen, strict=True)]
+        pairs = zip(robust.distances, chosen, strict=True)
+        return chosen, _weighted(problem, sets, [distances[index] for distances, index in pairs])
+
+    def training(fold: int) -> System:
+        return part(fold, inside=False)[1]
+
+    order, judging, systems = [], [], []
+    for fold in range(folds):
+        left_out, system = part(fold, inside=True)
+        systems.append(system)
+        judging.append([samples.observations for samples in system.sets])
+        order += [out + first for out, first in zip(left_out, firsts[:-1], strict=True)]
+    parts = [
+        compare(first, second, sets)
+        for first, second, sets in zip(
+            without_each(before, frames, systems, training),
+            without_each(after, names, systems, training),
+            judging,
+            strict=True,
+        )
+    ]
+    index = np.argsort(np.concatenate(order))
+    whole = np.concatenate(groups)
+    return (
+        Comparison(
+            _joined([part.before for part in parts], whole, index),
+            _joined([part.after for part in parts], whole, index),
+            ~robust.outliers,
+        ),
+        f'{folds}-fold cross-validation over {count} distinct configurations'
+        + (', because all held-out samples are at such' if len(repeated) else ''),
+    )
+
+
+def _repeated(problem: Problem) -> NDArray[np.bool_]:
+    """Return (N,) which held-out pairs are at configurations that are fitted."""
+    if not problem.judging:
+        return np.zeros(0, dtype=bool)
+    numbers = numbered((*problem.sets, *problem.judging))
+    count = len(problem.sets)
+    return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
+
+
+def _weighted(
+    problem: Problem, sets: Sequence[Observations], distances: Sequence[FloatArray]
+) -> System:
+    """Return sets with the weights of samples at distances (N,) in the fit to all."""
+    system = problem.system(sets)
+    for samples, distance in zip(system.sets, distances, strict=True):
+        samples.weights = np.sqrt(weights_of(distance, problem.loss))
+    return system
+
+
+def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
+    """Return into how many parts to deal the configurations; 0 where all are needed for the fit.
+
+    The other parts must determine what is fitted, with some equations to spare. Where they do so
+    by priors only, one configuration is left out at a time.
+    """
+    folds = min(problem.folds, count)
+    if folds > 1 and rows * (folds - 1) // folds >= len(names) + SPARE:
+        return folds
+    folds = count
+    unknown = set(names) - problem.informed
+    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + SPARE:
+        return 0
+    return folds
+
+
+def _joined(
+    pieces: Sequence[Residuals], configurations: NDArray[np.intp], index: NDArray[np.intp]
+) -> Residuals:
+    """Return the residuals of several parts as one, put in order by an index (N,)."""
+    return Residuals(
+        np.concatenate([piece.position for piece in pieces])[index],
+        np.concatenate([piece.orientation for piece in pieces])[index],
+        configurations,
+    )
+
+
+def _places(problem: Problem) -> list[set[str]]:
+    """Return the base frames of sockets, together those that are a known distance apart."""
+    places = [{base} for base in dict.fromkeys(each.base for each in problem.sets)]
+    for first, second, _ in problem.separations:
+        one, other = (next(p for p in places if base in p) for base in (first, second))
+        if one is not other:
+            one |= other
+            places.remove(other)
+    return places
+
+
+def _leave_one_place_out(
+    problem: Problem,
+    places: Sequence[set[str]],
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+) -> tuple[Comparison, str]:
+    """Judge both chains on places of sockets that were not fitted.
+
+    Where the sockets of a place are is unknown; it is fitted to the place's own pairs, by arm and
+    tool of the others. Outliers keep the weight that they have in the fit to all.
+    """
+    pairs = list(zip(problem.sets, robust.distances, strict=True))
+
+    def part(place: set[str], inside: bool) -> System:
+        chosen = [pair for pair in pairs if (pair[0].base in place) == inside]
+        return _weighted(problem, [pair[0] for pair in chosen], [pair[1] for pair in chosen])
+
+    frames = [name for name in names if before.owns_frame(name)]
+    chains: list[list[Chain]] = [[], []]
+    for place in places:
+        own = [name for name in names if name.partition('.')[0] in place]
+        for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
+            elsewhere = [name for name in fitted if name not in own]
+            trained = minimise(chain, elsewhere, part(place, inside=False)).chain
+            found.append(minimise(trained, own, part(place, inside=True)).chain)
+    number = {base: k for k, place in enumerate(places) for base in place}
+    parts = [
+        compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])
+        for each in problem.sets
+    ]
+    groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
+    index = np.arange(len(groups))
+    return (
+        Comparison(
+            _joined([part.before for part in parts], groups, index),
+            _joined([part.after for part in parts], groups, index),
+            ~robust.outliers,
+        ),
+        f'leaving out one of {len(places)} places at a time',
+    )
+
+
+def refusals(
+    problem: Problem,
+    converged: bool,
+    parameters: Sequence[Parameter],
+    validation: Comparison | None,
+    chance: float | None,
+    region: Region | None,
+    step: Step | None,
+    own: str | None,
+    unsure: bool,
+) -> tuple[str, ...]:
+    """Return the rules of acceptance that fail, in words.
+
+    1. The fit has converged.
+    2. The rank is full after gauges: no parameter that other poses would determine is left out.
+    3. The RMS position error on held-out poses is lower than before, by more than its
+       uncertainty (one-sided 95 %, Student's t over configurations; see `log_gain`). The
+       orientation must not get worse by the same measure.
+    4. The gain is no chance: where what is measured in succession shares errors, moved in time
+       they are explained as well (`chance.py`; 95 %).
+    5. No DH parameter is certainly (by three standard deviations) further from nominal than
+       `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
+       another robot, not a faulty one.
+    6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
+    7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains
+       more than half of the residuals (`steps.py`).
+    8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not
+       get worse: neither its mean, nor certainly (99 %) its RMS.
+    9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
+    10. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
+    """
+    failed = []
+    if step is not None and step.harmful:
+        failed.append(str(step))
+    if own is not None:
+        failed.append(own)
+    if not converged:
+        failed.append('the fit has not converged')
+    not_excited = [p.name for p in parameters if p.status == 'not excited']
+    if not_excited:
+        failed.append(
+            f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
+            'in more combinations, or fix these parameters'
+        )
+    for p in parameters:
+        length = is_length(p.name)
+        limit = problem.largest_length if length else problem.largest_angle
+        joint, _, kind = p.name.partition('.')
+        if p.std is None or joint not in problem.chain.joint_names or kind not in DH_KINDS:
+            continue
+        if abs(p.offset) - 3.0 * p.std > limit:
+            failed.append(
+                f'{p.name} is off by {1e3 * p.offset:.0f} {"mm" if length else "mrad"}, '
+                'more than a faulty robot of this kind can be: is it the right chain file?'
+            )
+    if validation is None:
+        failed.append('there are too few configurations to judge the result on any held out')
+        return tuple(failed)
+    share = validation.outliers / len(validation.judged)
+    if share > MOST_OUTLIERS:
+        failed += [str(step)] if step is not None and not step.harmful else []
+        failed.append(
+            f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
+            'and what is predicted do not belong together'
+        )
+        return tuple(failed)
+    before, after = validation.figures
+    if after.rms_mm > 1e3 * problem.largest_error:
+        failed.append(
+            f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
+            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?'
+        )
+    judged = validation.deciding
+    groups = validation.after.configurations[judged]
+    gain, limit = log_gain(
+        validation.before.position[judged], validation.after.position[judged], groups
+    )
+    if not gain > limit:
+        failed.append(
+            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
+            f'before, {after.rms_mm:.3f} mm after)'
+        )
+    elif chance is not None and chance > 1.0 - CONFIDENCE:
+        failed.append(
+            'the gain may be that of a drift, as of the tracker: moved in time against the joint '
+            f'values, residuals are explained as well in {100.0 * chance:.0f} % of the shifts; '
+            'measure the poses in random order, further apart, or more of them'
+        )
+    elif region is None:
+        failed.append(
+            'too little is known of the arm for the correction to help: what it removes is not '
+            'larger than its own uncertainty, even at the poses measured; measure more poses, '
+            'spread further'
+        )
+    if validation.outliers:
+        first, second = validation.figures_of_all
+        pairs = (validation.before.position, validation.after.position)
+        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
+        if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
+            failed.append(
+                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
+                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
+                f'{second.mean_mm:.3f} mm)'
+            )
+    if unsure:
+        failed.append(
+            'the gain may be that of rounded joint values, which are alike in many poses: record '
+            'them with more digits'
+        )
+    if after.rms_mrad is not None:
+        gain, limit = log_gain(
+            validation.before.orientation[judged], validation.after.orientation[judged], groups
+        )
+        if gain < -limit:
+            failed.append(
+                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
+                f'before, {after.rms_mrad:.3f} mrad after)'
+            )
+    return tuple(failed)
+
+
+def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is suspicious about a result that is not refused for it.
+
+    `coarse` are the steps [rad or m] of rounded joint values.
+    """
+    found = [] if step is None or step.harmful else [str(step)]
+    if coarse:
+        kinds = {joint.name: joint.type for joint in problem.chain.joints}
+        steps = [
+            f'{name} ({1e3 * step:.3g} {"mrad" if kinds[name] == "revolute" else "mm"})'
+            for name, step in coarse.items()
+        ]
+        found.append(
+            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
+        )
+    return tuple(found)
+
+
+def log_gain(
+    before: FloatArray,
+    after: FloatArray,
+    configurations: NDArray[np.intp],
+    confidence: float = CONFIDENCE,
+) -> tuple[float, float]:
+    """Return the logarithm of RMS before / RMS after, and how large chance could make it.
+
+    Errors are (N, 3). The standard error is that of the difference of the two logarithms by the
+    delta method, from the spread over configurations, because pairs of one are not independent.
+    """
+    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
+    known = ~np.isnan(squares).any(axis=0)
+    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
+    count = len(sizes)
+    if count < 2:
+        return 0.0, np.inf
+    means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+    totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
+    deviation = np.diff(means / totals, axis=0).std(ddof=1)
+    limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
+    return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)

@@ -1,0 +1,464 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The serial chain in Denavit-Hartenberg parameters, and its forward kinematics.
+
+    T_world_target(q) = T_world_base A_1(q_1) ... A_n(q_n) T_flange_target
+
+    standard   A = Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)    Vacarescu et al., eq. (2), with beta
+    modified   A = Rx(alpha) Tx(a) Ry(beta) Rz(theta) Tz(d)    Craig
+
+    revolute   theta = joint.theta + sign q        prismatic   d = joint.d + sign q
+
+The joint value q is the one reported plus the non-geometric effects of the chain (`effects.py`).
+
+A chain is a sequence of elementary motions, each along or about one axis of the moving frame.
+`Chain.trace` walks along it once: the end of the walk is the pose, and the axes met on the way
+are all that the error model (`differential.py`) needs.
+
+beta is Hayati's parameter (Hayati and Mirmirani 1985; Vacarescu et al., section 2). It replaces d
+at consecutive parallel revolute axes, where a tiny tilt moves the common normal arbitrarily far.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.se3 import FloatArray
+
+Convention: TypeAlias = Literal['standard', 'modified']
+JointType: TypeAlias = Literal['revolute', 'prismatic']
+Recorder: TypeAlias = Callable[[str, bool, FloatArray, FloatArray], None]
+
+DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
+ANGLES = ('alpha', 'theta', 'beta')
+FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
+DELAY = 'delay'
+"""Kind of parameter [s] of a base frame: how late the stamps of its device are."""
+PARALLEL_TOLERANCE = np.radians(5.0)
+"""Axes closer than this are treated as parallel: their common normal is badly determined."""
+
+# One DH transform as motions (kind of parameter, rotates, axis of the moving frame).
+_MOTIONS: dict[str, tuple[tuple[str, bool, int], ...]] = {
+    'standard': (
+        ('theta', True, 2),
+        ('d', False, 2),
+        ('a', False, 0),
+        ('alpha', True, 0),
+        ('beta', True, 1),
+    ),
+    'modified': (
+        ('alpha', True, 0),
+        ('a', False, 0),
+        ('beta', True, 1),
+        ('theta', True, 2),
+        ('d', False, 2),
+    ),
+}
+
+
+def is_length(name: str) -> bool:
+    """Tell whether a parameter is a length [m]; the others are angles [rad]."""
+    return name.partition('.')[2] in ('a', 'd', 'x', 'y', 'z')
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One row of the DH table: lengths in m, angles in rad, limits in rad or m.
+
+    `mass` [kg] and `com` [m], its centre in the frame at the link's end, serve compliance only;
+    `gear_ratio` (motor turns per joint turn, 0 when unknown) serves gear harmonics.
+    """
+
+    name: str
+    type: JointType = 'revolute'
+    a: float = 0.0
+    alpha: float = 0.0
+    d: float = 0.0
+    theta: float = 0.0
+    beta: float = 0.0
+    sign: int = 1
+    lower: float | None = None
+    upper: float | None = None
+    mass: float = 0.0
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gear_ratio: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a row that no robot has."""
+        if not self.name or '.' in self.name:
+            raise ConfigError(f'a joint needs a name without dots, not "{self.name}"')
+        if self.type not in get_args(JointType):
+            raise UnknownNameError(f'type of joint "{self.name}"', self.type, get_args(JointType))
+        if self.sign not in (1, -1):
+            raise ConfigError(f'sign of joint "{self.name}" must be 1 or -1, not {self.sign}')
+        for kind in DH_KINDS:
+            if not math.isfinite(getattr(self, kind)):
+                raise ConfigError(f'{kind} of joint "{self.name}" must be a finite number')
+        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+            raise ConfigError(
+                f'limits of joint "{self.name}": lower {self.lower} must be less than upper '
+                f'{self.upper}'
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A constant transform (4, 4); `fixed` when it is known and must not be fitted.
+
+    `delay` [s] is how much later than the joints' the stamps of the device at a base frame are;
+    None where the arm stood and no delay shows.
+    """
+
+    matrix: FloatArray = field(default_factory=lambda: np.eye(4))
+    fixed: bool = False
+    delay: float | None = None
+
+    def moved(self, offsets: Mapping[str, float]) -> Frame:
+        """Return the frame shifted by x, y, z [m] and turned by rx, ry, rz [rad].
+
+        Shift and turn are along and about the axes of the frame's parent (world for the base,
+        flange for the tool), the turn through the frame's own origin.
+        """
+        matrix = self.matrix.copy()
+        matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
+        turn = np.array([offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]])
+        if turn.any():
+            matrix[:3, :3] = se3.exp_rotation(turn) @ matrix[:3, :3]
+        if 'delay' in offsets:
+            return replace(self, matrix=matrix, delay=(self.delay or 0.0) + offsets['delay'])
+        return replace(self, matrix=matrix)
+
+    def offsets(self, reference: Frame | None = None) -> FloatArray:
+        """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""
+        start = np.eye(4) if reference is None else reference.matrix
+        turn = se3.log_rotation(self.matrix[:3, :3] @ start[:3, :3].T)
+        return np.concatenate([self.matrix[:3, 3] - start[:3, 3], turn])
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """A serial chain; immutable, offsets make a new one.
+
+    Parameters
+    ----------
+    name : str
+    convention : 'standard' or 'modified'
+    joints : tuple of Joint
+    parallel : tuple of str, optional
+        Joints whose row joins two parallel revolute axes: beta is fitted there and d is not.
+        Found from the nominal table when None.
+    base, tool : Frame, optional
+        T_world_base and T_flange_target; None when nothing is known about them.
+    frames : tuple of (str, Frame or None)
+        Further bases (`base_...`) and tools (`tool_...`), for several sessions or targets.
+    effects : tuple of (str, float)
+        Non-geometric effects by name, with their values.
+    gravity : three floats
+        Acceleration of gravity [m/s^2] in the base frame, for compliance.
+
+    """
+
+    name: str
+    convention: Convention
+    joints: tuple[Joint, ...]
+    parallel: tuple[str, ...] | None = None
+    base: Frame | None = None
+    tool: Frame | None = None
+    frames: tuple[tuple[str, Frame | None], ...] = ()
+    effects: tuple[tuple[str, float], ...] = ()
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+
+    def __post_init__(self) -> None:
+        """Check the names and find the parallel axes if they are not given."""
+        if str(self.convention) not in _MOTIONS:
+            raise UnknownNameError('convention', self.convention, _MOTIONS)
+        if not self.joints:
+            raise ConfigError(f'chain "{self.name}" has no joints')
+        names = self.joint_names
+        for name in names:
+            if names.count(name) > 1:
+                raise ConfigError(f'chain "{self.name}" has two joints named "{name}"')
+            if name in ('base', 'tool'):
+                raise ConfigError(f'a joint must not be named "{name}", the name of a frame')
+        if self.parallel is None:
+            object.__setattr__(self, 'parallel', self._find_parallel())
+        for name in self.parallel or ():
+            if name not in names:
+                raise UnknownNameError('joint in "parallel"', name, names)
+            if (self.parallel or ()).count(name) > 1:
+                raise ConfigError(f'"parallel" names joint "{name}" twice')
+
+    def _find_parallel(self) -> tuple[str, ...]:
+        """Return the joints whose row joins two (nearly) parallel axes, one at least revolute.
+
+        At a prismatic axis only the direction counts, but there, too, theta tilts a parallel axis
+        only to second order, and beta is needed for a complete model.
+        Row i leads from axis i to axis i + 1 in the standard convention and from axis i - 1 to
+        axis i in the modified one.
+        """
+        first, second = (0, 1) if self.convention == 'standard' else (-1, 0)
+        found = []
+        for i, joint in enumerate(self.joints):
+            before, after = i + first, i + second
+            if before < 0 or after >= len(self.joints):
+                continue
+            revolute = 'revolute' in (self.joints[before].type, self.joints[after].type)
+            tilt = np.hypot(np.sin(joint.alpha), np.sin(joint.beta))
+            if revolute and tilt < np.sin(PARALLEL_TOLERANCE):
+                found.append(joint.name)
+        return tuple(found)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Return the names of the joints, in the order of the chain."""
+        return tuple(joint.name for joint in self.joints)
+
+    @cached_property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Return the names of all parameters of the error model, frames first.
+
+        The model holds beta instead of d at the joints named in `parallel`.
+        """
+        names = [f'{frame}.{kind}' for frame in self.frame_names for kind in FRAME_KINDS]
+        names += [f'{k}.{DELAY}' for k in self.frame_names if self.frame(k).delay is not None]
+        for joint in self.joints:
+            left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
+            names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
+        return (*names, *(name for name, _ in self.effects))
+
+    @cached_property
+    def frame_names(self) -> tuple[str, ...]:
+        """Return the names of all base and tool frames."""
+        return ('base', 'tool', *(name for name, _ in self.frames))
+
+    @property
+    def table(self) -> FloatArray:
+        """Return the DH table (n, 5) with columns a, alpha, d, theta, beta."""
+        return np.array([[getattr(joint, kind) for kind in DH_KINDS] for joint in self.joints])
+
+    def value(self, name: str) -> float:
+        """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
+        owner, kind = self._split(name)
+        if isinstance(owner, Joint):
+            return float(getattr(owner, kind)) if kind in DH_KINDS else self._effect_values[name]
+        if kind == DELAY:
+            return owner.delay or 0.0
+        return float(owner.offsets()[FRAME_KINDS.index(kind)])
+
+    def offset(self, name: str, nominal: Chain) -> float:
+        """Return what `with_offsets` adds to the nominal chain's parameter to come here."""
+        owner, kind = self._split(name)
+        if isinstance(owner, Joint) or kind == DELAY:
+            return self.value(name) - nominal.value(name)
+        reference = nominal.frame(name.partition('.')[0])
+        return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
+
+    def frame(self, name: str) -> Frame:
+        """Return a base or tool frame by its name, the identity when nothing is known."""
+        return self._frames[name] or Frame()
+
+    def owns_frame(self, parameter: str) -> bool:
+        """Tell whether a parameter belongs to a base or tool frame."""
+        return parameter.partition('.')[0] in self.frame_names
+
+    def with_frame(self, name: str, frame: Frame) -> Chain:
+        """Return the chain with another base or tool frame, which may be a new one."""
+        if name == 'base':
+            return replace(self, base=frame)
+        if name == 'tool':
+            return replace(self, tool=frame)
+        return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
+
+    def with_effects(self, names: Sequence[str]) -> Chain:
+        """Return the chain with further effects, of no size yet."""
+        known = dict(self.effects)
+        added = tuple((name, 0.0) for name in dict.fromkeys(names) if name not in known)
+        chain = replace(self, effects=(*self.effects, *added))
+        for name, _ in added:
+            chain._split(name)
+        return chain
+
+    def with_effect_values(self, values: Mapping[str, float]) -> Chain:
+        """Return the chain with effects of given values."""
+        return self.with_effects(tuple(values)).with_offsets(values) if values else self
+
+    def with_offsets(self, offsets: Mapping[str, float]) -> Chain:
+        """Return the chain with offsets [m or rad] added to the named parameters.
+
+        Identified errors are added to the parameters, not to the transforms: the paper's
+        A + dA leaves SE(3).
+        """
+        by_owner: dict[str, dict[str, float]] = {}
+        for name, offset in offsets.items():
+            self._split(name)
+            owner, _, kind = name.partition('.')
+            by_owner.setdefault(owner, {})[kind] = float(offset)
+        joints = []
+        for joint in self.joints:
+            own = by_owner.get(joint.name, {})
+            values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in DH_KINDS}
+            joints.append(replace(joint, **values) if values else joint)
+        frames = {
+            key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
+            for key, frame in self._frames.items()
+        }
+        return replace(
+            self,
+            joints=tuple(joints),
+            base=frames.pop('base'),
+            tool=frames.pop('tool'),
+            frames=tuple(frames.items()),
+            effects=tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
+        )
+
+    def forward(
+        self,
+        q: FloatArray,
+        approach: FloatArray | None = None,
+        base: str = 'base',
+        tool: str = 'tool',
+    ) -> FloatArray:
+        """Return T_world_target (N, 4, 4) for joint values (N, n) [rad or m].
+
+        `approach` (N, n) holds the signs of the velocities before, for backlash; `base` and `tool`
+        choose among the frames.
+        """
+        q = np.asarray(q, dtype=np.float64)
+        if q.ndim != 2 or q.shape[1] != len(self.joints):
+            raise ConfigError(
+                f'joint values must have the shape (N, {len(self.joints)}) for chain '
+                f'"{self.name}", not {q.shape}'
+            )
+        rows = np.ascontiguousarray(q.T)
+        came = None if approach is None else np.ascontiguousarray(approach.T)
+        axes, origin = self.trace(self.effective(rows, came), base=base, tool=tool)
+        rotation = np.empty((len(q), 3, 3))
+        for k in range(3):
+            rotation[:, :, k] = axes[k].T
+        return se3.transform(rotation, np.broadcast_to(origin.T, (len(q), 3)))
+
+    def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
+        """Return the joint values (n, B) that the effects make of those reported (n, B)."""
+        if not self.effects:
+            return q
+        phi = effects.basis(self, [name for name, _ in self.effects], q, approach)
+        q = q.copy()
+        for (name, value), row in zip(self.effects, phi, strict=True):
+            q[self.joint_names.index(name.partition('.')[0])] += value * row
+        return q
+
+    def trace(
+        self,
+        q: FloatArray,
+        record: Recorder | None = None,
+        base: str = 'base',
+        tool: str = 'tool',
+        links: list[tuple[list[FloatArray], FloatArray]] | None = None,
+    ) -> tuple[list[FloatArray], FloatArray]:
+        """Walk along the chain, reporting the axis of every parameter.
+
+        Parameters
+        ----------
+        q : (n, B)
+            Effective joint values, a row per joint.
+        record : callable, optional
+            Called as record(name, rotates, axis, point), once per parameter. Raising the
+            parameter by epsilon shifts everything behind it by epsilon along the axis, or turns
+            it by epsilon about the axis through the point. Arrays are (3, B) or (3, 1), in world
+            coordinates, and are not modified afterwards.
+        base, tool : str
+            Frames at the ends of the chain.
+        links : list, optional
+            Gets the axes and the origin of the frame at the end of every link.
+
+        Returns
+        -------
+        axes : list of three (3, B)
+            x, y and z axis of the target, in world coordinates.
+        origin : (3, B)
+            Its origin [m].
+
+        """
+        report: Recorder = record or (lambda name, rotates, axis, point: None)
+        start, end = self.frame(base).matrix, self.frame(tool).matrix
+        axes = [start[:3, k : k + 1] for k in range(3)]
+        origin = start[:3, 3:]
+        for k in range(3):
+            unit = np.eye(3)[:, k : k + 1]
+            report(f'{base}.{FRAME_KINDS[k]}', False, unit, origin)
+            report(f'{base}.{FRAME_KINDS[k + 3]}', True, unit, origin)
+        for joint, values in zip(self.joints, q, strict=True):
+            driven = 'theta' if joint.type == 'revolute' else 'd'
+            for kind, rotates, k in _MOTIONS[self.convention]:
+                report(f'{joint.name}.{kind}', rotates, axes[k], origin)
+                value = getattr(joint, kind)
+                if kind == driven:
+                    value = value + joint.sign * values
+                elif value == 0.0:
+                    continue
+                if rotates:
+                    cos, sin = np.cos(value), np.sin(value)
+                    i, j = (k + 1) % 3, (k + 2) % 3
+                    axes[i], axes[j] = (
+                        cos * axes[i] + sin * axes[j],
+                        cos * axes[j] - sin * axes[i],
+                    )
+                else:
+                    origin = origin + value * axes[k]
+            if links is not None:
+                links.append((list(axes), origin))
+        flange = list(axes)
+        for i in range(3):
+            report(f'{tool}.{FRAME_KINDS[i]}', False, flange[i], origin)
+            axes[i] = sum(end[k, i] * flange[k] for k in range(3))
+        origin = origin + sum(end[k, 3] * flange[k] for k in range(3))
+        for i in range(3):
+            report(f'{tool}.{FRAME_KINDS[i + 3]}', True, flange[i], origin)
+        return axes, origin
+
+    def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """Draw joint values (count, n) within the limits, +-180 degrees or +-0.5 m by default."""
+        limits = []
+        for joint in self.joints:
+            reach = np.pi if joint.type == 'revolute' else 0.5
+            lower, upper = joint.lower, joint.upper
+            if lower is None:
+                lower = -reach if upper is None else min(-reach, upper - 2.0 * reach)
+            if upper is None:
+                upper = max(reach, lower + 2.0 * reach)
+            limits.append((lower, upper))
+        bounds = np.array(limits)
+        return rng.uniform(bounds[:, 0], bounds[:, 1], (count, len(self.joints)))
+
+    def _split(self, name: str) -> tuple[Joint | Frame, str]:
+        """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
+        owner, _, kind = name.partition('.')
+        if owner in self._frames and kind in (*FRAME_KINDS, DELAY):
+            return self.frame(owner), kind
+        joint = self._joints.get(owner)
+        if joint is not None and kind in DH_KINDS:
+            return joint, kind
+        if joint is not None and name in self._effect_values:
+            effects.check(name, self.joint_names)
+            return joint, kind
+        raise UnknownNameError('parameter', name, self.parameter_names)
+
+    @cached_property
+    def _frames(self) -> Mapping[str, Frame | None]:
+        return {'base': self.base, 'tool': self.tool, **dict(self.frames)}
+
+    @cached_property
+    def _joints(self) -> Mapping[str, Joint]:
+        return {joint.name: joint for joint in self.joints}
+
+    @cached_property
+    def _effect_values(self) -> Mapping[str, float]:
+        return dict(self.effects)

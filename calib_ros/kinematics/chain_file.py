@@ -1,0 +1,387 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Chain files and calibrations: YAML to chain and back.
+
+One schema for nominal and corrected chains, so that an output is an input. `docs/formats.md`
+describes it. A URDF is read as a nominal chain.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros import texts
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
+from calib_ros.kinematics.urdf import MOST_JOINTS, chain_from_urdf
+from calib_ros.settings import Settings
+from calib_ros.texts import parse_yaml
+from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_name, parse_number, parse_numbers
+
+CHAIN_KEYS = (
+    *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
+    'calibration',
+)
+FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay')
+JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
+URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
+SAME = 1e-9
+"""Numbers [m, rad] of two nominal chains that differ by less are the same."""
+
+
+def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
+    """Read a chain file, a URDF, or a robot that calib_ros ships by its name, such as "ur10e".
+
+    Base and tool frame of a URDF are left out: they lead to its links, and neither the world of a
+    measuring device nor its target is one.
+    """
+    path = Path(name_or_path)
+    if path.suffix in URDF_SUFFIXES:
+        return replace(read_urdf(path), base=None, tool=None)
+    if not path.suffix and not path.is_file():
+        robots = shipped_robots()
+        if str(name_or_path) not in robots:
+            raise UnknownNameError('robot', str(name_or_path), robots)
+        path = robots[path.name]
+    return parse_chain(read_text(path), str(path))
+
+
+def read_urdf(
+    path: Path,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    convention: Convention = 'standard',
+) -> Chain:
+    """Read the chain between two links of a URDF, with its frames (`urdf.chain_from_urdf`)."""
+    return chain_from_urdf(read_text(path), base_link, tip_link, convention)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a chain file."""
+    return texts.read_text(path, what='chain file ')
+
+
+def shipped_robots() -> dict[str, Path]:
+    """Return the chain files that come with calib_ros, by name.
+
+    Looked for in the share folders of the ROS workspaces in use, in that of the Python
+    environment, and in the source tree.
+    """
+    prefixes = [Path(p) for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
+    shares = [prefix / 'share' / 'calib_ros' for prefix in (*prefixes, Path(sys.prefix))]
+    for share in (*shares, Path(__file__).parents[2]):
+        found = sorted((share / 'config' / 'robots').glob('*.yaml'))
+        if found:
+            return {path.stem: path for path in found}
+    return {}
+
+
+def parse_chain(text: str, where: str = 'chain file') -> Chain:
+    """Turn the text of a chain file into a chain; `where` names it in errors."""
+    document = parse_yaml(text, where)
+    content = _mapping(document, CHAIN_KEYS, where)
+    for key in ('convention', 'joints'):
+        if key not in content:
+            raise ConfigError(f'{where}: key "{key}" is missing')
+    rows = content['joints']
+    if not isinstance(rows, list) or not rows:
+        raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
+    if len(rows) > MOST_JOINTS:
+        raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_JOINTS}')
+    parallel = content.get('parallel')
+    if parallel is not None and not (
+        isinstance(parallel, list) and all(isinstance(name, str) for name in parallel)
+    ):
+        raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')
+    try:
+        return Chain(
+            name=parse_name(content.get('name', Path(where).stem), f'{where}: name'),
+            convention=content['convention'],
+            joints=tuple(_joint(row, f'{where}: joint {k + 1}') for k, row in enumerate(rows)),
+            parallel=None if parallel is None else tuple(parallel),
+            base=_frame(content.get('base'), f'{where}: base'),
+            tool=_frame(content.get('tool'), f'{where}: tool'),
+            frames=tuple(
+                (parse_name(name, f'{where}: frames'), _frame(frame, f'{where}: frames.{name}'))
+                for name, frame in _dictionary(content.get('frames'), f'{where}: frames').items()
+            ),
+            **_gravity(content, where),
+        ).with_effect_values(
+            {
+                name: parse_number(value, f'{where}: effects: {name}')
+                for name, value in _dictionary(content.get('effects'), f'{where}: effects').items()
+            }
+        )
+    except ConfigError as err:
+        if str(err).startswith(where):
+            raise
+        if isinstance(err, UnknownNameError):
+            if where in err.what:
+                raise
+            raise UnknownNameError(f'{where}: {err.what}', err.name, err.alternatives) from err
+        raise ConfigError(f'{where}: {err}') from err
+
+
+def calibration_record(text: str) -> dict[str, Any]:
+    """Return what a chain file says about where its numbers come from."""
+    record = parse_yaml(text, 'chain file').get('calibration')
+    return record if isinstance(record, dict) else {}
+
+
+def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> tuple[Chain, dict[str, Any]]:
+    """Read the calibration of a nominal chain: its file, or the folder of an identification.
+
+    Return the corrected chain and the record of its origin.
+
+    Raises
+    ------
+    ConfigError
+        When it is none, or that of another nominal chain (`parse_calibration`).
+
+    """
+    file = Path(path)
+    if file.is_dir():
+        file /= 'calibration.yaml'
+    return parse_calibration(read_text(file), str(file), nominal)
+
+
+def parse_calibration(
+    text: str, where: str, nominal: Chain, settings: Settings | None = None
+) -> tuple[Chain, dict[str, Any]]:
+    """Turn the text of a calibration into the corrected chain and the record of its origin.
+
+    A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
+    all that calib_ros writes, and must not speak against this nominal chain; nor may the numbers
+    be further from it than `largest_length` and `largest_angle` of the settings allow. Without
+    settings the identification has judged that, if it records the numbers of this chain.
+
+    Raises
+    ------
+    ConfigError
+        When the text is no chain file, a chain without a record, or a calibration that was not
+        accepted, or that was identified from another nominal chain.
+
+    """
+    chain = parse_chain(text, where)
+    ours, theirs = (
+        [f'{joint.name} ({joint.type})' for joint in each.joints] for each in (nominal, chain)
+    )
+    if ours != theirs:
+        raise ConfigError(
+            f'{where} has the joints {", ".join(theirs)}, the nominal chain has '
+            f'{", ".join(ours)}: is it the right nominal chain?'
+        )
+    record = calibration_record(text)
+    if not record:
+        raise ConfigError(
+            f'{where} is a chain, but no calibration: it does not say where its numbers come '
+            'from (key "calibration"); give the calibration.yaml of calib_ros identify'
+        )
+    if record.get('accepted') is False:
+        raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
+    _check_figures(record, where)
+    known = _check_nominal(record.get('nominal'), nominal, where)
+    limits = settings or Settings()
+    length, angle = limits.largest_length, limits.largest_angle
+    if known and settings is None:
+        length = angle = math.inf
+    differing = _differing(chain, nominal, length, angle)
+    if differing:
+        raise ConfigError(
+            f'{where} is not the calibration of this robot: {", ".join(differing)} differ from '
+            f'chain "{nominal.name}" by more than largest_length and largest_angle allow'
+        )
+    return chain, record
+
+
+def nominal_record(nominal: Chain) -> dict[str, Any]:
+    """Return the numbers of the chain that a calibration belongs to, row by row."""
+    rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
+    return {'convention': nominal.convention, 'joints': rows}
+
+
+def _check_figures(record: dict[str, Any], where: str) -> None:
+    """Refuse what a calibration could not be judged by, or published under."""
+    rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
+    number = isinstance(rms, int | float) and not isinstance(rms, bool)
+    if not number or not 0.0 <= rms < math.inf:
+        raise ConfigError(f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}')
+    if not isinstance(frame, str):
+        raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
+
+
+def _check_nominal(recorded: object, nominal: Chain, where: str) -> bool:
+    """Refuse a nominal chain with other numbers than the one that a calibration comes from.
+
+    Return whether those numbers are recorded and can be compared.
+    """
+    known = _dictionary(recorded, f'{where}: calibration.nominal')
+    if known.get('convention') != nominal.convention:  # nothing recorded, or not comparable
+        return False
+    rows = _dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
+    for joint in nominal.joints:
+        row = parse_numbers(rows.get(joint.name), len(DH_KINDS), f'{where}: nominal {joint.name}')
+        for kind, value in zip(DH_KINDS, row.tolist(), strict=True):
+            if abs(value - getattr(joint, kind)) > SAME:
+                raise ConfigError(
+                    f'{where} was identified from another nominal chain, with {joint.name}.{kind} '
+                    f'{value:.9g} and not {getattr(joint, kind):.9g}: give that one, or identify '
+                    'again'
+                )
+    return True
+
+
+def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
+    """Return what of the joints differs by more than errors of one robot can [m, rad]."""
+    if chain.convention != nominal.convention:
+        return [f'the conventions ({chain.convention}, {nominal.convention})']
+    names = []
+    for joint, other in zip(chain.joints, nominal.joints, strict=True):
+        if joint.sign != other.sign:
+            names.append(f'the sign of {joint.name}')
+        for kind in DH_KINDS:
+            limit = angle if kind in ANGLES else length
+            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
+                names.append(f'{joint.name}.{kind}')
+    return names
+
+
+def chain_document(chain: Chain) -> dict[str, Any]:
+    """Return the content of a chain file as plain Python values."""
+    joints = []
+    for joint in chain.joints:
+        row: dict[str, Any] = {'name': joint.name, 'type': joint.type}
+        row |= {kind: float(getattr(joint, kind)) for kind in DH_KINDS}
+        row['sign'] = joint.sign
+        for key in ('lower', 'upper'):
+            if getattr(joint, key) is not None:
+                row[key] = float(getattr(joint, key))
+        if joint.mass or any(joint.com):
+            row |= {'mass': float(joint.mass), 'com': [float(part) for part in joint.com]}
+        if joint.gear_ratio:
+            row['gear_ratio'] = float(joint.gear_ratio)
+        joints.append(row)
+    document: dict[str, Any] = {
+        'name': chain.name,
+        'convention': chain.convention,
+        'joints': joints,
+        'parallel': list(chain.parallel or ()),
+    }
+    document |= {
+        key: _frame_document(frame)
+        for key, frame in (('base', chain.base), ('tool', chain.tool))
+        if frame is not None
+    }
+    others = {name: _frame_document(frame) for name, frame in chain.frames if frame is not None}
+    if others:
+        document['frames'] = others
+    if chain.effects:
+        document['effects'] = {name: float(value) for name, value in chain.effects}
+    if chain.gravity != Chain.gravity:
+        document['gravity'] = [float(part) for part in chain.gravity]
+    return document
+
+
+def _frame_document(frame: Frame) -> dict[str, Any]:
+    document = {
+        'xyz': frame.matrix[:3, 3].tolist(),
+        'quat_xyzw': se3.to_quat(frame.matrix[:3, :3]).tolist(),
+        'fixed': frame.fixed,
+    }
+    return document if frame.delay is None else document | {'delay': frame.delay}
+
+
+def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
+    """Return the text of a chain file; `calibration` says where the numbers come from."""
+    document = chain_document(chain)
+    if calibration is not None:
+        document['calibration'] = dict(calibration)
+    return dump_yaml(document)
+
+
+def dump_yaml(document: Mapping[str, Any]) -> str:
+    """Return plain values as YAML."""
+    import yaml
+
+    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000))
+
+
+def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f'{where} must be a mapping with the keys {", ".join(keys)}')
+    for key in value:
+        if key not in keys:
+            raise UnknownNameError(f'key in {where}', str(key), keys)
+    return value
+
+
+def _dictionary(value: object, where: str) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+        raise ConfigError(f'{where} must be a mapping of names, not {value!r}')
+    return value
+
+
+def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
+    if content.get('gravity') is None:
+        return {}
+    x, y, z = parse_numbers(content['gravity'], 3, f'{where}: gravity').tolist()
+    return {'gravity': (x, y, z)}
+
+
+def _joint(row: object, where: str) -> Joint:
+    content = _mapping(row, JOINT_KEYS, where)
+    for key in ('name', 'a', 'alpha', 'd', 'theta'):
+        if key not in content:
+            raise ConfigError(f'{where}: key "{key}" is missing')
+    numbers = {
+        key: parse_number(content[key], f'{where}: {key}')
+        for key in (*DH_KINDS, 'sign', 'mass', 'gear_ratio')
+        if content.get(key) is not None
+    }
+    for key in ('lower', 'upper'):
+        if content.get(key) is not None:
+            limit = parse_number(content[key], f'{where}: {key}', largest=math.inf)
+            if abs(limit) <= LARGEST:  # what some write where there is none
+                numbers[key] = limit
+    sign = numbers.pop('sign', 1.0)
+    centre = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
+    if sign not in (1.0, -1.0):
+        raise ConfigError(f'{where}: sign must be 1 or -1, not {sign:g}')
+    return Joint(
+        name=parse_name(content['name'], f'{where}: name'),
+        type=content.get('type', 'revolute'),
+        sign=int(sign),
+        com=(centre[0], centre[1], centre[2]),
+        **numbers,
+    )
+
+
+def _frame(value: object, where: str) -> Frame | None:
+    if value is None:
+        return None
+    content = _mapping(value, FRAME_KEYS, where)
+    xyz = parse_numbers(content.get('xyz', [0.0, 0.0, 0.0]), 3, f'{where}.xyz')
+    quat = parse_numbers(content.get('quat_xyzw', [0.0, 0.0, 0.0, 1.0]), 4, f'{where}.quat_xyzw')
+    length = float(np.linalg.norm(quat))
+    if abs(length - 1.0) > QUATERNION_TOLERANCE:
+        raise ConfigError(f'{where}.quat_xyzw must have length 1 (x, y, z, w), not {length:.6g}')
+    fixed = content.get('fixed', False)
+    if not isinstance(fixed, bool):
+        raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
+    delay = content.get('delay')
+    return Frame(
+        se3.transform(se3.from_quat(quat), xyz),
+        fixed,
+        None if delay is None else parse_number(delay, f'{where}.delay'),
+    )

@@ -1,0 +1,309 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The smallest change of the joints with which one arm reaches the pose of another.
+
+With x the change of the joints in units of the largest that is allowed, e the pose error (position
+[m], rotation vector times a weight [m/rad]) and J = -de/dx, Gauss-Newton minimises
+
+    |e|^2 + x^T D x         step = (J^T J + D)^-1 (J^T e - D x)
+
+D is next to nothing, so that x is the smallest change that reaches the pose, or the best
+compromise of an arm that cannot. Samples that would need more than is allowed, as near a
+singularity, are damped. With J = sum_k s_k u_k v_k^T at the command, a direction whose share
+e_k = u_k^T e of the error would need x_k = e_k / s_k > 1 gets x_k = s_k / e_k, which is what
+D = sum_k (e_k^2 - s_k^2) v_k v_k^T does: continuous where damping begins, zero at the singularity
+(variable damping after Nakamura and Hanafusa 1986), and exact in all other directions.
+
+Arrays inside are laid out (component, sample), as in `differential.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.inverse import LEVER, Aim, driven, limits, solve_positive
+from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.se3 import FloatArray, transform
+
+Flags = NDArray[np.bool_]
+
+BLOCK = 2048
+ITERATIONS = 50
+STEP = 1e-8
+"""An iteration has converged when no joint moves by more, in units of the largest change."""
+EXACT = 1e-8
+"""Errors [m, rad] below which a pose is reached."""
+EVEN = 1e-12
+"""Share by which the cost may change and count as the same."""
+CAUTION = 1e-3
+"""Damping, as a share of the diagonal, after a step that raised the cost."""
+RIDGE = 1e-8
+"""Root of D [m]; against regular singular values, from 1e-4 up, it does not show."""
+NULL_SPACE_RIDGE = 1e-6
+"""The same for arms with more joints than freedoms, whose J^T J is singular everywhere."""
+POSITION_FIRST = 1e-3
+"""Metres that a radian counts where not every orientation can be reached: position first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Changes of the joints, and the errors with and without them.
+
+    Attributes
+    ----------
+    change : (N, n)
+        To be added to the commands [rad or m].
+    held : (N, n) bool
+        Joints that are held at a limit.
+    converged, damped : (N,) bool
+        Damped samples would need more than the largest change: they get a part of it.
+    iterations : int
+        Of the slowest sample.
+    errors, errors_before : (N, 2)
+        Lengths of position [m] and orientation error [rad].
+
+    """
+
+    change: FloatArray
+    held: Flags
+    converged: Flags
+    damped: Flags
+    iterations: int
+    errors: FloatArray
+    errors_before: FloatArray
+
+
+def mobility(chain: Chain) -> int:
+    """Return how many freedoms of its flange an arm controls, 6 at most."""
+    q = chain.random_joints(10, np.random.default_rng(0))
+    return int(np.linalg.matrix_rank(ErrorModel(chain, driven(chain)).jacobian(q), 1e-6).max())
+
+
+class Follower:
+    """Joint changes with which the `follower` arm reaches the poses of the `leader`.
+
+    `lower` and `upper` (n,) are the limits of the leader's joints. An arm is `complete` when it
+    can reach every position and orientation nearby.
+
+    Parameters
+    ----------
+    leader, follower : Chain
+        Arms with the same joints. Their base and tool frames are left aside.
+    tool : three floats
+        The point [m] in the flange frame whose position counts.
+    unit : (n,)
+        Largest change of each joint [rad or m].
+    weight : float, optional
+        Metres that a radian counts.
+
+    """
+
+    def __init__(
+        self,
+        leader: Chain,
+        follower: Chain,
+        tool: Sequence[float],
+        unit: FloatArray,
+        weight: float | None,
+    ) -> None:
+        point = Frame(transform(np.eye(3), np.array(tool, dtype=np.float64)))
+        self._leader, self._follower = (
+            replace(chain, base=Frame(), tool=point) for chain in (leader, follower)
+        )
+        self._aim = Aim(self._follower)
+        self._unit = unit[:, np.newaxis]
+        self.lower, self.upper = limits(leader)
+        freedoms = mobility(leader)
+        self.complete = freedoms == 6
+        self._weight = weight or (LEVER if self.complete else POSITION_FIRST)
+        self._first_weight = LEVER if self.complete else self._weight
+        ridge = NULL_SPACE_RIDGE if len(unit) > freedoms else RIDGE
+        self._ridge = ridge**2 * np.eye(len(unit))[:, :, np.newaxis]
+        self._diagonal = np.diag_indices(len(unit))
+
+    def solve(
+        self, joints: FloatArray, approach: FloatArray | None = None, bounded: bool = True
+    ) -> Solution:
+        """Return the changes for commands (N, n), within the limits of the joints if bounded."""
+        parts = []
+        for start in range(0, len(joints), BLOCK):
+            rows = slice(start, start + BLOCK)
+            came = None if approach is None else np.ascontiguousarray(approach[rows].T)
+            parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ('change', 'held', 'converged', 'damped', 'errors', 'errors_before')
+        }
+        return Solution(iterations=max(part.iterations for part in parts), **joined)
+
+    def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
+        """Solve for commands (n, B).
+
+        A joint that would go beyond a limit is held there, and the others do without it.
+        """
+        axes, origin = self._leader.trace(self._leader.effective(q, approach))
+        shape = (3, q.shape[1])
+        task = _Task(
+            q,
+            approach,
+            np.stack([np.broadcast_to(axis, shape) for axis in axes]),
+            np.broadcast_to(origin, shape),
+            np.zeros(q.shape, dtype=bool),
+            np.zeros_like(q),
+        )
+        before = self._errors(task, task.start)
+        x, errors, converged, damped, iterations = self._attempt(task)
+        lower, upper = (((end - q.T).T / self._unit) for end in (self.lower, self.upper))
+        while bounded:
+            beyond = ~task.held & ((x < lower) | (x > upper))
+            rest = np.flatnonzero(beyond.any(axis=0))
+            if not rest.size:
+                break
+            held = task.held | beyond
+            task = replace(task, held=held, start=np.where(held, np.clip(x, lower, upper), 0.0))
+            x[:, rest], errors[rest], converged[rest], damped[rest], more = self._attempt(
+                task.select(rest)
+            )
+            iterations += more
+        return Solution(
+            (self._unit * x).T,
+            task.held.T,
+            converged,
+            damped,
+            iterations,
+            errors,
+            before,
+        )
+
+    def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags, int]:
+        """Return x (n, B), errors (B, 2), what converged and is damped (B,), and the iterations.
+
+        Where the first attempt fails the weight of the orientation makes the compromise.
+        """
+        x, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
+        errors = self._errors(task, x)
+        damped = np.zeros_like(converged)
+        rest = np.flatnonzero(~converged | (self.complete & (errors > EXACT).any(axis=1)))
+        if rest.size:
+            part = task.select(rest)
+            stiffness, damped[rest] = self._stiffness(part)
+            x[:, rest], converged[rest], more = self._minimise(
+                part, stiffness, self._weight, settle=True
+            )
+            errors[rest] = self._errors(part, x[:, rest])
+            iterations += more
+        return x, errors, converged, damped, iterations
+
+    def _minimise(
+        self, task: _Task, stiffness: FloatArray, weight: float, settle: bool = False
+    ) -> tuple[FloatArray, Flags, int]:
+        """Minimise |e|^2 + x^T D x, the cost.
+
+        A step that raises the cost is not taken, and tried again with more damping (Marquardt
+        1963). Samples settle for a cost that does not fall any more if told so; else they are
+        given up when x is longer than 1.
+
+        Returns
+        -------
+        x, converged, iterations : (n, B), (B,), int
+
+        """
+        found = task.start.copy()
+        converged = np.zeros(found.shape[1], dtype=bool)
+        active = np.arange(found.shape[1])
+        stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], active.size))
+        x, caution, still = task.start, np.zeros(active.size), np.zeros(active.size, dtype=bool)
+        error, columns = self._linearise(task, x, weight)
+        iterations = 0
+        while iterations < ITERATIONS:
+            iterations += 1
+            normal = np.einsum('ikb,jkb->ijb', columns, columns) + stiffness
+            normal[self._diagonal] *= 1.0 + caution
+            slope = np.einsum('ikb,kb->ib', columns, error)
+            slope -= np.einsum('ijb,jb->ib', stiffness, x)
+            step = solve_positive(normal, np.where(task.held | still, 0.0, slope))
+            new = x + step
+            found[:, active] = new
+            settled = still | (np.abs(step).max(axis=0) <= STEP)
+            far = ~(settle | (np.einsum('ib,ib->b', new, new) <= 1.0))
+            converged[active[settled & ~far]] = True
+            going = np.flatnonzero(~settled & ~far)
+            if not going.size:
+                break
+            active, task = active[going], task.select(going)
+            x, new, error, columns, stiffness, caution = (
+                part[..., going] for part in (x, new, error, columns, stiffness, caution)
+            )
+            new_error, new_columns = self._linearise(task, new, weight)
+            cost, new_cost = _cost(error, x, stiffness), _cost(new_error, new, stiffness)
+            taken = new_cost <= cost * (1.0 + EVEN)
+            still = settle & taken & (new_cost >= cost * (1.0 - EVEN))
+            x = np.where(taken, new, x)
+            error = np.where(taken, new_error, error)
+            columns = np.where(taken, new_columns, columns)
+            caution = np.where(taken, 0.1 * caution, np.maximum(10.0 * caution, CAUTION))
+        else:
+            found[:, active] = x
+        return found, converged, iterations
+
+    def _linearise(
+        self, task: _Task, x: FloatArray, weight: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the weighted error (6, B), and what x changes of the pose (n, 6, B)."""
+        q = task.q + self._unit * x
+        error, columns = self._aim.linearise(q, task.approach, task.origin, task.axes, weight)
+        columns *= self._unit[:, np.newaxis] * ~task.held[:, np.newaxis]
+        return error, columns
+
+    def _stiffness(self, task: _Task) -> tuple[FloatArray, Flags]:
+        """Return D (n, n, B) against too large changes, and which samples (B,) it damps."""
+        error, columns = self._linearise(task, task.start, self._weight)
+        left, values, right = np.linalg.svd(columns.transpose(2, 1, 0), full_matrices=False)
+        share = np.einsum('bik,ib->bk', left, error)
+        added = np.maximum(share**2 - values**2, 0.0)
+        stiffness = np.einsum('bki,bk,bkj->ijb', right, added, right)
+        return stiffness + self._ridge, (added > 0.0).any(axis=1)
+
+    def _errors(self, task: _Task, x: FloatArray) -> FloatArray:
+        """Return the lengths (B, 2) of position [m] and orientation error [rad]."""
+        q = task.q + self._unit * x
+        axes, origin = self._follower.trace(self._follower.effective(q, task.approach))
+        errors = np.stack([task.origin - origin, orientation_error(task.axes, axes)])
+        return np.asarray(np.sqrt(np.einsum('kib,kib->bk', errors, errors)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Samples to solve: commands (n, B), wanted axes (3, 3, B) and origins (3, B).
+
+    Joints that are `held` (n, B) keep the x that they have at the `start` (n, B).
+    """
+
+    q: FloatArray
+    approach: FloatArray | None
+    axes: FloatArray
+    origin: FloatArray
+    held: Flags
+    start: FloatArray
+
+    def select(self, index: NDArray[np.intp]) -> _Task:
+        """Return some of the samples."""
+        return _Task(
+            self.q[:, index],
+            None if self.approach is None else self.approach[:, index],
+            self.axes[..., index],
+            self.origin[:, index],
+            self.held[:, index],
+            self.start[:, index],
+        )
+
+
+def _cost(error: FloatArray, x: FloatArray, stiffness: FloatArray) -> FloatArray:
+    """Return |e|^2 + x^T D x (B,)."""
+    pull = np.einsum('ijb,jb->ib', stiffness, x)
+    return np.asarray(np.einsum('kb,kb->b', error, error) + np.einsum('ib,ib->b', x, pull))

@@ -1,0 +1,302 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The chain from a robot's own description (URDF), and the corrected arm back into it.
+
+    URDF     T_base_tip(q) = O_1 M_1(q_1) ... O_n M_n(q_n) O_tip
+    chain    T_base_tip(q) = base A_1(q_1) ... A_n(q_n) tool
+
+O are origins of joints, fixed joints multiplied in; M turns about an axis, or shifts along it.
+The lines of the axes at q = 0 are all that matters. In both conventions the same five parameters
+lead from a frame on one axis to a frame on the next,
+
+    Rz(theta_i) Tz(d_i) Tx(a) Rx(alpha) Ry(beta)
+
+with a, alpha and beta in row i of the standard convention and in row i + 1 of the modified one.
+Axes that are skew or intersect take their common normal, with beta = 0. Those that are parallel or
+nearly so take d = 0: theta and a lead to the point where the next axis pierces the plane across
+this one, alpha and beta tilt z into it. Nothing is divided by the angle between the axes there,
+so the tilts in a calibrated URDF make no absurd lengths (Hayati and Mirmirani 1985).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib_ros.errors import ConfigError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Convention, Frame, Joint
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
+
+DIGITS = 14
+"""Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
+POSES = 1000
+"""Random poses at which a corrected URDF, read back, is held against the arm."""
+EXACT = 1e-9
+"""Largest difference [m or 1] of poses by a corrected chain and by the URDF written from it."""
+MOST_JOINTS = 50
+"""Joints of a chain; each is five parameters to fit."""
+FAR = 0.2
+"""Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
+
+
+def chain_from_urdf(
+    text: str,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    convention: Convention = 'standard',
+) -> Chain:
+    """Return the chain between two links of a URDF, whose forward kinematics it has.
+
+    Base: from base_link to z along the first axis, the origin at the foot of base_link's origin on
+    it, x as that of the first joint. Tool: from the last frame, whose origin is the foot of
+    tip_link's origin on the last axis, to tip_link. Neither is fixed. Limits are taken over, and
+    the masses of all that is attached to a link; side branches that move count as they stand at
+    zero. Gravity is taken to point against z of base_link.
+
+    Parameters
+    ----------
+    text : str
+        The URDF.
+    base_link, tip_link : str, optional
+        By default the root, and `tool0`, `flange` or the only end behind a moving joint.
+    convention : 'standard' or 'modified', optional
+        Of the table.
+
+    Raises
+    ------
+    ConfigError
+        When the text is no URDF, or there is no serial chain between the links.
+
+    """
+    robot = parse_urdf(text)
+    path = robot.path(base_link, tip_link)
+    poses = robot.poses(path[0].parent)
+    moving = [joint for joint in path if joint.moves]
+    if len(moving) > MOST_JOINTS:
+        raise ConfigError(
+            f'{len(moving)} joints move between the links, more than {MOST_JOINTS}: choose '
+            'base_link and tip_link nearer to each other'
+        )
+    places = [poses[joint.child] for joint in moving]
+    axes = [place[:3, :3] @ joint.axis for place, joint in zip(places, moving, strict=True)]
+    tip = poses[path[-1].child]
+
+    frame = first = _first_frame(places[0], axes[0])
+    rows = [_row(joint) for joint in moving]
+    for i in range(len(rows) - 1):
+        rows[i] = _towards(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
+        frame = frame @ _ends(Chain('row', 'standard', (rows[i],)))[0]
+    rows[-1] = replace(rows[-1], d=_clean(float(frame[:3, 2] @ (tip - frame)[:3, 3])))
+    if convention == 'modified':
+        straight = Joint('straight')
+        rows = [
+            replace(row, a=before.a, alpha=before.alpha, beta=before.beta)
+            for before, row in zip([straight, *rows[:-1]], rows, strict=True)
+        ]
+    x, y, z = (_clean(-9.81 * part) for part in first[2, :3].tolist())
+    chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
+    ends = _ends(chain)
+    return replace(
+        chain,
+        joints=_with_masses(rows, ends, robot, moving, poses),
+        tool=Frame(se3.invert(ends[-1]) @ tip),
+    )
+
+
+def corrected_urdf(
+    text: str, chain: Chain, base_link: str | None = None, tip_link: str | None = None
+) -> str:
+    """Return a URDF whose forward kinematics between two links is that of a corrected arm.
+
+    Only `<origin>` of joints on the path is changed. Base and tool of the chain lead to the
+    measuring device and to its target, which are no parts of the robot: before the first axis and
+    behind the last frame the URDF's own transforms are kept. Errors of theta and d go into the
+    origin of their joint; what lies behind follows.
+
+    Parameters
+    ----------
+    text : str
+        The nominal URDF.
+    chain : Chain
+        The corrected chain, identified from that of this URDF and these links or an equal one.
+    base_link, tip_link : str, optional
+        As for `chain_from_urdf`.
+
+    Raises
+    ------
+    ConfigError
+        When the chain is not one of this arm, or has effects, which no URDF can hold.
+
+    """
+    nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
+    arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())
+    _refuse_others(arm, nominal)
+    robot = parse_urdf(text)
+    path = robot.path(base_link, tip_link)
+    poses = robot.poses(path[0].parent)
+    tip = arm.forward(np.zeros((1, len(arm.joints))))[0]
+    shifts = dict(zip(arm.joint_names, _on_axes(arm) @ se3.invert(_on_axes(nominal)), strict=True))
+
+    last, end = arm.joint_names[-1], path[-1].child
+    corrected, origins = {path[0].parent: np.eye(4)}, {}
+    for before, joint in zip([None, *path[:-1]], path, strict=True):
+        parent, pose = corrected[joint.parent], poses[joint.child]
+        if joint.moves:
+            pose = shifts[joint.name] @ pose
+        elif before is not None and before.name == last:
+            pose = tip @ se3.invert(poses[end]) @ pose
+        else:
+            pose = parent @ joint.origin
+        corrected[joint.child] = pose
+        origins[joint.name] = se3.invert(parent) @ pose
+    edited = with_origins(text, origins)
+    found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
+    q = arm.random_joints(POSES, np.random.default_rng(0))
+    if np.abs(found.forward(q) - arm.forward(q)).max() > EXACT:
+        raise ConfigError(
+            f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '
+            'that: let the tool frame be fitted instead, or add a fixed joint and a link'
+        )
+    return edited
+
+
+def _refuse_others(arm: Chain, nominal: Chain) -> None:
+    """Refuse a chain that is not a corrected one of the nominal arm."""
+    kinds = [[f'{joint.name} ({joint.type})' for joint in c.joints] for c in (arm, nominal)]
+    if kinds[0] != kinds[1]:
+        raise ConfigError(
+            f'the chain has the joints {", ".join(kinds[0])}, but the URDF has '
+            f'{", ".join(kinds[1])} between these links'
+        )
+    effects = [name for name, value in arm.effects if value]
+    if effects:
+        raise ConfigError(
+            f'a URDF cannot hold the effects {", ".join(effects)}, and without them the rest of '
+            'the chain is not accurate: identify with the model "geometric"'
+        )
+    q = nominal.random_joints(50, np.random.default_rng(0))
+    found, expected = arm.forward(q), nominal.forward(q)
+    shift = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1).mean()
+    turns = found[:, :3, :3] @ np.swapaxes(expected[:, :3, :3], 1, 2)
+    turn = np.linalg.norm(se3.log_rotation(turns), axis=1).mean()
+    if max(shift, turn) > FAR:
+        raise ConfigError(
+            f'the chain is not the arm of this URDF between these links: the poses differ by '
+            f'{shift:.3g} m and {turn:.3g} rad on average; identify again with the URDF as chain'
+        )
+
+
+def _row(joint: DescribedJoint) -> Joint:
+    """Return the row of a joint, without geometry."""
+    if joint.type == 'prismatic':
+        return Joint(joint.name, 'prismatic', lower=joint.lower, upper=joint.upper)
+    return Joint(joint.name, lower=joint.lower, upper=joint.upper)
+
+
+def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:
+    """Return a frame (4, 4) with z along an axis, near the origin and near x of the joint."""
+    across = joint[:3, 0] - axis * (axis @ joint[:3, 0])
+    if np.linalg.norm(across) < 0.1:  # the axis is the joint's x
+        across = joint[:3, 1] - axis * (axis @ joint[:3, 1])
+    x = across / np.linalg.norm(across)
+    foot = joint[:3, 3] - axis * (axis @ joint[:3, 3])
+    return se3.transform(np.column_stack([x, np.cross(axis, x), axis]), foot)
+
+
+def _towards(row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray) -> Joint:
+    """Return a standard row that leads from a frame on its axis to the next axis.
+
+    Of the two directions of its x the one within 90 degrees of the frame's is taken.
+    """
+    z = frame[:3, :3].T @ axis
+    p = frame[:3, :3].T @ (point - frame[:3, 3])
+    tilt = float(np.hypot(z[0], z[1]))
+    parallel = tilt < np.sin(PARALLEL_TOLERANCE)
+    if parallel:
+        x, y = p[:2] - p[2] / z[2] * z[:2]
+        d, a = 0.0, float(np.hypot(x, y))
+        theta = float(np.arctan2(y, x)) if _clean(a) else 0.0
+    else:
+        normal = np.array([-z[1], z[0]]) / tilt
+        d, a = float(p[2] - z[2] * (p[:2] @ z[:2]) / tilt**2), float(normal @ p[:2])
+        theta = float(np.arctan2(normal[1], normal[0]))
+    if _clean(np.cos(theta)) < 0.0:
+        theta, a = theta - np.copysign(np.pi, theta), -a
+    theta = _clean_angle(theta)
+    across = np.cos(theta) * z[1] - np.sin(theta) * z[0]
+    along = np.cos(theta) * z[0] + np.sin(theta) * z[1]
+    return replace(
+        row,
+        theta=theta,
+        d=_clean(d),
+        a=_clean(a),
+        alpha=_clean_angle(float(np.arctan2(-across, z[2]))),
+        beta=_clean_angle(float(np.arcsin(along))) if parallel else 0.0,
+    )
+
+
+def _clean(length: float) -> float:
+    """Return a length [m] as it was before sums of such were rounded."""
+    return round(length, DIGITS) + 0.0
+
+
+def _clean_angle(angle: float) -> float:
+    """Return an angle [rad] as it was; the right angle where it differs by rounding only."""
+    right = round(angle / (np.pi / 2)) * (np.pi / 2)
+    return _clean(angle) if _clean(angle - right) else right
+
+
+def _ends(chain: Chain) -> FloatArray:
+    """Return the frames (n, 4, 4) at the ends of the links at zero."""
+    links: list[tuple[list[FloatArray], FloatArray]] = []
+    chain.trace(np.zeros((len(chain.joints), 1)), links=links)
+    return np.array(
+        [
+            se3.transform(np.column_stack(axes), np.broadcast_to(origin, (3, 1))[:, 0])
+            for axes, origin in links
+        ]
+    )
+
+
+def _on_axes(chain: Chain) -> FloatArray:
+    """Return the frames (n, 4, 4) on the axes at zero, each behind theta and d of its row.
+
+    z is the axis about or along which the reported value moves.
+    """
+    frames = _ends(chain)
+    if chain.convention == 'standard':
+        for i, row in enumerate(chain.joints):
+            bend = replace(row, theta=0.0, d=0.0)
+            frames[i] = frames[i] @ se3.invert(_ends(Chain('bend', 'standard', (bend,)))[0])
+    signs = np.array([[1.0, row.sign, row.sign, 1.0] for row in chain.joints])
+    return np.asarray(frames * signs[:, np.newaxis, :])
+
+
+def _with_masses(
+    rows: Sequence[Joint],
+    ends: FloatArray,
+    robot: Description,
+    moving: Sequence[DescribedJoint],
+    poses: Mapping[str, FloatArray],
+) -> tuple[Joint, ...]:
+    """Return rows with the mass that each joint moves and the next does not, and its centre."""
+    number = {joint.child: i for i, joint in enumerate(moving)}
+    masses, moments = np.zeros(len(rows)), np.zeros((len(rows), 3))
+    for joint in robot.joints:  # from the root outwards
+        if joint.parent in number:
+            number.setdefault(joint.child, number[joint.parent])
+        if joint.child in number:
+            mass, centre = robot.links[joint.child]
+            masses[number[joint.child]] += mass
+            moments[number[joint.child]] += mass * (poses[joint.child] @ [*centre, 1.0])[:3]
+    loaded = []
+    for row, end, mass, moment in zip(rows, ends, masses.tolist(), moments, strict=True):
+        if mass:
+            x, y, z, _ = (se3.invert(end) @ [*(moment / mass), 1.0]).tolist()
+            row = replace(row, mass=mass, com=(x, y, z))
+        loaded.append(row)
+    return tuple(loaded)

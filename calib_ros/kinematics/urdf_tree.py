@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A robot's description (URDF) as a tree of links and joints, and origins back into its text.
+
+Origins are written into the text itself: everything else stays as it is, byte for byte.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from xml.parsers import expat
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import LARGEST_TEXT
+from calib_ros.values import LARGEST, parse_name
+
+MOVING = ('revolute', 'continuous', 'prismatic')
+TYPES = (*MOVING, 'fixed', 'floating', 'planar')
+USUAL_TIPS = ('tool0', 'flange')
+MOST_LINKS = 10_000
+"""Links, and joints, of a URDF."""
+SHORTEST_AXIS = 1e-9
+"""Largest component of a joint's axis that shows no direction."""
+UNCHANGED = 1e-13
+"""A position [m] or rotation that would change by less is left as it is written."""
+
+_DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedJoint:
+    """A joint of a URDF; `axis` is a unit vector in its frame, zero where nothing moves."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: FloatArray
+    axis: FloatArray
+    lower: float | None
+    upper: float | None
+    mimics: bool
+
+    @property
+    def moves(self) -> bool:
+        """Tell whether one number drives the joint."""
+        return self.type in MOVING
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A URDF: mass [kg] and centre (3,) [m] of its links, its joints from the root outwards."""
+
+    name: str
+    root: str
+    links: dict[str, tuple[float, FloatArray]]
+    joints: tuple[DescribedJoint, ...]
+
+    def path(self, base: str | None, tip: str | None) -> tuple[DescribedJoint, ...]:
+        """Return the joints from one link to another: by default from the root to the arm's end.
+
+        Raises
+        ------
+        ConfigError
+            When there is no serial chain of joints between them.
+
+        """
+        base = self.root if base is None else base
+        for link in (base, tip):
+            if link is not None and link not in self.links:
+                raise UnknownNameError('link', link, self.links)
+        tip = self._usual_tip(base) if tip is None else tip
+        leading = {joint.child: joint for joint in self.joints}
+        path: list[DescribedJoint] = []
+        while (link := path[-1].parent if path else tip) != base:
+            if link not in leading:
+                before = ', '.join([link, *(joint.child for joint in reversed(path))])
+                raise ConfigError(
+                    f'no joints lead from link "{base}" out to link "{tip}": choose base_link '
+                    f'among those before it, {before}'
+                )
+            path.append(leading[link])
+        path.reverse()
+        if not any(joint.moves for joint in path):
+            raise ConfigError(f'no joint moves between link "{base}" and link "{tip}"')
+        for joint in path:
+            does = 'mimics another' if joint.mimics else f'is {joint.type}'
+            if joint.mimics or joint.type in ('floating', 'planar'):
+                raise ConfigError(
+                    f'joint "{joint.name}" {does}: a serial chain has revolute, continuous, '
+                    'prismatic and fixed joints only, each driven alone; choose base_link and '
+                    'tip_link on one side of it'
+                )
+        return tuple(path)
+
+    def _usual_tip(self, base: str) -> str:
+        """Return the link at the end of the arm, if there is no doubt."""
+        behind, moved = {base}, set()
+        for joint in self.joints:
+            if joint.parent in behind:
+                behind.add(joint.child)
+                if joint.moves or joint.parent in moved:
+                    moved.add(joint.child)
+        for link in USUAL_TIPS:
+            if link in moved:
+                return link
+        parents = {joint.parent for joint in self.joints}
+        ends = [link for link in self.links if link in moved and link not in parents]
+        if len(ends) != 1:
+            found = f'ends in {", ".join(ends)}' if ends else f'moves nothing behind "{base}"'
+            raise ConfigError(f'the URDF {found}: name the tip_link of the arm (--tip-link)')
+        return ends[0]
+
+    def poses(self, base: str) -> dict[str, FloatArray]:
+        """Return the frames (4, 4) of all links behind a base at zero, in that of the base."""
+        poses = {base: np.eye(4)}
+        for joint in self.joints:
+            if joint.parent in poses:
+                poses[joint.child] = poses[joint.parent] @ joint.origin
+        return poses
+
+
+def parse_urdf(text: str) -> Description:
+    """Turn the text of a URDF into a tree of links and joints.
+
+    Raises
+    ------
+    ConfigError
+        When it is no URDF.
+
+    """
+    if _DOCTYPE.search(text):
+        raise ConfigError(
+            'the URDF has a <!DOCTYPE>, in which entities can stand for anything: remove it, no '
+            'URDF needs one'
+        )
+    if len(text) > LARGEST_TEXT:
+        raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError) as err:  # the latter for what UTF-8 cannot hold
+        raise ConfigError(f'the URDF is not valid XML: {err}') from err
+    if any('xacro' in element.tag.rpartition('}')[0] for element in root.iter()):
+        raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
+    if root.tag != 'robot':
+        raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>')
+    masses = [(element.get('name', ''), _inertial(element)) for element in root.findall('link')]
+    links = dict(masses)
+    described = root.findall('joint')
+    if max(len(masses), len(described)) > MOST_LINKS:
+        raise ConfigError(f'the URDF has more than {MOST_LINKS} links or joints')
+    joints = [_joint(element, links) for element in described]
+    for what, names in (
+        ('links are named', [name for name, _ in masses]),
+        ('joints are named', [joint.name for joint in joints]),
+        ('joints lead to link', [joint.child for joint in joints]),
+    ):
+        for name, count in Counter(names).items():
+            if count > 1:
+                raise ConfigError(f'two {what} "{name}" in the URDF')
+    children = {joint.child for joint in joints}
+    roots = [name for name in links if name not in children]
+    if len(roots) != 1:
+        found = ', '.join(roots) or 'none'
+        raise ConfigError(f'the links of a URDF are a tree with one root; roots here: {found}')
+    behind: dict[str, list[DescribedJoint]] = {}
+    for joint in joints:
+        behind.setdefault(joint.parent, []).append(joint)
+    outwards = list(behind.get(roots[0], ()))
+    for joint in outwards:  # grows
+        outwards += behind.get(joint.child, ())
+    if len(outwards) < len(joints):
+        reached = {joint.child for joint in outwards}
+        loop = ', '.join(joint.name for joint in joints if joint.child not in reached)
+        raise ConfigError(f'the links of a URDF are a tree; there is a loop among joints {loop}')
+    name = parse_name(root.get('name') or 'robot', 'the name of the robot')
+    return Description(name, roots[0], links, tuple(outwards))
+
+
+def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
+    name = parse_name(element.get('name', ''), 'the name of a joint')
+    kind = element.get('type', '')
+    where = f'joint "{name}"'
+    if kind not in TYPES:
+        raise UnknownNameError(f'type of {where}', kind, TYPES)
+    parent, child = (_child(element, key).get('link', '') for key in ('parent', 'child'))
+    for link in (parent, child):
+        if link not in links:
+            raise UnknownNameError(f'link at {where}', link, links)
+    axis = np.zeros(3)
+    if kind in MOVING:
+        axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
+        size = np.abs(axis).max()
+        if size < SHORTEST_AXIS:
+            raise ConfigError(f'the axis of {where} has no direction')
+        axis = axis / size
+        axis = axis / np.linalg.norm(axis)
+    lower, upper = None, None
+    limit = _child(element, 'limit')
+    if kind in ('revolute', 'prismatic') and {'lower', 'upper'} & set(limit.keys()):
+        lower, upper = (_limit(limit, key, where) for key in ('lower', 'upper'))
+    return DescribedJoint(
+        name=name,
+        type=kind,
+        parent=parent,
+        child=child,
+        origin=_origin(element, where),
+        axis=axis,
+        lower=lower,
+        upper=upper,
+        mimics=element.find('mimic') is not None,
+    )
+
+
+def _limit(element: ET.Element, key: str, where: str) -> float | None:
+    """Return a limit [rad or m]; none where it is as large as no arm moves."""
+    limit = float(_numbers(element, key, f'limit of {where}', '0', 1, math.inf)[0])
+    return limit if abs(limit) <= LARGEST else None
+
+
+def _inertial(link: ET.Element) -> tuple[float, FloatArray]:
+    """Return mass [kg] and centre (3,) [m] of a link in its frame."""
+    where = f'inertial of link "{link.get("name", "")}"'
+    inertial = _child(link, 'inertial')
+    mass = _numbers(_child(inertial, 'mass'), 'value', where, '0', 1)
+    return float(mass[0]), _origin(inertial, where)[:3, 3]
+
+
+def _origin(element: ET.Element, where: str) -> FloatArray:
+    origin = _child(element, 'origin')
+    xyz, rpy = (_numbers(origin, key, f'origin of {where}', '0 0 0') for key in ('xyz', 'rpy'))
+    return se3.transform(_from_rpy(rpy), xyz)
+
+
+def _child(element: ET.Element, tag: str) -> ET.Element:
+    """Return the first child of a kind, an empty one when there is none."""
+    found = element.find(tag)
+    return ET.Element(tag) if found is None else found
+
+
+def _numbers(
+    element: ET.Element,
+    key: str,
+    where: str,
+    default: str,
+    count: int = 3,
+    largest: float = LARGEST,
+) -> FloatArray:
+    text = element.get(key, default)
+    if '${' in text:
+        raise ConfigError(f'{key} in the {where} is a formula, "{text}": run xacro first')
+    try:
+        values = np.array([float(part) for part in text.split()])
+    except ValueError:
+        values = np.array([])
+    if len(values) != count or not np.isfinite(values).all():
+        what = f'{count} finite numbers' if count > 1 else 'a finite number'
+        raise ConfigError(f'{key} in the {where} must be {what}, not "{text}"')
+    if np.abs(values).max() > largest:
+        raise ConfigError(f'{key} in the {where} must be at most {largest:g}, not "{text}"')
+    return values
+
+
+def _from_rpy(rpy: FloatArray) -> FloatArray:
+    return np.asarray(Rotation.from_euler('xyz', rpy).as_matrix())
+
+
+# ---- back into the text
+
+_TAG = re.compile(r"""<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""")
+
+
+def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
+    """Return the text of a URDF with other origins (4, 4) of joints, all else as it is.
+
+    A joint without an origin gets one, first in it.
+    """
+    data = text.encode()
+    for start, tag, name in sorted(_places(data, origins), reverse=True):
+        before, rest = data[:start].decode(), data[start:].decode()
+        match = _TAG.match(rest)
+        assert match is not None  # without entities, an element begins where expat says
+        head, tail = rest[: match.end()], rest[match.end() :]
+        if tag == 'origin':
+            head = _with_origin(head, origins[name])
+        elif (added := _with_origin('<origin/>', origins[name])) != '<origin/>':
+            head += tail[: len(tail) - len(tail.lstrip())] + added
+        data = (before + head + tail).encode()
+    return data.decode()
+
+
+def _places(data: bytes, joints: Mapping[str, object]) -> list[tuple[int, str, str]]:
+    """Return where the origin of each joint starts, or else the joint: byte, tag, joint."""
+    places: dict[str, tuple[int, str, str]] = {}
+    above: list[str] = []
+    inside = ''
+    parser = expat.ParserCreate('utf-8')
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal inside
+        if [*above, tag] == ['robot', 'joint']:
+            inside = attributes.get('name', '')
+            places[inside] = (parser.CurrentByteIndex, tag, inside)
+        elif [*above, tag] == ['robot', 'joint', 'origin'] and places[inside][1] == 'joint':
+            places[inside] = (parser.CurrentByteIndex, tag, inside)
+        above.append(tag)
+
+    def end(tag: str) -> None:
+        above.pop()
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.Parse(data, True)
+    return [place for name, place in places.items() if name in joints]
+
+
+def _with_origin(tag: str, origin: FloatArray) -> str:
+    """Return the text of an origin's tag with another value; what stays is not touched."""
+    element = ET.fromstring(tag if tag.endswith('/>') else tag[:-1] + '/>')
+    xyz, rpy = (_numbers(element, key, 'origin', '0 0 0') for key in ('xyz', 'rpy'))
+    if np.abs(origin[:3, :3] - _from_rpy(rpy)).max() > UNCHANGED:
+        tag = _with_attribute(tag, 'rpy', _to_rpy(origin[:3, :3], rpy))
+    if np.abs(origin[:3, 3] - xyz).max() > UNCHANGED:
+        tag = _with_attribute(tag, 'xyz', origin[:3, 3])
+    return tag
+
+
+def _with_attribute(tag: str, key: str, values: FloatArray) -> str:
+    text = ' '.join(repr(round(value, 15) + 0.0) for value in values.tolist())
+    found = re.search(rf"""\s{key}\s*=\s*(["'])(.*?)\1""", tag, re.DOTALL)
+    if found is None:
+        return tag.replace('<origin', f'<origin {key}="{text}"', 1)
+    return tag[: found.start(2)] + text + tag[found.end(2) :]
+
+
+def _to_rpy(rotation: FloatArray, near: FloatArray) -> FloatArray:
+    """Return roll, pitch, yaw (3,) [rad] of a rotation; of the two solutions the nearer one.
+
+    The roll is that of the rotation behind yaw and pitch as they were found, so that the three
+    fit together near a pitch of 90 degrees, too, where yaw and roll alone are undetermined.
+    """
+    first = np.arctan2(rotation[1, 0], rotation[0, 0])
+    level = np.hypot(rotation[0, 0], rotation[1, 0])
+    solutions = []
+    for yaw, cosine in ((first, level), (first + np.pi, -level)):
+        across = np.array([-np.sin(yaw), np.cos(yaw), 0.0]) @ rotation
+        roll, pitch = np.arctan2(-across[2], across[1]), np.arctan2(-rotation[2, 0], cosine)
+        difference = np.array([roll, pitch, yaw]) - near
+        solutions.append(near + np.remainder(difference + np.pi, 2.0 * np.pi) - np.pi)
+    return min(solutions, key=lambda angles: float(np.abs(angles - near).sum()))

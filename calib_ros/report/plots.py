@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures: each function draws arrays into the Axes that it is given."""
+
+from __future__ import annotations
+
+from io import BytesIO
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from calib_ros.apply.placement import Placements
+from calib_ros.apply.workspace import Survey, rms_map
+from calib_ros.escapes import one_line
+from calib_ros.identification.identification import Identification
+from calib_ros.kinematics.se3 import FloatArray
+
+BEFORE_COLOUR, AFTER_COLOUR = '#d95f02', '#1b9e77'
+
+
+def draw_errors(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -> None:
+    """Draw the position error of every pose, before and after, with the RMS as a line."""
+    for name, errors, colour in (
+        ('before', before_mm, BEFORE_COLOUR),
+        ('after', after_mm, AFTER_COLOUR),
+    ):
+        rms = np.sqrt(np.mean(errors**2))
+        axes.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
+        axes.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
+    axes.set(xlabel='pose', ylabel='position error [mm]', xlim=(0, len(before_mm)))
+    axes.set_ylim(bottom=0.0)
+    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
+
+
+def draw_distribution(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -> None:
+    """Draw the share of poses with at most a given position error, before and after."""
+    for errors, colour in ((before_mm, BEFORE_COLOUR), (after_mm, AFTER_COLOUR)):
+        share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
+        axes.plot(np.sort(errors), share, color=colour, drawstyle='steps-post')
+    axes.set(xlabel='position error [mm]', ylabel='poses with at most this error [%]')
+    axes.set(xlim=(0, None), ylim=(0, 100))
+    axes.grid(alpha=0.3)
+
+
+def before_after_png(result: Identification) -> bytes:
+    """Return the figure of position errors before and after, on poses that were not fitted."""
+    comparison = result.validation or result.fitted
+    before, after = (
+        1e3 * np.linalg.norm(residuals.position[comparison.judged], axis=1)
+        for residuals in (comparison.before, comparison.after)
+    )
+    figure = Figure(figsize=(10.0, 3.8), layout='constrained')
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    draw_errors(left, before, after)
+    draw_distribution(right, before, after)
+    title = f'{one_line(result.chain.name)}, judged by {result.validated_by}'
+    figure.suptitle(title, parse_math=False)
+    return _png(figure)
+
+
+def draw_histogram(axes: Axes, errors_mm: FloatArray, label: str) -> None:
+    """Draw how often an error comes, with its 50th and 95th percentile."""
+    axes.hist(errors_mm, bins=60, color=AFTER_COLOUR, alpha=0.7)
+    for share, style in ((0.5, '-'), (0.95, '--')):
+        value = float(np.quantile(errors_mm, share))
+        axes.axvline(value, color='black', linestyle=style, label=f'{share:.0%}: {value:.3f} mm')
+    axes.set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
+    axes.legend(frameon=False)
+
+
+def draw_map(
+    axes: Axes,
+    edges: tuple[FloatArray, FloatArray],
+    errors_mm: FloatArray,
+    labels: tuple[str, str],
+) -> None:
+    """Draw errors (rows, columns) over the cells of two coordinates with such edges [m]."""
+    mesh = axes.pcolormesh(*edges, errors_mm.T, cmap='viridis', rasterized=True)
+    axes.figure.colorbar(mesh, ax=axes, label='RMS [mm]')
+    axes.set(xlabel=f'{labels[0]} [m]', ylabel=f'{labels[1]} [m]', aspect='equal')
+
+
+def draw_placements(
+    axes: Axes,
+    positions: FloatArray,
+    errors_mm: FloatArray,
+    marks: tuple[int, int],
+    labels: tuple[str, str],
+) -> None:
+    """Draw the errors (M,) of placements at (M, 2) [m], the least in front; mark two of them."""
+    order = np.argsort(-errors_mm)
+    x, y = positions[order].T
+    dots = axes.scatter(x, y, c=errors_mm[order], s=60, cmap='viridis', rasterized=True)
+    axes.figure.colorbar(dots, ax=axes, label='expected error [mm]')
+    for mark, name, shape in zip(marks, ('best', 'centre'), ('*', 'X'), strict=True):
+        label = f'{name}: {errors_mm[mark]:.3f} mm'
+        axes.plot(*positions[mark], shape, color='red', markersize=11, mec='white', label=label)
+    axes.set(xlabel=f'{labels[0]} [m]', ylabel=f'{labels[1]} [m]', aspect='equal')
+    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)
+
+
+def workspace_png(survey: Survey) -> bytes:
+    """Return the figure of a survey: what the calibration removes and, if known, what remains."""
+    rows = [('removed by the calibration', survey.removed)]
+    if not np.isnan(survey.sigma).any():
+        rows.append(('sigma of what remains', survey.sigma))
+    x, y, z = survey.positions.T
+    low, high = np.quantile(z, [0.4, 0.6])
+    level = (low <= z) & (z <= high)
+    figure = Figure(figsize=(13.0, 4.0 * len(rows)), layout='constrained')
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(rows), 3, squeeze=False)
+    for axes, (label, errors) in zip(grid, rows, strict=True):
+        draw_histogram(axes[0], 1e3 * errors, label)
+        axes[1].set_title('all directions')
+        axes[2].set_title(f'height {low:.2f} to {high:.2f} m')
+        for place, pair, part, labels in (
+            (axes[1], (np.hypot(x, y), z), 1e3 * errors, ('radius', 'height')),
+            (axes[2], (x[level], y[level]), 1e3 * errors[level], ('x', 'y')),
+        ):
+            first, second, rms = rms_map(*pair, part)
+            draw_map(place, (first, second), rms, labels)
+    return _png(figure)
+
+
+def placements_png(placements: Placements) -> bytes:
+    """Return the map of a task's placements from above and from two sides."""
+    reached = np.flatnonzero(~np.isnan(placements.errors))
+    marks = (
+        int(np.flatnonzero(reached == placements.best)[0]),
+        int(np.flatnonzero(reached == placements.centre)[0]),
+    )
+    figure = Figure(figsize=(15.0, 4.5), layout='constrained')
+    FigureCanvasAgg(figure)
+    for axes, pair in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
+        labels = ('xyz'[pair[0]], 'xyz'[pair[1]])
+        positions = placements.positions[reached][:, pair]
+        draw_placements(axes, positions, 1e3 * placements.errors[reached], marks, labels)
+    return _png(figure)
+
+
+def _png(figure: Figure) -> bytes:
+    image = BytesIO()
+    figure.savefig(image, format='png', dpi=120)
+    return image.getvalue()

@@ -1,0 +1,420 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A result in words and tables: a line for the operator, Markdown, JSON, the corrected chain."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+
+import calib_ros
+from calib_ros.escapes import in_markdown
+from calib_ros.identification.identification import Identification, Noise, Outlier
+from calib_ros.identification.region import Region
+from calib_ros.identification.validation import Comparison, ErrorFigures, Parameter
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record
+from calib_ros.sampling.calibration import Calibration
+from calib_ros.settings import Settings
+
+HOLDS = 1.5
+"""A calibration whose error on new samples has grown by more does not hold."""
+MOST_OUTLIERS = 5
+"""Outliers that an answer names."""
+WEAK = 0.01
+"""A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
+
+
+def summary(result: Identification, numbers: Mapping[Outlier, int] | None = None) -> str:
+    """Return the one line that an operator reads.
+
+    With the `numbers` of the samples that are outliers these are named.
+    """
+    before, after = (result.validation or result.fitted).figures
+    text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
+    text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
+    if result.unidentifiable:
+        text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
+    if result.outliers:
+        if numbers is None:
+            text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+        else:
+            named = _outliers_in_words(result.outliers, numbers)
+            text += f'; {len(result.outliers)} outliers carry no weight: {named}'
+    if result.chain.effects:
+        groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
+        text += f'; with {len(result.chain.effects)} effects ({", ".join(groups)})'
+    given = set(result.priors) - set(result.weak)
+    if given:
+        text += f'; priors on {len(given)} parameters'
+    if result.region is not None:
+        text += f'; {result.region.in_words()}'
+    if result.weak:
+        text += f'; hardly determined, held near nominal by priors: {", ".join(result.weak)}'
+    weak = [name for name in weakly_determined(result) if name not in result.weak]
+    if weak:
+        text += f'; weakly determined: {", ".join(weak)}'
+    if result.remarks:
+        text += f'; note: {"; ".join(result.remarks)}'
+    if result.accepted:
+        return f'accepted: {text}'
+    return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
+
+
+def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
+    """Return the numbers and stamps [s] of outliers, the largest first."""
+    largest = sorted(outliers, key=lambda each: -each.size)
+    words = [
+        f'sample {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
+        for each in largest[:MOST_OUTLIERS]
+    ]
+    if len(largest) > MOST_OUTLIERS:
+        words.append(f'and {len(largest) - MOST_OUTLIERS} more')
+    return ', '.join(words)
+
+
+def weakly_determined(result: Identification) -> tuple[str, ...]:
+    """Return the fitted parameters that are hardly known: judge them by predictions only."""
+    return tuple(p.name for p in result.parameters if p.std is not None and p.std > WEAK)
+
+
+def provenance(result: Identification) -> dict[str, Any]:
+    """Return where the numbers of a corrected chain come from, as plain values."""
+    before, after = (result.validation or result.fitted).figures
+    return {
+        'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+        'software': f'calib_ros {calib_ros.__version__}',
+        'accepted': result.accepted,
+        'world_frame': result.world_frame,
+        'samples': len(result.fitted.judged),
+        'outliers': len(result.outliers),
+        'validated_by': result.validated_by,
+        'rms_mm_before': round(before.rms_mm, 6),
+        'rms_mm_after': round(after.rms_mm, 6),
+        'not_identifiable': list(result.unidentifiable),
+        'nominal': nominal_record(result.before),
+        'region': None if result.region is None else result.region.document(),
+    }
+
+
+def calibration_yaml(result: Identification, origin: Mapping[str, Any] | None = None) -> str:
+    """Return the corrected chain as the text of a chain file, which can be an input again.
+
+    `origin` says where the samples come from.
+    """
+    head = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
+    return head + dump_chain(result.chain, provenance(result) | dict(origin or {}))
+
+
+def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
+    """Return the configuration as a parameter file, with which a node does the same again.
+
+    `more` are parameters of the node besides the settings.
+    """
+    parameters: dict[str, Any] = {'chain': chain, **more}
+    for name, value in asdict(settings).items():
+        parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
+    return dump_yaml({'/**': {'ros__parameters': parameters}})
+
+
+def verdict(
+    calibration: Calibration | None, now: ErrorFigures, nominal: ErrorFigures | None
+) -> tuple[bool, str]:
+    """Return whether a calibration still holds on new samples, and why in words."""
+    text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
+    text += f'{now.count} samples taken since'
+    if nominal is not None:
+        text += f'; the nominal chain has {nominal.rms_mm:.3f} mm'
+    judged = None if calibration is None else calibration.rms_mm
+    if judged is None:
+        return True, text
+    if now.rms_mm > HOLDS * judged:
+        return False, (
+            f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '
+            'tracker, the target or the robot moved?'
+        )
+    return True, f'the calibration holds: {text}; it had {judged:.3f} mm'
+
+
+def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
+    """Return the result as one JSON document; `samples` is what became of the input."""
+
+    def comparison(which: Comparison | None) -> dict[str, Any] | None:
+        if which is None:
+            return None
+        before, after = which.figures
+        with_outliers = which.figures_of_all[1]
+        return {
+            'before': asdict(before),
+            'after': asdict(after),
+            'outliers': which.outliers,
+            'after_with_outliers': asdict(with_outliers),
+        }
+
+    validation = comparison(result.validation)
+    return {
+        'converged': result.converged,
+        'accepted': result.accepted,
+        'refusals': list(result.refusals),
+        'remarks': list(result.remarks),
+        'iterations': result.iterations,
+        'rank': result.rank,
+        'unidentifiable': list(result.unidentifiable),
+        'not_excited': list(result.not_excited),
+        'weakly_determined': list(weakly_determined(result)),
+        'held_near_nominal': list(result.weak),
+        'parameters': {
+            p.name: {
+                'value': p.value,
+                'offset': p.offset,
+                'std': p.std,
+                'half_width_95': p.half_width(0.95),
+                'unit': unit(p.name),
+                'status': p.status,
+            }
+            for p in result.parameters
+        },
+        'fitted': comparison(result.fitted),
+        'validation': None if validation is None else {'by': result.validated_by, **validation},
+        'before_is': BEFORE,
+        'noise_in_sigma': asdict(result.noise),
+        'chance_of_gain': result.chance,
+        'outliers': [asdict(outlier) for outlier in result.outliers],
+        'gauges': result.gauges,
+        'covariance': {'names': list(result.names), 'matrix': result.covariance.tolist()},
+        'correlated': [list(pair) for pair in result.correlated()],
+        'observability': asdict(result.observability),
+        'predicted_sigma_mm': sigma_over_range(result),
+        'sizes': dict(result.posterior.sizes),
+        'region': None if result.region is None else region_figures(result.region),
+        'priors': result.priors,
+        'effects': dict(result.chain.effects),
+        'verdicts': [asdict(verdict) for verdict in result.verdicts],
+        'step': None if result.step is None else asdict(result.step),
+        'samples': samples,
+        'robot': result.chain.name,
+        'versions': {
+            'calib_ros': calib_ros.__version__,
+            'python': platform.python_version(),
+            'numpy': np.__version__,
+        },
+    }
+
+
+def region_figures(region: Region) -> dict[str, Any]:
+    """Return where a calibration may be used, in figures; the limit is None for everywhere."""
+    limit = None if region.whole else 1e3 * region.limit
+    return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
+
+
+BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
+
+
+def unit(name: str) -> str:
+    """Return the unit of a parameter."""
+    kind = name.partition('.')[2]
+    if kind == DELAY:
+        return 's'
+    if kind in DH_KINDS or kind in FRAME_KINDS:
+        return 'm' if is_length(name) else 'rad'
+    return effects.unit(name)
+
+
+def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]) -> str:
+    """Return the report that is kept with a calibration."""
+    lines = [
+        f'# Calibration of {in_markdown(result.chain.name)}',
+        '',
+        f'**{in_markdown(summary(result))}**',
+        '',
+    ]
+    lines += [f'- warning: {in_markdown(each)}' for each in (*warnings, *result.remarks)]
+    lines += [
+        f'- {in_markdown(key)}: {in_markdown(value)}'
+        for key, value in samples.items()
+        if value not in (0, {}, None)
+    ]
+    lines += [
+        f'- converged: {"yes" if result.converged else "no"}, {result.iterations} iterations',
+        f'- {result.rank} parameters fitted; {noise_in_words(result)}',
+        *(f'- {in_markdown(each)}' for each in chance_in_words(result)),
+        *(f'- {in_markdown(each)}' for each in priors_in_words(result)),
+        '',
+        '## Accuracy',
+        '',
+        f'"Before" is {BEFORE}. Validated by {result.validated_by}.',
+        '',
+        '| poses | | number | RMS [mm] | mean | max | mean + 3 sigma | RMS [mrad] |',
+        '|---|---|---|---|---|---|---|---|',
+    ]
+    for label, which in (('fitted', result.fitted), ('not fitted', result.validation)):
+        if which is not None:
+            lines += map(_figures_row, (label, label), ('before', 'after'), which.figures)
+            if which.outliers:
+                lines.append(_figures_row(label, 'after, with outliers', which.figures_of_all[1]))
+    if result.outliers:
+        lines += ['', '## Outliers', '', 'They carry no or little weight. Size: in usual errors.']
+        lines += ['', '| set | sample | stamp [ns] | size |', '|---|---|---|---|']
+        lines += [
+            f'| {o.set} | {o.sample} | {o.stamp_ns} | {o.size:.1f} |' for o in result.outliers
+        ]
+    if result.verdicts:
+        lines += [
+            '',
+            '## Non-geometric effects',
+            '',
+            'RMS on configurations left out.',
+        ]
+        lines += ['', '| | before [mm] | with it [mm] | pays for itself |', '|---|---|---|---|']
+        lines += [
+            f'| {in_markdown(v.what)} | {v.rms_mm_before:.4f} | {v.rms_mm_after:.4f} | '
+            f'{"yes" if v.pays else "no"} |'
+            for v in result.verdicts
+        ]
+    lines += ['', '## What the poses determine', '']
+    lines += [f'- {in_markdown(each)}' for each in identifiability_in_words(result)]
+    lines += ['', '## Parameters', '']
+    lines += ['Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.', '']
+    lines += [
+        '| parameter | value [m, rad] | offset | std | 95 % | |',
+        '|---|---|---|---|---|---|',
+    ]
+    lines += [_parameter_row(parameter) for parameter in result.parameters]
+    lines += [
+        '',
+        'gauge: redundant by the structure of the chain, kept nominal. not excited: the poses do '
+        'not determine it, kept nominal. fixed: held on request.',
+        '',
+    ]
+    return '\n'.join(lines)
+
+
+def priors_in_words(result: Identification) -> list[str]:
+    """Return the priors, those of effects by group."""
+    known = dict(result.chain.effects)
+    why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
+    lines = [
+        f'prior on {name}: {sigma:.3g} {unit(name)}{why.get(name, "")}'
+        for name, sigma in result.priors.items()
+        if name not in known
+    ]
+    groups: dict[str, list[str]] = {}
+    for name in known:
+        groups.setdefault(effects.group_of(name), []).append(name)
+    for group, names in groups.items():
+        sigma, of = result.priors[names[0]], unit(names[0])
+        lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
+    return lines
+
+
+def sigma_over_range(result: Identification) -> dict[str, float]:
+    """Return how well positions are predicted over the whole joint range [mm]."""
+    sigma = 1e3 * result.predicted_sigma()
+    return {'median': float(np.median(sigma)), 'max': float(sigma.max())}
+
+
+def noise_in_words(result: Identification) -> str:
+    """Return how large the residuals are against the sigmas given."""
+    noise = result.noise
+    text = f'residuals are {noise.position:.2f} times the sigma of position'
+    if noise.orientation is not None:
+        text += f' and {noise.orientation:.2f} times that of orientation'
+    if noise.consistent:
+        text += ', which a chi-squared test lets pass'
+    else:
+        text += '; the sigmas given are wrong, standard deviations follow the residuals'
+    return f'{text}; {neighbours_in_words(noise)}'
+
+
+NEIGHBOURS = {
+    'successive': 'measured in succession',
+    'near': 'near each other in joint space',
+}
+
+
+def neighbours_in_words(noise: Noise) -> str:
+    """Return which neighbours share errors, by how much, and what follows."""
+    if not noise.shared:
+        return 'neighbouring configurations share no errors that a test would find'
+    parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
+    return (
+        f'configurations {" and ".join(parts)} share errors, as of a drifting tracker or of '
+        'effects that the model lacks, and count for fewer: standard deviations are '
+        f'{noise.widened:.1f} times those of independent errors'
+    )
+
+
+def chance_in_words(result: Identification) -> list[str]:
+    """Return how well the gain stands against errors in succession, where that can be told."""
+    if result.chance is None:
+        return []
+    return [
+        f'moved in time against the joint values, residuals are explained as well in '
+        f'{100.0 * result.chance:.1f} % of the shifts: the chance that a drift passes for the gain'
+    ]
+
+
+def identifiability_in_words(result: Identification) -> list[str]:
+    """Return which parameters trade against which, which are weak, and the indices."""
+    lines = []
+    for name, partners in result.gauges.items():
+        if partners:
+            lines.append(f'{name} against {", ".join(partners)}: only their combination shows')
+        else:
+            lines.append(f'{name}: no measured pose depends on it')
+    weak = weakly_determined(result)
+    if weak:
+        lines.append(f'weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}')
+    for first, second, value in result.correlated():
+        lines.append(f'{first} and {second} are correlated by {value:+.3f}')
+    sigma = sigma_over_range(result)
+    lines.append(
+        f'one sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
+        f'(median), {sigma["max"]:.3f} mm at most'
+    )
+    lines.append(f'observability {observability_in_words(result)}')
+    return lines
+
+
+def observability_in_words(result: Identification) -> str:
+    """Return the observability indices."""
+    o = result.observability
+    return f'O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
+
+
+def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
+    turn = '' if figures.rms_mrad is None else f'{figures.rms_mrad:.3f}'
+    return (
+        f'| {label} | {when} | {figures.count} | {figures.rms_mm:.3f} | {figures.mean_mm:.3f} | '
+        f'{figures.max_mm:.3f} | {figures.mean_plus_3_sigma_mm:.3f} | {turn} |'
+    )
+
+
+def _parameter_row(p: Parameter) -> str:
+    width = p.half_width(0.95)
+    std = '' if p.std is None else f'{1e3 * p.std:.4f}'
+    within = '' if width is None else f'{1e3 * width:.4f}'
+    offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
+    note = '' if p.status == 'fitted' else p.status
+    return f'| {in_markdown(p.name)} | {p.value:.9f} | {offset} | {std} | {within} | {note} |'
+
+
+def against_truth(result: Identification, truth: Chain) -> str:
+    """Return a table of the fitted joint parameters beside those of the true chain."""
+    width = max(len(name) for name in result.names)
+    rows = [f'  {"parameter":{width}}     true   identified        std   deviation']
+    for p in result.parameters:
+        if p.std is None or p.name.partition('.')[0] in ('base', 'tool'):
+            continue
+        true = truth.value(p.name) - (p.value - p.offset)
+        rows.append(
+            f'  {p.name:{width}} {1e3 * true:+8.3f}   {1e3 * p.offset:+10.3f}   {1e3 * p.std:8.4f}'
+            f'   {(p.offset - true) / p.std:+6.1f} std'
+        )
+    return '\n'.join(rows)

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node offers around an identification: where to go next, how good where, corrections.
+
+    ~/next_pose          where to measure next, after every sample
+    ~/workspace_error    the errors over the workspace, after every accepted identification
+    ~/joint_trajectory   -> ~/compensated_joint_trajectory
+
+All of it is computed on one thread of its own, piece by piece: messages are taken meanwhile. On
+one core the next pose takes about 15 ms, the cloud 60 ms, 10,000 points of a trajectory 0.1 s, and
+0.3 s with velocities.
+"""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState, PointCloud2
+from trajectory_msgs.msg import JointTrajectory
+
+from calib_ros.apply.candidates import draw_candidates
+from calib_ros.apply.compensation import Compensator, compensate_program, in_words
+from calib_ros.apply.design import Design
+from calib_ros.apply.planning import next_pose
+from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.errors import CalibrationError, InputError
+from calib_ros.files.trajectories import RATES, trajectory_program
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.observations import STILL
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.ros import to_ros
+from calib_ros.sampling.calibration import Calibration
+from calib_ros.sampling.cdr import trajectory_size
+from calib_ros.sampling.live import Estimate
+from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.session import CalibrationSession
+
+CANDIDATES = 300
+"""Random poses among which the next one is looked for, where no file gives any."""
+TASK = 100
+"""Random poses at which the arm is to be accurate."""
+CLOUD = 10_000
+"""Points of the cloud of errors."""
+MOST_POINTS = 50_000
+"""Points of a trajectory; a longer one is refused."""
+MOST_JOINTS = 1000
+"""Joints that a trajectory names; one of more is refused."""
+MOST_BYTES = 20_000_000
+"""Size of a serialised trajectory; 50,000 points of ten joints with all rates take 18 MB."""
+MOST_WAITING = 10
+"""Trajectories that may wait; those that come on top are refused."""
+MOST_REASONS = 3
+"""Refused points whose reasons are told."""
+
+
+class Guide:
+    """Publishes what helps before and after an identification.
+
+    Parameters
+    ----------
+    node : Node
+    session : CalibrationSession
+    latched : QoSProfile
+        For topics whose last message a late subscriber gets.
+    guarded : callable
+        Makes a function of one that logs what it raises.
+    candidates : (N, n), optional
+        Joint values among which the next pose is chosen; random ones within the limits if None.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        session: CalibrationSession,
+        latched: QoSProfile,
+        guarded: Callable[[Callable[..., None]], Callable[..., None]],
+        candidates: FloatArray | None,
+    ) -> None:
+        self._node, self._session, self._guarded = node, session, guarded
+        self._candidates = candidates
+        self._pool = ThreadPoolExecutor(1)
+        self._pending: set[Future[None]] = set()
+        self._lock = threading.Lock()
+        self._advised: tuple[Sample, ...] = ()
+        self._advising: Future[None] | None = None
+        self._compensator: tuple[Calibration, Compensator] | None = None
+        self._last_trajectory = ''
+        self._next_pose = node.create_publisher(JointState, '~/next_pose', latched)
+        self._errors = node.create_publisher(PointCloud2, '~/workspace_error', latched)
+        self._corrected = node.create_publisher(
+            JointTrajectory, '~/compensated_joint_trajectory', 10
+        )
+        node.create_subscription(
+            JointTrajectory,
+            '~/joint_trajectory',
+            self._guarded(self._on_trajectory),
+            10,
+            raw=True,  # see `_too_large`
+        )
+
+    def join(self, timeout: float) -> bool:
+        """Begin nothing more and wait [s] for what runs; return whether it has ended."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        running = [each for each in self._pending if not each.cancelled()]
+        return not wait(running, timeout).not_done
+
+    def figures(self) -> dict[str, Any]:
+        """Return for the diagnostics how far it has come, and what became of trajectories."""
+        estimate = self._session.estimate
+        wanted = self._session.settings.wanted_accuracy
+        known = {} if estimate is None else {'expected [mm]': f'{1e3 * estimate.sigma:.4f}'}
+        enough = estimate is not None and estimate.sigma <= wanted
+        return known | {'enough samples': enough, 'last trajectory': self._last_trajectory}
+
+    def advise(self) -> None:
+        """Look for the next pose if there are samples that it was not looked for with."""
+        busy = self._advising is not None and not self._advising.done()
+        if busy or self._session.settings.mode == 'continuous':
+            return
+        samples = tuple(self._session.usable)
+        if samples == self._advised or all(sample.validation for sample in samples):
+            return
+        self._advised = samples
+        problem = self._session.problem_of(samples)
+        self._advising = self._start(self._advise, problem, self._session.estimate)
+
+    def show(self, result: Identification) -> None:
+        """Publish the errors over the workspace of an accepted identification."""
+        self._start(self._show, result)
+
+    def _start(self, work: Callable[..., None], *arguments: Any) -> Future[None]:
+        with self._lock:  # an identification calls from a thread of its own
+            future = self._pool.submit(self._guarded(work), *arguments)
+            self._pending = {each for each in self._pending if not each.done()} | {future}
+        return future
+
+    def _advise(self, problem: Problem, estimate: Estimate | None) -> None:
+        try:
+            design = Design.of(problem, estimate)
+        except InputError:  # distances: there is nothing to plan with
+            return
+        taken = np.concatenate([each.joints for each in problem.sets])
+        if estimate is None:
+            design = design.after(taken)
+        rng = np.random.default_rng(len(taken))
+        candidates = self._candidates
+        if candidates is None:
+            candidates = draw_candidates(design, CANDIDATES, rng)
+        apart = np.abs(candidates[:, np.newaxis] - taken).max(axis=2).min(axis=1)
+        candidates = candidates[apart > STILL]
+        if len(candidates):
+            task = design.chain.random_joints(TASK, rng)
+            found = next_pose(design, candidates, task, self._session.settings.wanted_accuracy)
+            self._next_pose.publish(
+                to_ros.joints(self._session.joint_names, found.joints, self._now())
+            )
+
+    def _show(self, result: Identification) -> None:
+        found = survey(CalibratedArm.of(result), CLOUD, np.random.default_rng(0))
+        points = found.cloud
+        base = result.chain.frame('base').matrix
+        points[:, :3] = points[:, :3] @ base[:3, :3].T + base[:3, 3]
+        self._errors.publish(
+            to_ros.cloud(
+                ('x', 'y', 'z', 'error', 'sigma'), points, result.world_frame, self._now()
+            )
+        )
+
+    def _on_trajectory(self, data: bytes) -> None:
+        if sum(not each.done() for each in self._pending) > MOST_WAITING:
+            self._refuse(f'{MOST_WAITING} others wait already, send them more slowly')
+        elif too_large := _too_large(data):
+            self._refuse(too_large)
+        else:
+            self._start(self._correct, data, self._session.calibration)
+
+    def _correct(self, data: bytes, calibration: Calibration | None) -> None:
+        """Publish a corrected trajectory, or nothing at all and log why."""
+        try:
+            message = deserialize_message(data, JointTrajectory)
+            corrected, self._last_trajectory = self._corrected_by(message, calibration)
+        except CalibrationError as err:
+            self._refuse(str(err))
+        else:
+            self._corrected.publish(corrected)
+
+    def _refuse(self, reason: str) -> None:
+        self._last_trajectory = f'refused: {reason}'
+        self._node.get_logger().warning(f'trajectory {self._last_trajectory}')
+
+    def _corrected_by(self, message: Any, calibration: Calibration | None) -> tuple[Any, str]:
+        if calibration is None:
+            raise InputError(
+                'there is no accepted calibration to correct it by: call ~/identify or ~/load'
+            )
+        compensator = self._compensator_of(calibration)
+        robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
+        program = trajectory_program(
+            [robot.get(name, name) for name in message.joint_names],
+            [{key: list(getattr(point, key)) for key in RATES} for point in message.points],
+            'the trajectory',
+        )
+        corrected, result = compensate_program(compensator, program)
+        words = in_words(compensator, result)
+        if result.refusals:
+            reasons = [
+                f'point {each.sample + 1}: {each.reason}'
+                for each in result.refusals[:MOST_REASONS]
+            ]
+            if len(result.refusals) > MOST_REASONS:
+                reasons.append(f'and {len(result.refusals) - MOST_REASONS} more')
+            raise InputError('; '.join([words, *reasons]))
+        if calibration.result is not None:
+            arm = CalibratedArm.of(calibration.result)
+            known, warning = arm.knowledge(result.joints, result.orientation_before)
+            words = f'{words}; {known}'
+            if warning:
+                words = f'{words}; {warning}'
+                self._node.get_logger().warning(f'trajectory: {warning}')
+        answer = copy.deepcopy(message)
+        for key in RATES:
+            values = getattr(corrected, key)
+            if values is not None:
+                for point, row in zip(answer.points, values.tolist(), strict=True):
+                    setattr(point, key, row)
+        return answer, words
+
+    def _compensator_of(self, calibration: Calibration) -> Compensator:
+        """Return the compensator of a calibration, made anew for a new one."""
+        if self._compensator is None or self._compensator[0] is not calibration:
+            made = Compensator(self._session.chain, calibration.chain, region=calibration.region)
+            self._compensator = (calibration, made)
+        return self._compensator[1]
+
+    def _now(self) -> Any:
+        return self._node.get_clock().now().to_msg()
+
+
+def _too_large(data: bytes) -> str:
+    """Return in words what a serialised trajectory has too much of; empty when it can be decoded.
+
+    To decode a million points takes many seconds, and no other thread runs meanwhile.
+    """
+    names, points = trajectory_size(data)
+    for count, most, what in (
+        (len(data), MOST_BYTES, 'bytes'),
+        (names, MOST_JOINTS, 'joints'),
+        (points, MOST_POINTS, 'points'),
+    ):
+        if count > most:
+            return f'{count} {what}, at most {most} are taken'
+    return ''

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The frames that a calibration has found, on /tf_static, where their names are given."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from calib_ros.errors import ConfigError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.ros.parameters import FrameNames
+
+
+class Broadcast:
+    """Publishes where the arm stands, and where on its flange the target is.
+
+    The arm's base and flange are the links of the URDF that the chain lies between, if the chain
+    is that of a URDF; else the frames before and behind the DH table. Of a camera on the flange
+    the base leads to the target that stands, and the tool to the camera.
+
+    Parameters
+    ----------
+    node : Node
+    names : FrameNames
+        Without a name nothing is published of a frame.
+    in_hand : bool
+        The device is on the flange.
+    urdf, links
+        The URDF of the robot, or '', and its links.
+    latched : QoSProfile
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        names: FrameNames,
+        in_hand: bool,
+        urdf: str,
+        links: Mapping[str, str | None],
+        latched: QoSProfile,
+    ) -> None:
+        self._node, self._names, self._in_hand = node, names, in_hand
+        self._publisher = None
+        if not any(names[:2]):
+            return
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as err:
+            raise ConfigError(
+                f'base_frame and flange_frame need tf2_msgs ({err}): apt install '
+                'ros-jazzy-tf2-msgs, or leave them empty'
+            ) from err
+        self._type = TFMessage
+        self._publisher = node.create_publisher(TFMessage, '/tf_static', latched)
+        self._base = self._tool = np.eye(4)
+        if urdf:
+            described = chain_from_urdf(urdf, **links)
+            self._base = described.frame('base').matrix
+            self._tool = described.frame('tool').matrix
+
+    def publish(self, chain: Chain, world: str) -> None:
+        """Publish the frames of a calibrated chain whose measurements are in a frame `world`."""
+        if self._publisher is None:
+            return
+        names, transforms = self._names, []
+        stands, moves = (names.target, world) if self._in_hand else (world, names.target)
+        if not world:
+            self._node.get_logger().warning('the measurements name no frame: /tf_static lacks it')
+        if names.base and stands:
+            base = chain.frame('base').matrix @ se3.invert(self._base)
+            transforms.append(self._transform(stands, names.base, base))
+        if names.flange and moves:
+            tool = se3.invert(self._tool) @ chain.frame('tool').matrix
+            transforms.append(self._transform(names.flange, moves, tool))
+        self._publisher.publish(self._type(transforms=transforms))
+
+    def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:
+        message = TransformStamped(child_frame_id=child)
+        message.header.frame_id = parent
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        shift, turn = message.transform.translation, message.transform.rotation
+        shift.x, shift.y, shift.z = matrix[:3, 3].tolist()
+        turn.x, turn.y, turn.z, turn.w = se3.to_quat(matrix[:3, :3]).tolist()
+        return message

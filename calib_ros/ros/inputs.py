@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The topics that the node hears, and how well it hears them.
+
+Messages wait in the queues of their subscriptions, serialised, until they are taken by the batch:
+no executor may serve these subscriptions.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+
+from calib_ros.errors import ConfigError
+from calib_ros.sampling.intake import Stream, links_of
+
+INPUT_QUEUE = 2000
+"""Messages of a topic that may wait while the node is busy; what comes on top is lost."""
+MOST_LOST = 2**30
+"""Messages that may get lost between two reports of DDS: two weeks of 1 kHz."""
+SILENCE = 5.0
+"""A source that has been heard before and is silent for so long [s] is reported."""
+
+
+@dataclass
+class Hearing:
+    """What has been heard on one topic; times [s] are those of the monotonic clock."""
+
+    count: int = 0
+    before: int = 0
+    rate: float = 0.0
+    last: float | None = None
+    deaf: str = ''
+    """What a publisher offers that is not what is asked for, in words."""
+    latched: bool = False
+    """True when it comes once and not again."""
+    lost: int = 0
+    """Messages that got lost on the way, as DDS tells by their numbers."""
+    told: int = 0
+    """The total of which DDS told last."""
+    full: int = 0
+    """How often the queue was found full, so that messages may be lost."""
+    lost_before: int = 0
+    losing: bool = False
+    """True when either has grown between the last two looks."""
+
+    def note_lost(self, total: int) -> None:
+        """Count up to a total of lost messages; the change told with it leaves some out.
+
+        DDS counts with 32 bits, signed, and sometimes tells nonsense: a total that falls, or grows
+        by too many messages to be meant, is where it goes on from.
+        """
+        more = (total - self.told) % 2**32
+        self.told = total
+        if more < MOST_LOST:
+            self.lost += more
+
+    def look(self, now: float, span: float) -> None:
+        """Note how many messages came in the last `span`."""
+        fresh, self.before = self.count - self.before, self.count
+        self.rate = fresh / span
+        lost, before = self.lost + self.full, self.lost_before
+        self.losing, self.lost_before = lost > before, lost
+        if fresh:
+            self.last = now
+
+    @property
+    def silent(self) -> bool:
+        """Tell whether it has been heard before and is not any more."""
+        heard = self.last is not None and not self.latched
+        return heard and time.monotonic() - self.last > SILENCE
+
+
+class Inputs:
+    """Subscriptions to streams of messages, emptied by hand.
+
+    Parameters
+    ----------
+    node : Node
+    streams : sequence of Stream
+    guarded : callable
+        Makes a function of one that logs what it raises.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        streams: Sequence[Stream],
+        guarded: Callable[[Callable[..., None]], Callable[..., None]],
+    ) -> None:
+        self._node, self._guarded = node, guarded
+        self._heard: dict[str, Hearing] = {}
+        self._looked_at = time.monotonic()
+        self._inputs = dict(self._subscribe(stream) for stream in streams)
+
+    def __contains__(self, subscription: Subscription) -> bool:
+        """Tell whether a subscription is one of these."""
+        return subscription in self._inputs
+
+    def take(self) -> list[tuple[Stream, bytes]]:
+        """Return what has come since the last call, in the order in which it came."""
+        come = []
+        for subscription, (stream, heard) in self._inputs.items():
+            found = _waiting(subscription)
+            heard.count += len(found)
+            heard.full += len(found) >= subscription.qos_profile.depth
+            come += [(stamp, stream, data) for stamp, data in found]
+        come.sort(key=itemgetter(0))
+        return [(stream, data) for _, stream, data in come]
+
+    @property
+    def topics(self) -> list[str]:
+        """Return the topics on which something has been heard."""
+        return [topic for topic, heard in self._heard.items() if heard.count]
+
+    def look(self) -> None:
+        """Note the rates at which messages have come since the last look."""
+        now = time.monotonic()
+        span, self._looked_at = now - self._looked_at, now
+        for heard in self._heard.values():
+            heard.look(now, span)
+
+    def troubles(self) -> list[str]:
+        """Return in words which topics are not heard as they should be."""
+        wrong = [
+            f'nothing is heard on {topic} any more'
+            for topic, heard in self._heard.items()
+            if heard.silent
+        ]
+        wrong += [
+            f'{topic} is published {heard.deaf} is asked for'
+            for topic, heard in self._heard.items()
+            if heard.deaf and not heard.count
+        ]
+        wrong += self._of_other_types()
+        streams = [stream for stream, _ in self._inputs.values()]
+        wrong += [words for links in links_of(streams) for words in links.problems()]
+        losing = [topic for topic, heard in self._heard.items() if heard.losing]
+        if losing:
+            wrong.append(f'messages get lost on {", ".join(losing)}')
+        return wrong
+
+    def figures(self) -> dict[str, Any]:
+        """Return for the diagnostics what was heard on each topic."""
+        now = time.monotonic()
+        heard = {topic: heard for topic, heard in self._heard.items() if heard.last is not None}
+        return {
+            **{f'rate of {topic} [Hz]': f'{each.rate:.1f}' for topic, each in heard.items()},
+            **{f'age of {topic} [s]': f'{now - each.last:.1f}' for topic, each in heard.items()},
+            **{f'lost on {topic}': each.lost for topic, each in heard.items()},
+            **{f'queue of {topic} full': each.full for topic, each in heard.items()},
+        }
+
+    def _subscribe(self, stream: Stream) -> tuple[Subscription, tuple[Stream, Hearing]]:
+        overriding = QoSOverridingOptions(
+            (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
+        )
+        heard = self._heard.setdefault(self._node.resolve_topic_name(stream.topic), Hearing())
+        heard.latched = stream.still
+        try:
+            subscription = self._node.create_subscription(
+                _message_type(stream.type),
+                stream.topic,
+                lambda data: None,  # no executor serves it
+                _qos(stream),
+                qos_overriding_options=overriding,
+                event_callbacks=self._noting(heard),
+                raw=True,
+            )
+        except RuntimeError as err:  # what rclpy raises for a policy that there is not
+            raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
+        if subscription.qos_profile.depth < 1:
+            raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
+        return subscription, (stream, heard)
+
+    def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:
+        def note_deaf(event: Any) -> None:
+            latched = event.last_policy_kind == QoSPolicyKind.DURABILITY
+            heard.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
+
+        def note_lost(event: Any) -> None:
+            heard.note_lost(event.total_count)
+
+        return SubscriptionEventCallbacks(
+            incompatible_qos=self._guarded(note_deaf), message_lost=self._guarded(note_lost)
+        )
+
+    def _of_other_types(self) -> list[str]:
+        """Return in words what is published as another type on topics that are not heard."""
+        found = {}
+        for subscription, (stream, heard) in self._inputs.items():
+            topic = subscription.topic_name
+            infos = [] if heard.count else self._node.get_publishers_info_by_topic(topic)
+            for kind in {info.topic_type for info in infos} - {stream.type}:
+                found[topic, kind] = f'{topic} is published as {kind}, not as {stream.type}'
+        return [found[key] for key in sorted(found)]
+
+
+def deserialised(data: bytes, name: str) -> Any:
+    """Return the message of a type in its bytes."""
+    return deserialize_message(data, _message_type(name))
+
+
+def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
+    """Return the messages that wait, with the times at which they were received [ns]."""
+    found = []
+    with subscription.handle:
+        for _ in range(INPUT_QUEUE):
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                break
+            found.append((taken[1]['received_timestamp'], taken[0]))
+    return found
+
+
+def _qos(stream: Stream) -> QoSProfile:
+    """Return how a topic is asked for; a new one each time, because overriding changes it."""
+    return QoSProfile(
+        depth=INPUT_QUEUE,
+        reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if stream.still else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _message_type(name: str) -> Any:
+    package, _, kind = name.partition('/msg/')
+    try:
+        return getattr(importlib.import_module(f'{package}.msg'), kind)
+    except ImportError as err:
+        distribution = os.environ.get('ROS_DISTRO', 'jazzy')
+        name = f'ros-{distribution}-{package.replace("_", "-")}'
+        raise ConfigError(f'{package} cannot be imported, install {name}: {err}') from err

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The calibration in use: published, saved, loaded, and exported."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64MultiArray, String
+
+from calib_ros.atomic import confined
+from calib_ros.errors import InputError
+from calib_ros.files.archive import Archive
+from calib_ros.files.export import exports
+from calib_ros.files.vendors import vendor_files
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.region import region_of_record
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import (
+    calibration_record,
+    parse_calibration,
+    parse_chain,
+    read_text,
+)
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.urdf import corrected_urdf
+from calib_ros.ros import to_ros
+from calib_ros.ros.broadcast import Broadcast
+from calib_ros.ros.parameters import Given
+from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import parse_sources
+
+
+class Published(NamedTuple):
+    """A calibration as the text of a file, and by which configuration it was made, if known."""
+
+    text: str
+    configuration: str
+
+
+class Exportable(NamedTuple):
+    """The calibrated chain, its text, and the joint values of the samples."""
+
+    chain: Chain
+    text: str
+    joints: Sequence[FloatArray] | None
+
+
+class Keeper:
+    """Keeps the calibration of a session, its publishers and its files together.
+
+    Parameters
+    ----------
+    node : Node
+    session : CalibrationSession
+    archive : Archive
+    given : Given
+        What the node was started with.
+    urdf : str
+        The URDF of the robot, if there is one.
+    latched : QoSProfile
+        For topics whose last message a late subscriber gets.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        session: CalibrationSession,
+        archive: Archive,
+        given: Given,
+        urdf: str,
+        latched: QoSProfile,
+    ) -> None:
+        self._node, self._session, self._archive = node, session, archive
+        self._given, self._urdf = given, urdf
+        self._published = Published('', '')
+        self._lock = threading.Lock()  # identifications end on a thread of their own
+        self._posed: tuple[int, Sequence[float]] | None = None
+        self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
+        self._calibration = node.create_publisher(String, '~/calibration', latched)
+        for name in ('target_filename', 'calibration_filename'):
+            self._named(name)  # refused now rather than after a day's work
+        sources = parse_sources(given.settings.sources)
+        in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
+        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links, latched)
+        self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
+
+    def adopt(
+        self, result: Identification, samples: Sequence[Sample], published: Published
+    ) -> None:
+        """Take an accepted result as the calibration in use."""
+        with self._lock:
+            self._session.adopt(result, samples)
+            self._publish(result.chain, published)
+
+    def save(self) -> Path:
+        """Write the calibration to `target_filename` or a new file; return its path."""
+        if not self._published.text:
+            raise InputError('there is no accepted calibration to save: call ~/identify first')
+        return self._archive.save(*self._published, self._named('target_filename'))
+
+    def at_start(self) -> tuple[Path | None, bool]:
+        """Return which calibration there is to load, and whether it shall be at the start."""
+        named = self._named('calibration_filename')
+        path = named or self._archive.newest_calibration()
+        return path, path is not None and (named is not None or self._given.autoload)
+
+    def load(self) -> Path:
+        """Take the calibration in `calibration_filename` or the newest one; return its path."""
+        path, _ = self.at_start()
+        session = self._session
+        if path is None:
+            raise InputError(
+                f'there is no saved calibration of {session.chain.name} in '
+                f'{self._archive.folder}: set calibration_filename'
+            )
+        text = _calibration_text(path)
+        chain, record = parse_calibration(text, str(path), session.chain, session.settings)
+        region = region_of_record(record, chain, str(path))
+        serial, ours = record.get('robot_serial'), self._given.serial
+        if serial and ours and serial != ours:
+            raise InputError(
+                f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
+            )
+        with self._lock:
+            session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''), region)
+            self._publish(chain, Published(text, ''))
+        return path
+
+    def exportable(self) -> Exportable:
+        """Return what there is to export, as it is now."""
+        session = self._session
+        if session.calibration is None:
+            raise InputError('there is no calibration to export: call ~/identify or ~/load first')
+        joints = [sample.joints for sample in session.samples]
+        with self._lock:
+            return Exportable(session.calibration.chain, self._published.text, joints or None)
+
+    def export(self, found: Exportable) -> tuple[bool, str]:
+        """Write a calibration in all forms; return success, and where in words."""
+        record = calibration_record(found.text)
+        nominal, links = self._session.chain, self._given.links
+        forms = exports(found.chain, nominal, found.joints, record)
+        forms += vendor_files(found.chain, nominal, record, self._urdf, links)
+        files = {each.name: each.content for each in forms}
+        if self._urdf:
+            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **links)
+        return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
+
+    def publish_pose(self) -> None:
+        """Publish the corrected pose of the latest joint values, once."""
+        calibration, latest = self._session.calibration, self._session.latest
+        if calibration is None or latest is None or latest is self._posed:
+            return
+        self._posed = latest
+        stamp_ns, values = latest
+        self._corrected_pose.publish(
+            to_ros.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
+        )
+
+    def _named(self, parameter: str) -> Path | None:
+        """Return the file that a parameter names, which any node may have set, if it does."""
+        name = self._node.get_parameter(parameter).value
+        if not name:
+            return None
+        if not name.endswith(('.yaml', '.yml')):
+            raise InputError(f'{parameter} must end in .yaml or .yml')
+        return confined(
+            name,
+            (self._archive.folder, *self._given.allowed_folders),
+            f'choose {parameter} in data_dir, or start the node with allowed_folders',
+        )
+
+    def _publish(self, chain: Chain, published: Published) -> None:
+        self._published = published
+        self._dh_parameters.publish(to_ros.dh_parameters(chain))
+        self._calibration.publish(String(data=published.text))
+        self._broadcast.publish(chain, self._session.calibration.world_frame)
+
+
+def _calibration_text(path: Path) -> str:
+    """Return the text of a chain file; of any other file the answer must tell nothing."""
+    if not path.is_file():
+        raise InputError(f'there is no file {path}')
+    try:
+        text = read_text(path)
+        parse_chain(text)
+    except Exception as err:  # whatever it is, its words may quote the file
+        if isinstance(err.__cause__, OSError):
+            raise
+        raise InputError(
+            f'{path} is not a calibration: `calib_ros chain {path}` says what is wrong with it'
+        ) from None
+    return text

@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node is set to: parameters with their ranges, and the robot that they name.
+
+Every field of `Settings` is a parameter of the same name, with its text and its smallest value;
+`arguments.py` lists the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import String
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
+from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.ros.arguments import BESIDE_SETTINGS
+from calib_ros.settings import STARTUP, Settings
+
+QOS = 'qos_overrides.'
+DESCRIPTION_WAIT = 10.0
+"""Time [s] for which the node waits for the robot's description."""
+
+
+class FrameNames(NamedTuple):
+    """What the frames are called on /tf_static; nothing is published of one without a name."""
+
+    base: str
+    flange: str
+    target: str
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a node was started with; what else may change is read where it is used."""
+
+    chain: str
+    links: dict[str, str | None]
+    serial: str
+    data_dir: Path | None
+    allowed_folders: tuple[Path, ...]
+    resume: bool
+    autoload: bool
+    candidates: Path | None
+    frames: FrameNames
+    settings: Settings
+
+
+def declare_all(node: Node) -> Given:
+    """Declare all parameters of the node and return what they were set to.
+
+    Raises
+    ------
+    ConfigError
+        When a value cannot be, or a parameter was set that does not exist.
+
+    """
+    own = {
+        each.name: _declare(node, each.name, each.default, each.text, each.fixed)
+        for each in BESIDE_SETTINGS
+    }
+    settings = Settings(**{item.name: _declare_setting(node, item) for item in fields(Settings)})
+    refuse_unknown(node, QOS)
+    if not own['chain']:
+        raise ConfigError(
+            'parameter "chain" is not set: give the chain file of the robot, for example '
+            '--ros-args -p chain:=ur10e'
+        )
+    return Given(
+        chain=own['chain'],
+        links={name: own[name] or None for name in ('base_link', 'tip_link')},
+        serial=own['serial'],
+        data_dir=_path(own['data_dir']),
+        allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
+        resume=own['resume'],
+        autoload=own['autoload'],
+        candidates=_path(own['candidates']),
+        frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
+        settings=settings,
+    )
+
+
+def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
+    """Return settings with what changes of parameters make of them."""
+    known = {item.name: item.default for item in fields(Settings)}
+    values = {
+        each.name: _names(each.value) if isinstance(known[each.name], tuple) else each.value
+        for each in changes
+        if each.name in known
+    }
+    return replace(settings, **values)
+
+
+def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
+    """Return the nominal chain, and the URDF that it comes from if it does."""
+    name, links = given.chain, given.links
+    if name == 'robot_description':
+        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        topic = node.resolve_topic_name('robot_description')
+        node.get_logger().info(f'waiting for {topic}, {DESCRIPTION_WAIT:g} s at most')
+        found, message = wait_for_message(
+            String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
+        )
+        if not found:
+            raise ConfigError(
+                f'no robot_description has come within {DESCRIPTION_WAIT:g} s: start '
+                'robot_state_publisher first, or set chain to a file'
+            )
+        text = message.data
+    elif Path(name).suffix in URDF_SUFFIXES:
+        text = read_text(Path(name))
+    elif any(links.values()):
+        raise ConfigError('base_link and tip_link are of use with a URDF only')
+    else:
+        return load_chain(name), ''
+    return replace(chain_from_urdf(text, **links), base=None, tool=None), text
+
+
+def refuse_unknown(node: Node, later: str = f'{QOS}/clock.') -> None:
+    """Refuse parameters that were set but do not exist; ROS ignores them.
+
+    Names that begin with `later` are let pass: what they set comes into being later, or not.
+    """
+    known = [*node._parameters]
+    for name in node._parameter_overrides:
+        if name not in known and not name.startswith((later, 'use_sim_time')):
+            raise UnknownNameError('parameter', name, known)
+
+
+def _path(name: str) -> Path | None:
+    return Path(name).expanduser() if name else None
+
+
+def _declare(
+    node: Node, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
+) -> Any:
+    descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
+    override = node._parameter_overrides.get(name)
+    if isinstance(default, str) and override and not isinstance(override.value, str):
+        raise ConfigError(
+            f'parameter "{name}" must be text, not {override.value!r}: write it in quotes, for '
+            f"""example {name}: '0012'"""
+        )
+    if isinstance(default, tuple):  # an empty list has no type in ROS, [''] has one
+        return _names(node.declare_parameter(name, [''], descriptor).value)
+    return node.declare_parameter(name, default, descriptor).value
+
+
+def _declare_setting(node: Node, item: Any) -> Any:
+    text, lower = item.metadata['text'], item.metadata.get('lower')
+    fixed = item.name in STARTUP
+    if isinstance(item.default, tuple | str):
+        return _declare(node, item.name, item.default, text, fixed)
+    if isinstance(item.default, int):
+        span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)
+        return _declare(node, item.name, item.default, text, fixed, integer_range=[span])
+    # Declared with any type first, so that "max_gap: 1" is taken as 1.0.
+    loose = ParameterDescriptor(dynamic_typing=True)
+    value = node.declare_parameter(item.name, item.default, loose).value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ConfigError(f'parameter "{item.name}" must be a number, not {value!r}')
+    node.undeclare_parameter(item.name)
+    span = FloatingPointRange(from_value=float(lower), to_value=1e9)
+    descriptor = ParameterDescriptor(
+        description=text, read_only=fixed, floating_point_range=[span]
+    )
+    return node.declare_parameter(item.name, float(value), descriptor, ignore_override=True).value
+
+
+def _names(values: Sequence[str] | None) -> tuple[str, ...]:
+    return tuple(name for name in values or () if name)

@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Results as ROS messages.
+
+Jazzy's messages do not check their fields, and an int or a numpy number where a float belongs
+arrives as garbage: everything is made a plain Python value here.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Point, PoseStamped
+from sensor_msgs.msg import JointState, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
+from visualization_msgs.msg import Marker, MarkerArray
+
+from calib_ros.identification.identification import Identification, residuals
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import DH_KINDS, Chain
+from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
+
+MOST_ARROWS = 1000
+
+
+def dh_parameters(chain: Chain) -> Float64MultiArray:
+    """Return the DH table, joint by joint."""
+    rows, columns = chain.table.shape
+    array = Float64MultiArray()
+    array.layout.dim = [
+        MultiArrayDimension(label='joint', size=rows, stride=rows * columns),
+        MultiArrayDimension(label=','.join(DH_KINDS), size=columns, stride=columns),
+    ]
+    array.data = chain.table.ravel().tolist()
+    return array
+
+
+def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) -> PoseStamped:
+    """Return the pose of the target at joint values (n) of a stamp."""
+    matrix = chain.forward(np.array([joints]))[0]
+    message = PoseStamped()
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
+    message.header.frame_id = frame_id
+    point, turn = message.pose.position, message.pose.orientation
+    point.x, point.y, point.z = matrix[:3, 3].tolist()
+    turn.x, turn.y, turn.z, turn.w = to_quat(matrix[:3, :3]).tolist()
+    return message
+
+
+def joints(names: Sequence[str], values: FloatArray, stamp: Any) -> JointState:
+    """Return joint values (n) by name."""
+    message = JointState(name=list(names), position=values.tolist())
+    message.header.stamp = stamp
+    return message
+
+
+def cloud(fields: Sequence[str], rows: FloatArray, frame_id: str, stamp: Any) -> PointCloud2:
+    """Return rows (N, C) as points with named fields of single precision."""
+    data = np.ascontiguousarray(rows, dtype='<f4')
+    message = PointCloud2(height=1, width=len(data), is_dense=bool(np.isfinite(data).all()))
+    message.header.stamp, message.header.frame_id = stamp, frame_id
+    message.fields = [
+        PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1)
+        for k, name in enumerate(fields)
+    ]
+    message.point_step = 4 * len(fields)
+    message.row_step = data.nbytes
+    message.data = array('B', data.tobytes())
+    return message
+
+
+def status(
+    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
+) -> DiagnosticStatus:
+    """Return one line of diagnostics."""
+    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(
+        name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
+    )
+
+
+def residual_markers(
+    result: Identification, sets: Sequence[Observations], scale: float, stamp: Any
+) -> MarkerArray:
+    """Return what is left at each measured position, drawn `scale` times as long as it is.
+
+    A line from the measured position towards the predicted one: green for a small residual, red
+    for one of three times the RMS and beyond.
+    """
+    lines = Marker(ns='residuals', id=0, type=Marker.LINE_LIST, action=Marker.ADD)
+    lines.header.stamp = stamp
+    lines.header.frame_id = result.world_frame
+    lines.pose.orientation.w = 1.0
+    lines.scale.x = 0.002
+    base = result.chain.frame('base').matrix
+    for each in sets:
+        if each.distances is not None:
+            continue
+        left = residuals(result.chain, each).position
+        size = np.linalg.norm(left, axis=1)
+        share = np.clip(size / max(3.0 * float(np.sqrt(np.mean(size**2))), 1e-12), 0.0, 1.0)
+        world = base @ invert(result.chain.frame(each.base).matrix)
+        begins = each.positions @ world[:3, :3].T + world[:3, 3]
+        ends = begins - scale * left @ world[:3, :3].T
+        for k in range(max(0, len(each) - MOST_ARROWS), len(each)):
+            color = ColorRGBA(r=float(share[k]), g=float(1.0 - share[k]), b=0.0, a=1.0)
+            for x, y, z in (begins[k].tolist(), ends[k].tolist()):
+                lines.points.append(Point(x=x, y=y, z=z))
+                lines.colors.append(color)
+    return MarkerArray(markers=[lines])

@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How late a measuring device stamps, from the motion itself.
+
+The speed of the target by the joints and the chain, and the speed by the measurements, are the
+same signal twice. Angular speed depends on no frame; linear speed is that of the flange, near
+enough to that of the target for a start. The lag of the greatest correlation is refined by a
+parabola; the identification then fits the rest as a parameter (`base.delay`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.track import Rows, Stamps
+
+STEP = 5e-3
+"""Time between two values of the speeds [s]."""
+LONGEST = 1.0
+"""Largest delay that is looked for [s]."""
+LEAST_MOTION = 3.0
+"""Time in motion that is needed [s]."""
+CONVINCING = 0.8
+"""Least correlation."""
+MOVING = 0.1
+"""Share of the 95th percentile of the speed beyond which the arm counts as moving."""
+FEWEST = 10
+"""Fewest samples of joints, and measurements, that are looked at."""
+MOST_TIME = 300.0
+"""Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
+WATCH_NS = 15_000_000_000
+"""Time over which a watch looks."""
+WATCHED = 20_000
+"""Samples that it keeps at most."""
+DENSE_NS = 4_000_000
+"""Time between two samples that it keeps; nearer ones tell no more."""
+SMOOTHING = 0.05
+"""Time over which speeds are taken [s]; short against a move, long against the noise."""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How much later than the joints' the stamps of measurements are, and how sure it is."""
+
+    seconds: float
+    correlation: float
+
+
+class Watch:
+    """Joint values and poses while the arm moves between stops, to see whether the clocks agree.
+
+    Parameters
+    ----------
+    joints : int
+        Number of joints.
+
+    """
+
+    def __init__(self, joints: int) -> None:
+        self._joints = Rows(joints, WATCHED)
+        self._poses = Rows(7, WATCHED)
+        self._begun_ns = 0
+        self._last_ns = [0, 0]
+
+    def add_joints(self, stamp_ns: int, values: Sequence[float]) -> bool:
+        """Take joint values; return whether it is time to look."""
+        if not self._begun_ns:
+            self._begun_ns = stamp_ns
+        if abs(stamp_ns - self._last_ns[0]) >= DENSE_NS and not self._joints.full:
+            self._last_ns[0] = stamp_ns
+            self._joints.append(stamp_ns, values)
+        return abs(stamp_ns - self._begun_ns) > WATCH_NS
+
+    def add_pose(
+        self, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float] | None
+    ) -> None:
+        """Take a measured pose or position."""
+        if abs(stamp_ns - self._last_ns[1]) >= DENSE_NS and not self._poses.full:
+            self._last_ns[1] = stamp_ns
+            self._poses.append(stamp_ns, (*position, *(quat_xyzw or ())))
+
+    def uneventful(self, stamps: Stamps) -> NDArray[np.bool_]:
+        """Return (M,) at which stamps of joint values it is not yet time to look."""
+        quiet = np.abs(stamps - self._begun_ns) <= WATCH_NS
+        return quiet if self._begun_ns else np.zeros(len(stamps), dtype=bool)
+
+    def extend_joints(self, stamps: Stamps, values: FloatArray) -> None:
+        """Take joint values (M, n) at uneventful stamps (M,)."""
+        self._extend(0, self._joints, stamps, values)
+
+    def extend_poses(self, stamps: Stamps, numbers: FloatArray) -> None:
+        """Take poses (M, 7), with NaN for a rotation that was not measured."""
+        self._extend(1, self._poses, stamps, numbers)
+
+    def _extend(self, which: int, rows: Rows, stamps: Stamps, values: FloatArray) -> None:
+        chosen: list[int] = []
+        last = self._last_ns[which]
+        room = rows.capacity - rows.count
+        for k, stamp_ns in enumerate(stamps.tolist() if room else ()):
+            if abs(stamp_ns - last) >= DENSE_NS and len(chosen) < room:
+                last = stamp_ns
+                chosen.append(k)
+        self._last_ns[which] = last
+        rows.extend(stamps[chosen], values[chosen])
+
+    def look(self, chain: Chain) -> Delay | None:
+        """Return the delay if it shows, and begin anew."""
+        self._joints.sort()
+        self._poses.sort()
+        values = self._poses.values
+        oriented = len(values) > 0 and not np.isnan(values).any()
+        found = find_delay(
+            chain,
+            self._joints.stamps,
+            self._joints.values,
+            self._poses.stamps,
+            values[:, :3],
+            se3.from_quat(values[:, 3:]) if oriented else None,
+        )
+        for rows in (self._joints, self._poses):
+            rows.keep(np.zeros(rows.count, dtype=bool))
+        self._begun_ns = 0
+        return found
+
+
+def find_delay(
+    chain: Chain,
+    joint_stamps: Stamps,
+    joints: FloatArray,
+    stamps: Stamps,
+    positions: FloatArray,
+    rotations: FloatArray | None,
+) -> Delay | None:
+    """Return the delay of measurements (N) against joint samples (M); None where none shows.
+
+    Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3).
+    """
+    if len(joint_stamps) < FEWEST or len(stamps) < FEWEST:
+        return None
+    start = joint_stamps[0]
+    joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
+    begin = max(joint_times[0], times[0] - LONGEST)
+    end = min(joint_times[-1], times[-1] + LONGEST)
+    if end - begin < LEAST_MOTION:
+        return None
+    begin = max(begin, end - MOST_TIME)
+    grid = np.arange(begin, end, STEP)
+    coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
+    nearest = np.unique(np.round(coarse).astype(int))
+    if len(nearest) < FEWEST:  # a gap
+        return None
+    poses = chain.forward(joints[nearest])
+    first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
+    second = _speed(times, positions, rotations, rotations is not None)
+    by_joints = np.interp(grid, *first)
+    if (by_joints > MOVING * np.percentile(by_joints, 95)).sum() * STEP < LEAST_MOTION:
+        return None
+    lags = np.arange(-LONGEST, LONGEST + STEP / 2, STEP)
+    score = np.array([_correlation(grid + lag, by_joints, second) for lag in lags])
+    best = int(np.argmax(score))
+    if score[best] < CONVINCING or best in (0, len(lags) - 1):
+        return None
+    left, middle, right = score[best - 1 : best + 2]
+    bend = left - 2.0 * middle + right
+    shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    return Delay(float(lags[best] + shift * STEP), float(score[best]))
+
+
+def _speed(
+    times: FloatArray, positions: FloatArray, rotations: FloatArray | None, angular: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return times and speeds, over SMOOTHING or from one measurement to the next."""
+    behind = np.searchsorted(times, times + SMOOTHING)
+    behind = np.minimum(np.maximum(behind, np.arange(len(times)) + 1), len(times) - 1)
+    first = np.flatnonzero(times[behind] > times)
+    last = behind[first]
+    span = times[last] - times[first]
+    if angular and rotations is not None:
+        turn = np.swapaxes(rotations[first], 1, 2) @ rotations[last]
+        way = np.linalg.norm(se3.log_rotation(turn), axis=1)
+    else:
+        way = np.linalg.norm(positions[last] - positions[first], axis=1)
+    return 0.5 * (times[first] + times[last]), way / span
+
+
+def _correlation(
+    grid: FloatArray, by_joints: FloatArray, measured: tuple[FloatArray, FloatArray]
+) -> float:
+    times, speed = measured
+    inside = (grid >= times[0]) & (grid <= times[-1])
+    if inside.sum() * STEP < LEAST_MOTION:
+        return -1.0
+    first, second = by_joints[inside], np.interp(grid[inside], times, speed)
+    first, second = first - first.mean(), second - second.mean()
+    size = np.sqrt((first @ first) * (second @ second))
+    return float(first @ second / size) if size > 0.0 else -1.0

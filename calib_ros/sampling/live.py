@@ -1,0 +1,350 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The estimate while samples are being taken: what is known so far, and how many more it takes.
+
+At a chain that is near enough, every sample adds its share J^T W J and J^T W r to the information
+matrix and vector, so the estimate and its covariance follow each sample at the cost of that sample
+alone (an information filter; Maybeck 1979). The point of linearisation moves to the estimate when
+that has gone further than the linear model holds. Wide priors stand for what no sample has told
+yet; at the end they weigh nothing, and the estimate is that of the batch.
+
+A sample that lies too far from where the others predict it is left out as suspicious. The first
+ones cannot be judged so, because the estimate bends to them. So it begins anew, from the nominal
+chain and by the robust fit of the identification (`robust.py`), each time the number of samples
+has grown by a fifth: an early gross error is found, and what was left out wrongly comes back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.errors import CalibrationError
+from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.identification.leastsquares import (
+    Prior,
+    Samples,
+    System,
+    normal_equations,
+    residual_arrays,
+)
+from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.robust import robust_fit, thorough_fit
+from calib_ros.identification.start import start_frames
+from calib_ros.kinematics.chain import ANGLES, DELAY, Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.sample import Frames, Sample, collect
+
+WIDE = (0.01, 0.02)
+"""Standard deviations [m, rad] of arm parameters before anything is measured."""
+FAR = 1e-3
+"""Step [m or rad] from which the linear model is made anew."""
+MOST_STEPS = 5
+START = 6
+"""Configurations with which the frames can be found."""
+MOST_ANEW = 500
+"""Samples up to which the linear model is made anew, and with which it begins at most."""
+MOST_THOROUGH = 60
+"""Parameters up to which it begins with the thorough fit, which takes too long for more."""
+GROWN = 1.2
+"""Growth of the number of samples from which all of them are judged anew."""
+MOST_AT_ONCE = 2000
+"""Samples that one update adds at most; the rest waits for the next ones."""
+FAR_OFF = 7.0
+"""Distance [standard deviations] from which a sample is left out as suspicious."""
+LEAST_NOISE = 1e-3
+"""Smallest noise [sigma given] that residuals are taken to show."""
+LOOKED_AT = 200
+"""Samples at which is looked whether the residuals are as small as the noise."""
+LOOK = 100
+"""Configurations at which the accuracy is predicted."""
+LITTLE = 0.35
+"""Range [rad] of a joint over all samples that is too little; a tenth of it [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the samples so far tell.
+
+    `sigma` is the RMS standard deviation [m] of positions predicted over the joint range, by the
+    noise that the residuals show, which is `noise` [sigma given]. `excess` is how many times
+    larger the residuals of positions are than what measurements scatter by: the sigma given, or
+    the spread at a stop where that is larger. It is None while too few samples show it; priors,
+    and nothing measured, make up much of the sigma then.
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    covariance: FloatArray
+    samples: int
+    sigma: float
+    noise: float
+    excess: float | None
+
+    def more_for(self, wanted: float) -> int:
+        """Return how many more samples are expected to bring the sigma to a wanted one [m]."""
+        return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))
+
+
+class LiveEstimate:
+    """An information filter over the parameters of a problem, as its samples come.
+
+    Parameters
+    ----------
+    problem_of : callable
+        Makes a problem of samples, as the identification will.
+
+    """
+
+    def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
+        self._problem_of = problem_of
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin again with the next update."""
+        self._frames = Frames()
+        self._names: tuple[str, ...] = ()
+        self._chain: Chain | None = None
+        self._added: list[Sample] = []
+        self._begun = 0  # how many samples there were then
+        self._seen = 0
+        self._pending: list[Sample] = []
+        self._latest: Estimate | None = None
+        self.suspicious: list[Sample] = []
+        """Samples that lie too far from what the others predict; they are left out here."""
+
+    def update(self, samples: Sequence[Sample]) -> Estimate | None:
+        """Take what a growing list of samples has beyond that of the last call.
+
+        Returns None while there are too few. An update is short, so that it may be called between
+        messages: of many samples it takes MOST_AT_ONCE.
+        """
+        if self._latest is not None and len(samples) == self._seen and not self._pending:
+            return self._latest
+        self._pending += [each for each in samples[self._seen :] if not each.validation]
+        self._seen = len(samples)
+        fresh = self._pending[:MOST_AT_ONCE]
+        if self._outgrown(fresh) or any(not self._knows(sample) for sample in fresh):
+            fitted = [sample for sample in samples if not sample.validation]
+            first = _spread(fitted)
+            if _distinct(first) < START or not self._begin(first):
+                return None
+            chosen = set(first)
+            self._begun = len(fitted)
+            self._seen = len(samples)
+            self._pending = [sample for sample in fitted if sample not in chosen]
+        elif fresh:
+            del self._pending[: len(fresh)]
+            self._add(fresh)
+            self._settle()
+        self._latest = self._result()
+        return self._latest
+
+    def _outgrown(self, fresh: Sequence[Sample]) -> bool:
+        """Tell whether it is time to begin, or to begin anew."""
+        count = len(self._added) + len(self.suspicious) + len(fresh)
+        return self._chain is None or GROWN * self._begun < count <= MOST_ANEW
+
+    def _knows(self, sample: Sample) -> bool:
+        assert self._chain is not None
+        return set(self._frames.of(sample)) <= set(self._chain.frame_names)
+
+    def _begin(self, fitted: Sequence[Sample]) -> bool:
+        """Choose the parameters, and fit them to the samples but those of gross error.
+
+        What the robust fit leaves out comes back where the others predict it within the sigmas
+        given.
+        """
+        self.restart()
+        problem = self._problem_of(fitted)
+        model = problem.model
+        self._sigmas = (problem.sigma_position, problem.sigma_orientation)
+        try:
+            self._names = structurally_independent(model, problem.free, problem.kinds)
+            chain = start_frames(model, problem.sets, *self._sigmas, problem.loss)
+        except (CalibrationError, np.linalg.LinAlgError):
+            return False
+        wide = {name: _wide(name) for name in self._names if not model.owns_frame(name)}
+        self._prior = Prior(model, {**wide, **problem.prior_sigmas})
+        self._joints = chain.random_joints(LOOK, np.random.default_rng(0))
+        groups = self._groups(fitted)
+        system = self._system(groups, self._prior)
+        loss = 'redescending' if self._enough(system.rows) else 'none'
+        fit = thorough_fit if len(self._names) <= MOST_THOROUGH else robust_fit
+        robust = fit(chain, self._names, system, loss)
+        members = [sample for group, _ in groups for sample in group]
+        judged = list(zip(members, robust.outliers.tolist(), strict=True))
+        self._added = [sample for sample, gross in judged if not gross]
+        self._linearise(robust.fit.chain)
+        self._add([sample for sample, gross in judged if gross])
+        self._settle()
+        return True
+
+    def _settle(self) -> None:
+        """Move the point of linearisation to the estimate while that is far from it."""
+        for _ in range(MOST_STEPS):
+            if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
+                break
+            self._linearise(self._estimate())
+
+    def _linearise(self, chain: Chain) -> None:
+        """Begin the information anew at a chain, with the samples taken so far."""
+        inverse, residual = self._prior.rows(chain, self._names)
+        self._chain = chain
+        self._information = np.diag(inverse**2)
+        self._vector = inverse * residual
+        self._cost, self._rows = float(residual @ residual), 0
+        added, self._added = self._added, []
+        self._add(added, gate=False)
+
+    def _add(self, samples: Sequence[Sample], gate: bool = True) -> None:
+        """Add the information of samples."""
+        assert self._chain is not None
+        if gate and self._enough(self._rows):
+            samples = self._plausible(samples)
+        system = self._system(self._groups(samples))
+        normal = normal_equations(self._chain, self._names, system)
+        self._information = self._information + normal.matrix
+        self._vector = self._vector + normal.gradient
+        self._cost += normal.cost
+        self._rows += system.rows
+        self._added += samples
+
+    def _enough(self, rows: int) -> bool:
+        """Tell whether there are equations enough to know a gross error by."""
+        return rows > 2 * len(self._names)
+
+    def _groups(self, samples: Sequence[Sample]) -> list[tuple[list[Sample], Observations]]:
+        """Return samples of one kind between the same frames, and the same as observations."""
+        groups: dict[tuple[Any, ...], list[Sample]] = {}
+        for sample in samples:
+            key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
+            groups.setdefault(key, []).append(sample)
+        found = []
+        for members in groups.values():
+            ((observations,), _) = collect(members, self._sigmas, self._frames)
+            found.append((members, observations))
+        return found
+
+    def _system(
+        self, groups: Sequence[tuple[list[Sample], Observations]], prior: Prior | None = None
+    ) -> System:
+        return System(tuple(Samples(each, *self._sigmas) for _, each in groups), prior)
+
+    def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
+        """Return the samples that lie where the others predict them."""
+        chain = self._estimate()
+        covariance, noise = self._uncertainty()
+        # Samples of one place may agree better than the model does elsewhere.
+        covariance, noise = covariance * max(1.0 / noise, 1.0), max(noise, 1.0)
+        good: list[Sample] = []
+        for members, some in self._groups(samples):
+            left = residual_arrays(chain, some)[0]
+            model = ErrorModel(chain, self._names, some.base, some.tool)
+            jacobian = model.jacobian(some.joints, some.approach, some.velocity)[:, :3]
+            if some.distances is not None:
+                points = chain.forward(some.joints, some.approach, some.base, some.tool)[:, :3, 3]
+                rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+                jacobian = rays[:, np.newaxis] @ jacobian
+            spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+            spread += np.eye(left.shape[1]) * noise * self._sigmas[0] ** 2
+            size = (left * np.linalg.solve(spread, left[..., np.newaxis])[..., 0]).sum(axis=1)
+            for sample, far in zip(members, (size > FAR_OFF**2).tolist(), strict=True):
+                (self.suspicious if far else good).append(sample)
+        return good
+
+    def _scaled(self) -> tuple[FloatArray, FloatArray]:
+        """Return scales (P,), and the information matrix with a diagonal of one by them."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
+        matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        return scale, matrix
+
+    def _step(self) -> FloatArray:
+        scale, matrix = self._scaled()
+        return np.asarray(scale * linalg.solve(matrix, scale * self._vector, assume_a='pos'))
+
+    def _estimate(self) -> Chain:
+        assert self._chain is not None
+        return self._chain.with_offsets(dict(zip(self._names, self._step(), strict=True)))
+
+    def _uncertainty(self) -> tuple[FloatArray, float]:
+        """Return the covariance by the noise that the residuals show, and its variance."""
+        left = max(self._cost - float(self._step() @ self._vector), 0.0)
+        freedom = self._rows - len(self._names)
+        noise = max(left / freedom, LEAST_NOISE**2) if freedom > 0 else 1.0
+        scale, matrix = self._scaled()
+        return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
+
+    def _result(self) -> Estimate:
+        chain = self._estimate()
+        covariance, noise = self._uncertainty()
+        jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
+        variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
+        sigma = float(np.sqrt(variance.mean()))
+        return Estimate(
+            chain,
+            self._names,
+            covariance,
+            len(self._added),
+            sigma,
+            float(np.sqrt(noise)),
+            self._excess(chain) if self._enough(self._rows) else None,
+        )
+
+    def _excess(self, chain: Chain) -> float:
+        """Return the RMS residual of positions in units of what measurements scatter by."""
+        chosen = np.linspace(0, len(self._added) - 1, LOOKED_AT).round().astype(int)
+        some = [self._added[k] for k in np.unique(chosen)]
+        total = 0.0
+        for members, each in self._groups(some):
+            left = residual_arrays(chain, each)[0]
+            scatter = np.full(len(each), self._sigmas[0] ** 2)
+            if each.covariance is not None:
+                own = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
+                scatter = np.where(np.isnan(own), scatter, own)
+            spread = np.array([sample.spread for sample in members])
+            total += float(((left**2).mean(axis=1) / np.maximum(scatter, spread**2)).sum())
+        return math.sqrt(total / len(some))
+
+
+def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
+    """Return the joints whose values (N, n) span too little to tell much about them."""
+    span = np.ptp(joints, axis=0)
+    least = [LITTLE if joint.type == 'revolute' else 0.1 * LITTLE for joint in chain.joints]
+    return tuple(
+        joint.name
+        for joint, reached, wanted in zip(chain.joints, span.tolist(), least, strict=True)
+        if reached < wanted
+    )
+
+
+def _spread(samples: Sequence[Sample]) -> list[Sample]:
+    """Return at most MOST_ANEW samples or so, evenly from those between each pair of frames."""
+    frames = Frames()
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, sample in enumerate(samples):
+        groups.setdefault(frames.of(sample), []).append(k)
+    chosen: set[int] = set()
+    for members in groups.values():
+        count = min(len(members), 1 + MOST_ANEW // len(groups))
+        chosen |= {members[k] for k in np.linspace(0, len(members) - 1, count).astype(int)}
+    return [samples[k] for k in sorted(chosen)]
+
+
+def _distinct(samples: Sequence[Sample]) -> int:
+    """Return in how many configurations samples were taken."""
+    if not samples:
+        return 0
+    return int(configurations(np.array([sample.joints for sample in samples])).max()) + 1
+
+
+def _wide(name: str) -> float:
+    kind = name.partition('.')[2]
+    return 1.0 if kind == DELAY else WIDE[1] if kind in ANGLES else WIDE[0]

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Names in messages: which joints of the chain they hold, in which frames things are measured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from operator import itemgetter
+from typing import TypeAlias
+
+import numpy as np
+
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.messages import JointReadings, MessageError
+
+Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
+Layout: TypeAlias = tuple[tuple[int, ...], Picker]
+
+MOST_NAMES = 50
+"""Frames of measurements, and sets of joint names, that are told apart."""
+USUAL = 20
+"""So many measurements in one frame make it the usual one of a device."""
+FEW = 0.1
+"""Share of measurements in other frames up to which they are stray ones; more is a mistake."""
+
+
+class JointNames:
+    """Finds the joints of a chain in messages that may name others, and only part of them.
+
+    Parameters
+    ----------
+    names : sequence of str
+        How messages name the joints of the chain, in its order.
+
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._layouts: dict[tuple[str, ...], Layout] = {}
+        self.foreign: tuple[str, ...] = ()
+        """Names that come while some of the chain's joints are never named."""
+
+    def layout(self, names: Sequence[str]) -> Layout:
+        """Return which joints of the chain a message names, and how to pick their values.
+
+        Raises
+        ------
+        MessageError
+            When it names none of them.
+
+        """
+        key = tuple(names)
+        if key not in self._layouts:
+            if len(self._layouts) == MOST_NAMES:
+                self._layouts.clear()
+            known = [(k, key.index(n)) for k, n in enumerate(self._names) if n in key]
+            self._layouts[key] = (tuple(k for k, _ in known), _picker([i for _, i in known]))
+            named = {name for names in self._layouts for name in names}
+            missing = [name for name in self._names if name not in named]
+            self.foreign = tuple(sorted(named)) if missing else ()
+        layout = self._layouts[key]
+        if not layout[0]:
+            raise MessageError('none of the joints in the message')
+        return layout
+
+    def values(self, readings: JointReadings) -> tuple[tuple[int, ...], FloatArray]:
+        """Return which joints of the chain messages name, and their values (N, k)."""
+        columns, pick = self.layout(readings.names)
+        index = np.array(pick(range(len(readings.names))), dtype=np.intp)
+        return columns, readings.values[:, index]
+
+
+class FrameNames:
+    """The frames in which each device has measured; there should be one of each."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Counter[str]] = {}
+        self._usual: dict[str, str] = {}
+
+    def check(self, device: str, frame_id: str, wanted: str, count: int = 1) -> None:
+        """Note the frame of some measurements.
+
+        Raises
+        ------
+        MessageError
+            When it is not the one `wanted`, if any is, nor the usual one.
+
+        """
+        if wanted and frame_id != wanted:
+            raise MessageError(f'in frame "{frame_id}", not in frame_id "{wanted}"')
+        if not frame_id.isprintable():  # it shall be a cell of a table
+            raise MessageError('in a frame whose name cannot be printed')
+        self.note(device, frame_id, count)
+        usual = self._usual.get(device, frame_id)
+        if frame_id != (wanted or usual):
+            raise MessageError(strange(frame_id, usual))
+
+    def note(self, device: str, frame_id: str, count: int = 1) -> None:
+        """Note the frame of measurements that were taken before."""
+        known = self._known.setdefault(device, Counter())
+        if frame_id not in known and len(known) == MOST_NAMES:
+            raise MessageError(f'in one of more than {MOST_NAMES} frames')
+        known[frame_id] += count
+        if known[frame_id] >= USUAL:
+            self._usual.setdefault(device, frame_id)
+
+    def usual(self, device: str) -> str | None:
+        """Return the usual frame of a device; None while few measurements have come."""
+        return self._usual.get(device)
+
+    def main(self, device: str) -> str | None:
+        """Return the usual frame of a device, or the most frequent one while few have come."""
+        known = self._known.get(device)
+        return self._usual.get(device) or (max(known, key=known.__getitem__) if known else None)
+
+    @property
+    def several(self) -> bool:
+        """Tell whether any device measured in several frames."""
+        return any(len(known) > 1 for known in self._known.values())
+
+    @property
+    def different(self) -> tuple[str, ...]:
+        """Return the different frames in which one device measured; empty when none did.
+
+        A few measurements in others do not count.
+        """
+        for known in self._known.values():
+            if known.total() - max(known.values()) > FEW * known.total():
+                return tuple(sorted(known))
+        return ()
+
+
+def strange(frame_id: str, usual: str) -> str:
+    """Return in words that a measurement is not in the frame in which others are."""
+    return f'in frame "{frame_id}", not in "{usual}" as others'
+
+
+def _picker(index: Sequence[int]) -> Picker:
+    """Return a function that picks some values of a sequence."""
+    if len(index) > 1:
+        return itemgetter(*index)
+    return lambda values: tuple(values[i] for i in index)

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Samples: what was measured at one stop of the arm, or at one moment of its motion.
+
+A sample is what the live node takes, what the journal keeps, and what a row of a table holds.
+`collect` turns many of them into sets of observations with frames of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.se3 import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """One measurement with the joint values that belong to it.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    joints, approach : (n,)
+        Joint values [rad or m], and the signs of the joints' last moves.
+    position : (3,), optional
+        Of the target in the frame of the device [m].
+    rotation : (3, 3), optional
+        Of the target in the frame of the device.
+    distance : float, optional
+        From the origin of the device to the target [m], where no position was measured.
+    covariance : (6, 6), optional
+        Of x, y, z [m] and the rotation about the device's x, y, z axes [rad].
+    velocity, acceleration : (n,), optional
+        Of the joints, where the arm was moving.
+    session, device, target : str
+        Each session and device has a base frame of its own, each session and target a tool frame.
+    frame_id : str
+        Frame of the measurement, as its message named it.
+    socket : bool
+        A ball at the target sat in a socket, whose place is not known.
+    eye_in_hand : bool
+        The pose is that of a fixed target in a camera on the flange.
+    validation : bool
+        The sample judges and is never fitted.
+    delay : float
+        How much earlier than the stamp the joints had these values [s].
+    count : int
+        Measurements that were averaged.
+    spread : float
+        RMS of one coordinate of them about their mean [m].
+
+    """
+
+    stamp_ns: int
+    joints: FloatArray
+    approach: FloatArray | None = None
+    position: FloatArray | None = None
+    rotation: FloatArray | None = None
+    distance: float | None = None
+    covariance: FloatArray | None = None
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
+    session: str = ''
+    device: str = ''
+    target: str = ''
+    frame_id: str = ''
+    socket: bool = False
+    eye_in_hand: bool = False
+    validation: bool = False
+    delay: float = 0.0
+    count: int = 1
+    spread: float = 0.0
+
+
+class Frames:
+    """Names of the frames between which samples were measured.
+
+    The first session, device and target that is met has the frames `base` and `tool`; others add
+    their names.
+    """
+
+    def __init__(self) -> None:
+        self._sessions: list[str] = []
+        self._ends: dict[tuple[str, str], list[tuple[bool, str]]] = {}
+        self._owners: dict[str, tuple[str, bool, bool, str]] = {}
+
+    def of(self, sample: Sample) -> tuple[str, str]:
+        """Return the names of base and tool of a sample.
+
+        A camera on the flange is the tool's end, and its target stands for the world.
+        """
+        eye = sample.eye_in_hand
+        base, tool = (sample.target, sample.device) if eye else (sample.device, sample.target)
+        if sample.session not in self._sessions:
+            self._sessions.append(sample.session)
+        first = sample.session == self._sessions[0]
+        suffix = '' if first else f'_{plain(sample.session)}'
+        if sample.socket:  # none of them is the first
+            place = (sample.session, False, True, base)
+            return self._own(f'base{suffix}_{plain(base)}', place), f'tool{suffix}'
+        start = self._end('base', sample.session, (eye, base))
+        end = self._end('tool', sample.session, (eye, tool))
+        return (
+            self._own(f'base{suffix}{start}', (sample.session, eye, False, base)),
+            self._own(f'tool{suffix}{end}', (sample.session, eye, False, tool)),
+        )
+
+    def _own(self, name: str, owner: tuple[str, bool, bool, str]) -> str:
+        """Return a name that is no one else's: a device may be called like a session."""
+        while self._owners.setdefault(name, owner) != owner:
+            name += '_'
+        return name
+
+    def _end(self, side: str, session: str, label: tuple[bool, str]) -> str:
+        known = self._ends.setdefault((side, session), [])
+        if label not in known:
+            known.append(label)
+        number = known.index(label)
+        return f'_{plain(label[1]) or number + 1}' if number else ''
+
+
+def named(samples: Iterable[Sample]) -> Frames:
+    """Return the names of the frames of samples, in the order in which these were taken."""
+    frames = Frames()
+    for sample in samples:
+        frames.of(sample)
+    return frames
+
+
+def plain(name: str) -> str:
+    """Return a name as part of a frame's, which holds no dots."""
+    return name.replace('.', '-')
+
+
+def collect(
+    samples: Iterable[Sample], sigmas: tuple[float, float], frames: Frames | None = None
+) -> tuple[tuple[Observations, ...], tuple[Observations, ...]]:
+    """Return sets of observations to fit and sets held out, one for each pair of frames.
+
+    `sigmas` (position [m], orientation [rad]) are those of poses seen by a camera on the flange
+    without a covariance of their own. `frames` remembers the names given to earlier samples.
+    """
+    frames = Frames() if frames is None else frames
+    groups: dict[tuple[str, str, bool, bool, bool, bool], list[Sample]] = {}
+    for sample in samples:
+        base, tool = frames.of(sample)
+        distance = sample.distance is not None
+        key = (base, tool, distance, sample.socket, sample.eye_in_hand, sample.validation)
+        groups.setdefault(key, []).append(sample)
+    fitted: list[Observations] = []
+    held_out: list[Observations] = []
+    for (base, tool, _, _, eye_in_hand, validation), members in groups.items():
+        observations = replace(_observations(members), base=base, tool=tool)
+        if eye_in_hand:
+            observations = observations.inverted(sigmas)
+        (held_out if validation else fitted).append(observations)
+    return tuple(fitted), tuple(held_out)
+
+
+def _observations(samples: Sequence[Sample]) -> Observations:
+    """Return samples between the same frames and of the same kind as observations."""
+    count = len(samples)
+    oriented = np.array([sample.rotation is not None for sample in samples])
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    covariance = np.full((count, 6, 6), np.nan)
+    positions = np.zeros((count, 3))
+    for k, sample in enumerate(samples):
+        if sample.position is not None:
+            positions[k] = sample.position
+        if sample.rotation is not None:
+            rotations[k] = sample.rotation
+        if sample.covariance is not None:
+            covariance[k] = sample.covariance
+    distances = None
+    if samples[0].distance is not None:
+        distances = np.array([sample.distance for sample in samples], dtype=np.float64)
+
+    def optional(name: str) -> FloatArray | None:
+        rows = [getattr(sample, name) for sample in samples]
+        if all(row is None for row in rows):
+            return None
+        nothing = np.zeros(samples[0].joints.shape)  # it stood; how it came there is not known
+        return np.array([nothing if row is None else row for row in rows], dtype=np.float64)
+
+    return Observations(
+        np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
+        np.array([sample.joints for sample in samples], dtype=np.float64),
+        positions,
+        rotations,
+        oriented,
+        None if np.isnan(covariance).all() else covariance,
+        optional('approach'),
+        distances,
+        optional('velocity'),
+        optional('acceleration'),
+        optional('delay'),
+        socket=samples[0].socket,
+    )

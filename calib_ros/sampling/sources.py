@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where measurements come from: topics, what they carry, and between which frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.sampling.messages import DECODERS, TRANSFORMS, frame_name
+
+VALIDATION = 'validation_'
+"""Topics whose last name starts so hold measurements that judge the result, never fitted."""
+MARKERS = {
+    'status': 'std_msgs/msg/String',
+    'calibration': 'std_msgs/msg/String',
+    'dh_parameters': 'std_msgs/msg/Float64MultiArray',
+}
+"""Topics that together tell that what is above them is one of our nodes."""
+DISTANCE = 'distance'
+"""Device of distances that name none: their origin is not that of a tracker."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One topic of measurements.
+
+    Attributes
+    ----------
+    topic : str
+    type : str
+        Message type, such as geometry_msgs/msg/PoseStamped; empty when any will do.
+    device, target : str
+        What measures, and what is measured. Each device has a base frame of its own, each target
+        a tool frame. A message that names its child frame names the target.
+    eye_in_hand : bool
+        The poses are those of a fixed target in a camera on the flange.
+    validation : bool
+        The measurements judge the result and are never fitted.
+    parent, child : str
+        On a topic of many transforms, such as /tf: the frames between which it is measured.
+
+    """
+
+    topic: str
+    type: str = ''
+    device: str = ''
+    target: str = ''
+    eye_in_hand: bool = False
+    validation: bool = False
+    parent: str = ''
+    child: str = ''
+
+    def __post_init__(self) -> None:
+        """Refuse what no bag or node could use."""
+        if self.type and self.type not in TYPES:
+            raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
+        frames = {self.parent, self.child} - {''}
+        if len(frames) != (2 if self.type == TRANSFORMS else 0):
+            raise ConfigError(
+                f'source "{self.topic}" needs parent=FRAME child=FRAME, between which it '
+                'measures, if its type is TFMessage, and only then'
+            )
+        for name in (self.device, self.target):
+            if '.' in name or ',' in name:
+                raise ConfigError(f'a device or target needs a name without . and , not "{name}"')
+
+
+TYPES = (*DECODERS, TRANSFORMS)
+"""Types of messages that hold measurements."""
+
+STANDARD = (
+    Source('measured_pose', 'geometry_msgs/msg/PoseStamped'),
+    Source('measured_pose_with_covariance', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
+    Source('measured_point', 'geometry_msgs/msg/PointStamped'),
+    Source('measured_transform', 'geometry_msgs/msg/TransformStamped'),
+    Source('measured_odometry', 'nav_msgs/msg/Odometry'),
+    Source('measured_distance', 'sensor_msgs/msg/Range', device=DISTANCE),
+    Source('validation_pose', 'geometry_msgs/msg/PoseStamped', validation=True),
+    Source('validation_point', 'geometry_msgs/msg/PointStamped', validation=True),
+)
+"""What the node listens to unless it is told otherwise."""
+
+
+def parse_source(text: str) -> Source:
+    """Read a source from "TOPIC key=value ...".
+
+    Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
+    child. A short type such as PoseStamped will do; a topic named tf is of type TFMessage, and so
+    is one with a parent or a child.
+    """
+    topic, *pairs = text.split() or ('',)
+    if not topic or '=' in topic:
+        raise ConfigError(f'source "{text}" must begin with its topic: "TOPIC key=value ..."')
+    values: dict[str, Any] = {'validation': topic.rpartition('/')[2].startswith(VALIDATION)}
+    for pair in pairs:
+        key, equals, value = pair.partition('=')
+        if not equals or key not in KEYS:
+            raise UnknownNameError(f'key of source "{text}"', key, KEYS)
+        if key in ('eye_in_hand', 'validation'):
+            if value not in ('true', 'false'):
+                raise ConfigError(f'{key} of source "{text}" must be true or false, not "{value}"')
+            values[key] = value == 'true'
+        elif key == 'type':
+            values[key] = _full_type(value)
+        else:
+            values[key] = frame_name(value) if key in ('parent', 'child') else value
+    if values.keys() & {'parent', 'child'} or topic.rpartition('/')[2] == 'tf':
+        values.setdefault('type', TRANSFORMS)
+    source = Source(topic, **values)
+    if source.type.endswith('/Range') and not source.device:
+        source = replace(source, device=DISTANCE)
+    return source
+
+
+KEYS = ('type', 'device', 'target', 'eye_in_hand', 'validation', 'parent', 'child')
+
+
+def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
+    """Read several sources; a topic may be named once, or once for each pair of its frames."""
+    sources = tuple(parse_source(text) for text in texts)
+    names = [' '.join((each.topic, each.parent, each.child)).strip() for each in sources]
+    for source, name in zip(sources, names, strict=True):
+        if names.count(name) > 1:
+            raise ConfigError(f'source "{name}" is named twice')
+        if any(each.topic == source.topic and each.type != source.type for each in sources):
+            raise ConfigError(f'source "{source.topic}" is named with different types')
+    return sources
+
+
+def _full_type(name: str) -> str:
+    matches = [known for known in TYPES if name in (known, known.rpartition('/')[2])]
+    return matches[0] if matches else name

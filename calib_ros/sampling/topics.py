@@ -1,0 +1,244 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a recording are read, and what must not be read as a measurement."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from calib_ros.errors import InputError
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.intake import Stream, decoded, linked, measured
+from calib_ros.sampling.messages import (
+    DECODERS,
+    JOINT_STATE,
+    TRANSFORMS,
+    JointReadings,
+    joint_state,
+)
+from calib_ros.sampling.sources import MARKERS, TYPES, Source, parse_source, parse_sources
+from calib_ros.sampling.track import Stamps
+from calib_ros.sampling.transforms import STATIC, Links
+from calib_ros.settings import Settings
+
+SAME = 1e-9
+"""Joint values [rad or m] of two topics that differ by less are the same."""
+
+
+Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
+"""Returns the messages of a recording on some topics."""
+
+
+def choose(
+    available: Mapping[str, str], settings: Settings, messages_on: Reading
+) -> dict[str, Stream]:
+    """Choose topics by type from those available (topic to type), unless they are named.
+
+    Raises
+    ------
+    InputError
+        When there is none or more than one; it lists the candidates.
+
+    """
+    own = outputs(available)
+    sources = parse_sources(settings.sources)
+    for topic in (*settings.joint_topics, *(source.topic for source in sources)):
+        if topic in own:
+            raise InputError(
+                f'{topic} is published by the calibration node itself: it measures nothing'
+            )
+    joints = [topic for topic, kind in available.items() if kind == JOINT_STATE]
+    for topic in settings.joint_topics:
+        if topic not in joints:
+            raise _no_topic(f'"{topic}"', (JOINT_STATE,), available)
+    joints = list(settings.joint_topics) or [topic for topic in joints if topic not in own]
+    if not joints:
+        raise _no_topic('joint topic', (JOINT_STATE,), available)
+    sources = sources or _found(available)
+    for source in sources:
+        kind = available.get(source.topic, '')
+        if kind not in TYPES or source.type not in ('', kind):
+            expected = (source.type,) if source.type else tuple(DECODERS)
+            raise _no_topic(f'"{source.topic}"', expected, available)
+    if all(source.validation for source in sources):
+        error = _no_topic('pose topic', tuple(DECODERS), available)
+        raise InputError('; '.join([str(error), *_links(available, messages_on)]))
+    streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
+    return {stream.topic: stream for stream in streams if stream.topic in available}
+
+
+def _links(available: Mapping[str, str], messages_on: Reading) -> list[str]:
+    """Return in words which links between frames move, by topic."""
+    found = []
+    for topic, kind in available.items():
+        if kind == TRANSFORMS and not topic.endswith(STATIC):
+            links = Links(topic)
+            for batch in _batches(messages_on({topic: Stream(topic, kind, None, links)})):
+                linked(batch)
+            found.append(str(links))
+    return found
+
+
+def outputs(available: Mapping[str, str]) -> set[str]:
+    """Return the topics beneath calibration nodes, which are known by what only they publish."""
+    nodes = [
+        topic.rpartition('/')[0]
+        for topic in available
+        if topic.rpartition('/')[2] in MARKERS and topic.rpartition('/')[0]
+    ]
+    known = {
+        f'{node}/'
+        for node in nodes
+        if all(available.get(f'{node}/{name}') == kind for name, kind in MARKERS.items())
+    }
+    return {topic for topic in available if topic.startswith(tuple(known))}
+
+
+def check_joints(
+    messages: Iterator[tuple[Stream, bytes]],
+    joint_names: Sequence[str],
+    deserialise: Callable[[bytes, str], Any],
+) -> None:
+    """Refuse joint states of which several topics name the same joints of the chain.
+
+    Parameters
+    ----------
+    messages : iterator of (Stream, bytes)
+        The joint states of a recording.
+    joint_names : sequence of str
+        How messages name the joints of the chain.
+    deserialise : callable
+        Makes a message of bytes and a message type.
+
+    Raises
+    ------
+    InputError
+        With the topics, and how far their values are apart.
+
+    """
+    heard: dict[str, dict[str, tuple[Stamps, FloatArray]]] = defaultdict(dict)
+    for (topic, name), parts in _joint_values(messages, deserialise).items():
+        if name in joint_names:
+            stamps = np.concatenate([each for each, _ in parts])
+            values = np.concatenate([each for _, each in parts])
+            order = np.argsort(stamps, kind='stable')
+            heard[topic][name] = stamps[order], values[order]
+    twice = [
+        (a, b, shared)
+        for a, b in itertools.combinations(sorted(heard), 2)
+        if (shared := [name for name in joint_names if name in heard[a] and name in heard[b]])
+    ]
+    if twice:
+        names = [name for name in joint_names if any(name in shared for *_, shared in twice)]
+        apart = '; '.join(_apart(a, b, heard[a], heard[b], shared) for a, b, shared in twice)
+        raise InputError(
+            f'joints {", ".join(names)} come on several topics: {apart}. Choose the measured one '
+            '(or several that name different joints) with --joint-topics'
+        )
+
+
+def _joint_values(
+    messages: Iterator[tuple[Stream, bytes]], deserialise: Callable[[bytes, str], Any]
+) -> dict[tuple[str, str], list[tuple[Stamps, FloatArray]]]:
+    """Return stamps and values by topic and joint."""
+    found = defaultdict(list)
+    for batch in _batches(messages):
+        groups = decoded(batch)
+        for k in sorted(set(range(len(batch))).difference(*(each.places for each in groups))):
+            stream, data = batch[k]
+            try:
+                reading = joint_state(deserialise(data, stream.type))
+            except Exception:  # it is counted when it is replayed
+                continue
+            for name, value in zip(reading.names, reading.values, strict=True):
+                part = np.array([reading.stamp_ns]), np.array([value], dtype=np.float64)
+                found[stream.topic, name].append(part)
+        for group in groups:
+            assert isinstance(group.readings, JointReadings)
+            stamps, names, values = group.readings
+            for name, column in zip(names, values.T, strict=True):
+                found[group.stream.topic, name].append((stamps, column))
+    return found
+
+
+def _batches(
+    messages: Iterator[tuple[Stream, bytes]],
+) -> Iterator[list[tuple[Stream, bytes]]]:
+    """Yield messages by the batch; what is wrong with a recording is told when it is replayed."""
+    ended = False
+    while not ended:
+        batch: list[tuple[Stream, bytes]] = []
+        try:
+            batch.extend(itertools.islice(messages, 2000))
+            ended = not batch
+        except Exception:
+            ended = True
+        yield batch
+
+
+def _apart(
+    a: str,
+    b: str,
+    first: Mapping[str, tuple[Stamps, FloatArray]],
+    second: Mapping[str, tuple[Stamps, FloatArray]],
+    names: Sequence[str],
+) -> str:
+    """Return in words by how much the joint values on two topics differ at the same time."""
+    largest: tuple[float, str] | None = None
+    for name in names:
+        dense, sparse = sorted((first[name], second[name]), key=lambda each: -len(each[0]))
+        begin, end = dense[0][[0, -1]]
+        known = (sparse[0] >= begin) & (sparse[0] <= end)
+        if known.any():
+            there = np.interp(sparse[0][known] - begin, dense[0] - begin, dense[1])
+            error = float(np.abs(sparse[1][known] - there).max())
+            largest = max(largest or (error, name), (error, name))
+    if largest is None:
+        return f'{a} and {b} never come at the same time'
+    if largest[0] < SAME:
+        return f'{a} and {b} are the same'
+    return f'{a} and {b} differ by up to {largest[0]:.3g} rad or m, as for {largest[1]}'
+
+
+def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
+    """Return the sources of a bag by their types; one at most is fitted."""
+    own = outputs(available)
+    sources = [
+        parse_source(f'{topic} type={kind}')
+        for topic, kind in available.items()
+        if kind in DECODERS and topic not in own
+    ]
+    fitted = sorted(source.topic for source in sources if not source.validation)
+    if len(fitted) > 1:
+        raise InputError(
+            'the bag has several pose topics, choose one or more with --sources: '
+            f'{", ".join(fitted)}; it holds {_contents(available)}'
+        )
+    return tuple(sources)
+
+
+def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
+    return InputError(
+        f'the bag has no {what} ({", ".join(map(_short, types))}); it holds {_contents(available)}'
+    )
+
+
+def _short(kind: str) -> str:
+    """Return the name of a type without its package."""
+    return kind.rpartition('/')[2]
+
+
+def _contents(available: Mapping[str, str]) -> str:
+    own = outputs(available)
+    return (
+        ', '.join(
+            f'{t} (own output)' if t in own else f'{t} ({_short(kind)})'
+            for t, kind in sorted(available.items())
+        )
+        or 'nothing'
+    )

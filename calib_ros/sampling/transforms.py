@@ -1,0 +1,290 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements out of the transforms between frames that come on /tf and /tf_static.
+
+A source names two frames. Between them there must be one link that moves; what stands still
+before and after it, in either direction, is composed with it at its stamps. Several moving links
+are refused: at one moment only one of them is known, and mostly they are the robot's own joints,
+by which it would be measured with itself.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.cdr import Layout
+from calib_ros.sampling.messages import Readings
+from calib_ros.sampling.sources import Source
+from calib_ros.sampling.track import Stamps
+
+Pair: TypeAlias = tuple[str, str]
+"""Names of the parent and the child frame of a link."""
+
+STATIC = '_static'
+"""What the name of the topic of links that stand still ends with."""
+HELD = 20_000
+"""Transforms that wait for the frames between which they are."""
+SAME = 1e-9
+"""A link that stands still may come again with numbers that differ by less."""
+LISTED = 20
+"""Links that are named when none of them was chosen."""
+
+
+class Route(NamedTuple):
+    """T_parent_child is `before` times the moving link, or its inverse, times `after`."""
+
+    link: Pair
+    inverse: bool
+    before: FloatArray
+    after: FloatArray
+
+
+@dataclass
+class Seen:
+    """How often a moving link has come, and its first and last stamp."""
+
+    count: int
+    first_ns: int
+    last_ns: int
+
+    @property
+    def rate(self) -> float:
+        """Return the mean rate [Hz], by the stamps; 0 when it is not known."""
+        span = 1e-9 * (self.last_ns - self.first_ns)
+        return (self.count - 1) / span if span > 0.0 else 0.0
+
+
+class Links:
+    """The links between frames, and what sources make of them.
+
+    Parameters
+    ----------
+    topic : str
+        Of the links that move; those that stand still come on the same with _static behind it.
+    sources : sequence of Source
+        What is measured on it.
+
+    """
+
+    def __init__(self, topic: str, sources: Sequence[Source] = ()) -> None:
+        self.topic = topic
+        self.sources = tuple(sources)
+        self._fixed: dict[Pair, FloatArray] = {}
+        self._moving: dict[Pair, Seen] = {}
+        self._changed: set[Pair] = set()
+        self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
+        self._known = False  # whether the routes are up to date
+        self._wanted: set[Pair] = set()
+        self._open = True  # whether frames of a source are not linked yet
+        self.layouts: dict[int, list[Layout]] = {}
+        """How its messages are laid out, by their length."""
+        self._held: deque[tuple[Pair, Stamps, FloatArray]] = deque()
+        self._count = 0
+
+    def fix(self, link: Pair, numbers: FloatArray) -> None:
+        """Learn a link that stands still: position and quaternion (7)."""
+        matrix = se3.transform(se3.from_quat(numbers[3:]), numbers[:3])
+        before = self._fixed.get(link)
+        if before is None:
+            self._fixed[link] = matrix
+            self._known = False
+        elif not np.allclose(before, matrix, rtol=0.0, atol=SAME):
+            self._changed.add(link)
+            self._known = False
+
+    def move(self, link: Pair, count: int, first_ns: int, last_ns: int) -> None:
+        """Learn that a moving link has come."""
+        seen = self._moving.get(link)
+        if seen is None:
+            self._moving[link] = Seen(count, first_ns, last_ns)
+            self._known = False
+            return
+        seen.count += count
+        seen.first_ns, seen.last_ns = min(seen.first_ns, first_ns), max(seen.last_ns, last_ns)
+
+    def wanted(self, link: Pair) -> bool:
+        """Tell whether the numbers of a link are of use, now or perhaps later."""
+        self._update()
+        return self._open or link in self._wanted
+
+    def measured_by(self, link: Pair) -> list[Source]:
+        """Return the sources that a link measures."""
+        self._update()
+        return [source for source, _ in self._of(link)]
+
+    def readings(
+        self, link: Pair, stamps: Stamps, numbers: FloatArray
+    ) -> list[tuple[Source, Readings]]:
+        """Return what sources make of a moving link: numbers (N, 7) at stamps (N,).
+
+        Where the frames between are not known yet, it waits for them.
+        """
+        self._update()
+        if self._open:
+            self._held.append((link, stamps, numbers))
+            self._count += len(stamps)
+            while self._count > HELD:
+                self._count -= len(self._held.popleft()[1])
+        return [
+            (source, self._reading(source, route, stamps, numbers))
+            for source, route in self._of(link)
+        ]
+
+    def released(self) -> list[tuple[Source, Readings]]:
+        """Return what sources make of what has waited, as far as frames are known by now."""
+        before = dict(self._routes)
+        self._update()
+        fresh = {
+            source: route
+            for source, route in self._routes.items()
+            if before[source] == '' and isinstance(route, Route)
+        }
+        found = [
+            (source, self._reading(source, route, stamps, numbers))
+            for link, stamps, numbers in (self._held if fresh else ())
+            for source, route in fresh.items()
+            if route.link == link
+        ]
+        if not self._open:
+            self._held.clear()
+            self._count = 0
+        return found
+
+    def problems(self) -> list[str]:
+        """Return in words why sources measure nothing, with what to use instead."""
+        if not (self._fixed or self._moving):
+            return []
+        self._update()
+        found = []
+        for source, route in self._routes.items():
+            if isinstance(route, Route):
+                continue
+            words = route or f'nothing links frame "{source.child}" to "{source.parent}"'
+            found.append(f'{words} on {self.topic}; {self}')
+        return found
+
+    def __str__(self) -> str:
+        """Return in words which links move and how often they come, those that stand out first."""
+        if not self._moving:
+            return f'nothing moves on {self.topic}'
+        order = sorted(self._moving, key=lambda link: (not self._stands_alone(link), link))
+        listed = [
+            f'{parent} to {child} at {self._moving[parent, child].rate:.0f} Hz'
+            for parent, child in order[:LISTED]
+        ]
+        if len(order) > LISTED:
+            listed.append(f'{len(order) - LISTED} more')
+        words = f'what moves on {self.topic}: {", ".join(listed)}'
+        parent, child = order[0]
+        if not self._stands_alone(order[0]):
+            return f'{words}; they hang on one another, as the joints of a robot do'
+        return (
+            f'{words}; name what a device measures, such as '
+            f'--sources "{self.topic} parent={parent} child={child}"'
+        )
+
+    # Details
+
+    def _stands_alone(self, link: Pair) -> bool:
+        """Tell whether no other moving link is above or below it, as in the chain of an arm."""
+        parent, child = link
+        above = [pair for frame in self._above(parent)[0] for pair in self._to(frame)]
+        below = [pair for pair in self._moving if child in self._above(pair[0])[0]]
+        return not below and not any(pair in self._moving for pair in above)
+
+    def _of(self, link: Pair) -> Iterator[tuple[Source, Route]]:
+        for source, route in self._routes.items():
+            if isinstance(route, Route) and route.link == link:
+                yield source, route
+
+    def _update(self) -> None:
+        if not self._known:
+            self._routes = {source: self._route(source) for source in self.sources}
+            routes = self._routes.values()
+            self._wanted = {route.link for route in routes if isinstance(route, Route)}
+            self._open = '' in routes
+            self._known = True
+
+    def _route(self, source: Source) -> Route | str:
+        """Return how a source is measured; else why not in words, empty when it may come yet."""
+        path = self._path(source.parent, source.child)
+        if isinstance(path, str):
+            return path
+        links = [link for link, _ in path]
+        name = f'from {source.parent} to {source.child}'
+        for link in links:
+            if link in self._moving and link in self._fixed:
+                return (
+                    f'{" to ".join(link)} comes on both {self.topic} and {self.topic}{STATIC}, '
+                    'one is needed'
+                )
+            if link in self._changed:
+                return f'{" to ".join(link)} has changed on {self.topic}{STATIC}: measure again'
+        moving = [k for k, link in enumerate(links) if link in self._moving]
+        if not moving:
+            return f'nothing moves {name}'
+        if len(moving) > 1:
+            names = ', '.join(' to '.join(links[k]) for k in moving)
+            return (
+                f'{len(moving)} links move {name} ({names}), and only one may: name frames '
+                'between which a device measures, not joints of the robot'
+            )
+        (k,) = moving
+        return Route(*path[k], self._composed(path[:k]), self._composed(path[k + 1 :]))
+
+    def _path(self, parent: str, child: str) -> list[tuple[Pair, bool]] | str:
+        """Return the links from one frame to another, and which of them are to be inverted."""
+        for link, inverse in (((parent, child), False), ((child, parent), True)):
+            if link in self._moving:  # measured directly, whatever else is known of the frames
+                return [(link, inverse)]
+        first, ambiguous = self._above(child)
+        second, also = self._above(parent)
+        common = next((frame for frame in first if frame in second), None)
+        if common is None:
+            return ambiguous or also
+        down = [(self._to(frame)[0], False) for frame in first[: first.index(common)]]
+        up = [(self._to(frame)[0], True) for frame in second[: second.index(common)]]
+        return [*up, *reversed(down)]
+
+    def _above(self, frame: str) -> tuple[list[str], str]:
+        """Return a frame and those above it; and what is wrong with the last one, if anything."""
+        frames = [frame]
+        while links := self._to(frames[-1]):
+            if len(links) > 1:
+                parents = ' and '.join(parent for parent, _ in links)
+                return frames, (
+                    f'frame "{frames[-1]}" has several parents, {parents}: what is measured needs '
+                    'a frame name of its own'
+                )
+            if links[0][0] in frames:
+                return frames, f'frame "{frames[-1]}" is above itself'
+            frames.append(links[0][0])
+        return frames, ''
+
+    def _to(self, frame: str) -> list[Pair]:
+        """Return the links from parents of a frame."""
+        return sorted(
+            {link for each in (self._fixed, self._moving) for link in each if link[1] == frame}
+        )
+
+    def _composed(self, path: Sequence[tuple[Pair, bool]]) -> FloatArray:
+        matrix = np.eye(4)
+        for link, inverse in path:
+            matrix = matrix @ (se3.invert(self._fixed[link]) if inverse else self._fixed[link])
+        return matrix
+
+    def _reading(
+        self, source: Source, route: Route, stamps: Stamps, numbers: FloatArray
+    ) -> Readings:
+        if route.inverse or route.link != (source.parent, source.child):
+            links = se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
+            found = route.before @ (se3.invert(links) if route.inverse else links) @ route.after
+            numbers = np.hstack([found[:, :3, 3], se3.to_quat(found[:, :3, :3])])
+        return Readings(stamps, source.parent, source.child, False, numbers)

@@ -1,0 +1,364 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib_ros.apply import simulation
+from calib_ros.apply.candidates import Visibility
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.design import Design
+from calib_ros.apply.iso9283 import iso_9283_poses
+from calib_ros.apply.verification import in_words, rms_limits, verify
+from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.cli.main import main
+from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.waypoints import csv_of, joint_columns, joints_csv, read_joints
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import invert, to_quat
+from calib_ros.report.words import as_document, calibration_yaml
+
+UR = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+
+
+@pytest.fixture(scope='module')
+def cell():
+    """Return a true arm and its identification."""
+    rng = np.random.default_rng(0)
+    true = simulation.faulty(UR, simulation.Cell(), rng)
+    seen = simulation.measure(true, UR.random_joints(40, rng), rng, *NOISE)
+    return true, identify(Problem(UR, seen))
+
+
+@pytest.fixture(scope='module')
+def arm(cell):
+    return CalibratedArm.of(cell[1])
+
+
+def design_of(chain, oriented=True):
+    rng = np.random.default_rng(0)
+    imagined = simulation.measure(chain, np.zeros((1, len(chain.joints))), rng, oriented=oriented)
+    return Design.of(Problem(chain, imagined))
+
+
+def measured(true, joints, repeats=3, noise=NOISE, seed=1):
+    rng = np.random.default_rng(seed)
+    return simulation.measure(true, np.repeat(joints, repeats, axis=0), rng, *noise)
+
+
+def with_errors(arm, errors):
+    """Return observations whose position errors by the calibrated arm are (N, 3) [m]."""
+    seen = measured(arm.after, UR.random_joints(len(errors), np.random.default_rng(2)), 1, (0, 0))
+    return replace(seen, positions=seen.positions + errors)
+
+
+# Test poses
+
+
+@pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14', 'denso_hsr065'])
+def test_the_test_poses_are_those_of_the_standard(name, rng):
+    chain = replace(load_chain(name), base=simulation.random_frame(rng, 2.0))
+    design = design_of(chain)
+    found = iso_9283_poses(design, rng)
+    poses = invert(chain.base.matrix) @ design.targets(found.joints)
+    np.testing.assert_allclose(poses[:, :3, :3], poses[:1, :3, :3].repeat(5, 0), atol=1e-6)
+    away = (poses[1:, :3, 3] - poses[0, :3, 3]) / found.edge
+    np.testing.assert_allclose(np.abs(away), 0.4, atol=1e-6)  # a tenth of the diagonal from it
+    np.testing.assert_allclose(away[:, 0], away[:, 2], atol=1e-6)  # in one plane through P1
+    assert len(np.unique(away.round(3), axis=0)) == 4
+    assert np.abs(poses[0, :2, 3]).max() > 0.5 * found.edge  # the arm does not stand in it
+    assert found.edge > 0.25
+    limits = np.array([[joint.lower, joint.upper] for joint in chain.joints])
+    assert ((limits[:, 0] <= found.joints) & (found.joints <= limits[:, 1])).all()
+
+
+def test_the_test_poses_are_seen(rng):
+    design = design_of(UR)
+    seen = Visibility(np.array([[0.2, -0.5, 0.2], [1.0, 0.5, 1.0]]), np.array([3.0, 0.0, 1.0]))
+    found = iso_9283_poses(design, rng, seen)
+    assert seen.sees(design, found.joints).all()
+    assert 0.2 < found.edge < 0.8
+
+
+def test_an_arm_that_keeps_no_orientation_is_told_so(rng):
+    with pytest.raises(InputError, match='keeps one orientation in no cube'):
+        iso_9283_poses(design_of(load_chain('kuka_youbot')), rng)
+
+
+# The verdict
+
+
+def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
+    """Commands compensated by the calibration: what is wanted against what is reached."""
+    true, result = cell
+    wanted = UR.random_joints(200, np.random.default_rng(4))
+    moved = compensate(Compensator(UR, result.chain), wanted).joints
+    moved = moved[~np.isnan(moved).any(axis=1)]
+    wanted = wanted[~np.isnan(compensate(Compensator(UR, result.chain), wanted).joints[:, 0])]
+    found = verify(arm, [measured(true, moved, 1, (0.0, 0.0))], 1e-3)
+    frames = {'base': result.chain.base, 'tool': result.chain.tool}
+    meant = replace(UR, **frames).forward(wanted)[:, :3, 3]
+    missed = np.linalg.norm(true.forward(moved)[:, :3, 3] - meant, axis=1)
+    assert found.rms == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-6)
+    before, after = found.comparison.figures
+    assert before.rms_mm > 10.0 * after.rms_mm
+
+
+def test_a_correction_that_did_not_arrive_shows(cell, arm):
+    """Against what was commanded: corrected commands pass, uncorrected ones do not."""
+    true, result = cell
+    meant = iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints
+    moved = compensate(Compensator(UR, result.chain), meant).joints
+    for joints, verdict in ((moved, 'PASS'), (meant, 'FAIL')):
+        seen = [measured(true, joints[::-1])]
+        found = verify(arm, seen, 5e-4, commanded=meant)
+        assert found.verdict == verdict
+        assert verify(arm, seen, 5e-4).verdict == 'PASS'  # the calibration itself is right
+    corrected = verify(arm, [measured(true, moved)], 5e-4, commanded=meant)
+    by_model = verify(arm, [measured(true, moved)], 5e-4)
+    assert corrected.rms == pytest.approx(by_model.rms, rel=1e-6)
+    assert found.rms == pytest.approx(1e-3 * found.comparison.figures[0].rms_mm, rel=0.5)
+    moved[3, 5] += 0.3
+    with pytest.raises(InputError, match=r'measurement 10 was taken 0\.[23]\d* rad or m from'):
+        verify(arm, [measured(true, moved)], 1e-3, commanded=meant)
+
+
+def test_pass_fail_and_undecided(cell, arm):
+    true, _ = cell
+    seen = [measured(true, iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints)]
+    rms = verify(arm, seen, 1.0).rms
+    found = {scale: verify(arm, seen, scale * rms) for scale in (0.4, 1.0, 3.0)}
+    assert [each.verdict for each in found.values()] == ['FAIL', 'UNDECIDED', 'PASS']
+    assert all(each.lower < rms < each.upper for each in found.values())
+    assert found[1.0].needed is None  # exactly at the tolerance nothing decides
+    near = verify(arm, seen, 1.2 * rms)
+    assert near.verdict == 'UNDECIDED'
+    assert 5 < near.needed < 500
+    assert f'about {near.needed} configurations' in in_words(near)
+
+
+@pytest.mark.parametrize('shape', [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.1, 0.1)])
+@pytest.mark.parametrize('count', [5, 12])
+def test_the_limits_hold_as_often_as_they_say(arm, shape, count):
+    rng = np.random.default_rng(5)
+    shape = 1e-4 * np.array(shape)
+    truth = np.sqrt((shape**2).sum())
+    held = []
+    for _ in range(400):
+        errors = rng.normal(size=(count, 3)) * shape
+        found = verify(arm, [with_errors(arm, errors)], 1e-4)
+        held.append((found.lower <= truth, truth <= found.upper))
+    least = stats.binom.ppf(1e-3, 400, 0.94) / 400
+    assert (np.mean(held, axis=0) > least).all()
+    assert np.mean(held) < 0.995  # wide enough, and no wider
+
+
+def test_limits_are_those_of_the_chi_squared_distribution():
+    rng = np.random.default_rng(0)
+    lower, upper = rms_limits(1.0, np.array([15.0]), 0.9)
+    squares = rng.chisquare(15.0, 100_000) / 15.0
+    assert np.mean(squares < 1.0 / upper[0] ** 2) == pytest.approx(0.1, abs=0.005)
+    assert np.mean(squares > 1.0 / lower[0] ** 2) == pytest.approx(0.1, abs=0.005)
+
+
+def test_repeats_do_not_count_as_more_configurations(arm):
+    errors = np.random.default_rng(0).normal(scale=1e-4, size=(6, 3))
+    once = with_errors(arm, errors)
+    often = once.select(np.tile(np.arange(6), 10))
+    first, second = (verify(arm, [each], 1e-4) for each in (once, often))
+    assert second.configurations == first.configurations == 6
+    assert second.upper == pytest.approx(first.upper, rel=1e-9)
+
+
+def test_a_device_that_stands_elsewhere(cell, arm):
+    true, _ = cell
+    joints = UR.random_joints(30, np.random.default_rng(3))
+    there = simulation.random_frame(np.random.default_rng(9), 3.0)
+    moved = replace(true, base=replace(true.base, matrix=there.matrix @ true.base.matrix))
+    seen = [measured(moved, joints)]
+    lost = verify(arm, seen, 3e-4)
+    assert lost.verdict == 'FAIL'
+    assert 'was the measuring device moved?' in in_words(lost)
+    found = verify(arm, seen, 3e-4, new_base=True)
+    assert found.verdict == 'PASS'
+    same = verify(arm, [measured(true, joints)], 3e-4)
+    assert same.verdict == 'PASS'
+    assert found.rms == pytest.approx(same.rms, rel=0.1)
+    assert found.upper / found.rms > same.upper / same.rms
+    assert 'moved' not in in_words(same)
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_target_that_was_mounted_anew(cell, arm, oriented):
+    """Its change counts as the arm's error unless its frame is fitted as well."""
+    true, _ = cell
+    there, tool = (simulation.random_frame(np.random.default_rng(k), 0.3) for k in (9, 10))
+    moved = replace(true, base=there, tool=tool)
+    joints = UR.random_joints(40, np.random.default_rng(3))
+    seen = [simulation.measure(moved, joints, np.random.default_rng(1), *NOISE, oriented)]
+    assert verify(arm, seen, 3e-4, new_base=True).verdict == 'FAIL'
+    found = verify(arm, seen, 3e-4, new_base=True, new_tool=True)
+    same = verify(arm, [measured(true, joints, 1)], 3e-4)
+    assert found.verdict == 'PASS'
+    assert found.rms == pytest.approx(same.rms, rel=0.15)
+    assert found.fitted == ('base', 'tool')
+    before, after = found.comparison.figures
+    assert 0.5 < before.rms_mm < 5.0
+    assert after.rms_mrad is None or after.rms_mrad < 1.0
+    with pytest.raises(InputError, match='7 configurations were measured, at least 8'):
+        verify(arm, [seen[0].select(np.arange(7))], 3e-4, new_base=True, new_tool=True)
+
+
+def test_a_new_target_alone(cell, arm):
+    true, _ = cell
+    moved = replace(true, tool=simulation.random_frame(np.random.default_rng(10), 0.3))
+    joints = UR.random_joints(40, np.random.default_rng(3))
+    assert verify(arm, [measured(moved, joints)], 3e-4, new_tool=True).verdict == 'PASS'
+
+
+def test_the_better_calibration_wins_on_a_session_of_its_own(cell, arm):
+    """With a tool of an earlier session, the worse one may look better."""
+    true, result = cell
+    tool = result.chain.frame('tool').matrix.copy()
+    tool[:3, 3] += [2e-3, -1e-3, 1e-3]
+    moved = replace(true, tool=replace(true.tool, matrix=tool))
+    seen = [measured(moved, UR.random_joints(40, np.random.default_rng(3)))]
+    half = result.chain.with_offsets({'elbow_joint.theta': 5e-4, 'wrist_1_joint.a': 5e-4})
+    shifted = half.with_frame('tool', replace(half.frame('tool'), matrix=tool))
+    worse = CalibratedArm(arm.before, shifted)
+    wrong = [verify(each, seen, None, new_base=True).rms for each in (arm, worse)]
+    right = [verify(each, seen, None, new_base=True, new_tool=True).rms for each in (arm, worse)]
+    assert wrong[0] > wrong[1]
+    assert right[0] < 0.5 * right[1]
+
+
+def test_limits_hold_where_some_places_are_worse_than_others(arm):
+    """As compliance leaves them: squares that scatter more than those of Gaussian noise."""
+    rng = np.random.default_rng(0)
+    held = []
+    for _ in range(300):
+        size = 1e-4 * np.abs(rng.normal(size=(20, 1)))
+        found = verify(arm, [with_errors(arm, size * rng.normal(size=(20, 3)))], None)
+        held.append((found.lower <= 1e-4 * np.sqrt(3.0), 1e-4 * np.sqrt(3.0) <= found.upper))
+    assert (np.mean(held, axis=0) > stats.binom.ppf(1e-3, 300, 0.94) / 300).all()
+
+
+def test_a_session_is_judged_without_a_tolerance(arm, cell):
+    found = verify(arm, [measured(cell[0], UR.random_joints(10, np.random.default_rng(0)))], None)
+    assert (found.verdict, found.needed, found.tolerance) == ('JUDGED', None, None)
+    words = in_words(found)
+    assert 'wanted is' not in words
+    assert '\nthe RMS error over poses like these is below 0.' in words
+
+
+def test_the_fitted_frame_costs_its_freedom(arm):
+    """Errors that are noise alone: their size is found, though a frame was fitted to them."""
+    rng = np.random.default_rng(3)
+    squares = [
+        verify(arm, [with_errors(arm, rng.normal(scale=1e-4, size=(7, 3)))], 1, new_base=True).rms
+        ** 2
+        for _ in range(200)
+    ]
+    assert np.sqrt(np.mean(squares)) == pytest.approx(1e-4 * np.sqrt(3.0), rel=0.06)
+
+
+def test_what_cannot_be_verified_is_refused(cell, arm):
+    true, _ = cell
+    joints = UR.random_joints(6, np.random.default_rng(0))
+    seen = measured(true, joints)
+    for tolerance, confidence in ((0.0, 0.95), (1e-3, 0.4), (1e-3, 1.0), (np.nan, 0.95)):
+        with pytest.raises(ConfigError, match='tolerance must be positive'):
+            verify(arm, [seen], tolerance, confidence)
+    with pytest.raises(InputError, match='4 configurations were measured, at least 5'):
+        verify(arm, [measured(true, joints[:4])], 1e-3)
+    with pytest.raises(InputError, match='6 configurations were measured, at least 7'):
+        verify(arm, [seen], 1e-3, new_base=True)
+    with pytest.raises(InputError, match='not base_other and tool'):
+        verify(arm, [replace(seen, base='base_other')], 1e-3)
+    with pytest.raises(InputError, match='not distances'):
+        verify(arm, [replace(seen, distances=np.ones(len(seen)))], 1e-3)
+
+
+# On the command line
+
+
+@pytest.fixture
+def folder(cell, tmp_path, monkeypatch):
+    import json
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'result').mkdir()
+    (tmp_path / 'result' / 'calibration.yaml').write_text(calibration_yaml(cell[1]))
+    (tmp_path / 'result' / 'result.json').write_text(json.dumps(as_document(cell[1], {})))
+    return tmp_path
+
+
+def write_table(path, seen):
+    columns = (*joint_columns(6), 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+    values = np.column_stack([seen.joints, seen.positions, to_quat(seen.rotations)])
+    path.write_text(csv_of(columns, values))
+
+
+def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
+    """Plan the test poses, correct them, measure the real arm there, and judge."""
+    true, _ = cell
+    assert main(['plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv']) == 0
+    assert 'P1 to P5 of ISO 9283 in a cube of' in capsys.readouterr().out
+    correct = ['compensate', 'tests.csv', '--chain', 'ur10e', '--out', 'corrected.csv']
+    assert main([*correct, '--calibration', 'result/calibration.yaml']) == 0
+    capsys.readouterr()
+    write_table(folder / 'measured.csv', measured(true, read_joints(folder / 'corrected.csv', UR)))
+    judge = ['verify', 'measured.csv', '--commanded', 'tests.csv', '--chain', 'ur10e']
+    judge.append('--calibration')
+    for calibration in ('result', 'result/calibration.yaml'):
+        assert main([*judge, calibration, '--new-tool', '--new-base']) == 1
+        assert 'at least 8 are needed' in capsys.readouterr().err
+        for tolerance, status, word in (('1', 0, 'PASS'), ('0.01', NOT_ACCEPTED, 'FAIL')):
+            assert main([*judge, calibration, '--tolerance', tolerance]) == status
+            out = capsys.readouterr().out
+            assert f'\n{word}: the RMS error over poses like these is below 0.' in out
+            assert 'about the calibration' not in out
+            assert '15 measurements in 5 configurations' in out
+            assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
+
+
+def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, capsys):
+    """Its joint values tell of the calibration alone."""
+    q = UR.random_joints(8, np.random.default_rng(3))
+    (folder / 'program.csv').write_text(joints_csv(q))
+    write_table(folder / 'measured.csv', measured(cell[0], q))
+    common = ['verify', 'measured.csv', '--chain', 'ur10e', '--calibration', 'result']
+    common += ['--tolerance', '1']
+    assert main(common) == 0
+    assert 'about the calibration: whether its correction arrives' in capsys.readouterr().out
+    assert main([*common, '--commanded', 'program.csv']) == NOT_ACCEPTED
+    assert 'about the calibration' not in capsys.readouterr().out
+
+
+def test_verify_refuses_what_makes_no_sense(cell, folder, capsys):
+    write_table(folder / 'measured.csv', measured(cell[0], UR.random_joints(3, np.random)))
+    common = ['verify', 'measured.csv', '--chain', 'ur10e', '--calibration', 'result']
+    for arguments, text in (
+        ([*common, '--tolerance', '1'], 'at least 5 are needed'),
+        ([*common, '--tolerance', '0'], 'tolerance must be positive'),
+        ([*common, '--tolerance', 'inf'], 'tolerance must be positive'),
+        ([*common[:-1], 'missing', '--tolerance', '1'], 'missing'),
+        (['verify', 'none.csv', *common[2:], '--tolerance', '1'], 'cannot read none.csv'),
+    ):
+        assert main(arguments) == 1
+        assert text in capsys.readouterr().err
+
+
+def test_plan_writes_test_poses_that_are_seen(folder, capsys):
+    common = ['plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv']
+    assert main([*common, '--box', '0.2', '-0.5', '0.2', '1', '0.5', '1']) == 0
+    joints = read_joints(folder / 'tests.csv', UR)
+    design = design_of(UR)
+    positions = design.targets(joints)[:, :3, 3]
+    assert ((positions > [0.2, -0.5, 0.2]) & (positions < [1.0, 0.5, 1.0])).all()
+    assert joints_csv(joints) == (folder / 'tests.csv').read_text()

@@ -1,0 +1,471 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import json
+
+import numpy as np
+import pytest
+import yaml
+from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
+
+from calib_ros.apply import simulation
+from calib_ros.cli.main import NOT_ACCEPTED, RESULT_FILES, main
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        capsys.readouterr()
+        status = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return run
+
+
+@pytest.fixture
+def table(tmp_path):
+    return write_csv(tmp_path / 'cell.csv', rows_of(measured()))
+
+
+@pytest.fixture
+def identified(run):
+    """Return a function that identifies and returns status and JSON document."""
+
+    def identified(*arguments):
+        status, out, err = run('identify', '--json', *arguments)
+        assert err == ''
+        return status, json.loads(out)
+
+    return identified
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def assert_same_result(found, expected, tolerance):
+    assert found['parameters'].keys() == expected['parameters'].keys()
+    for name, parameter in expected['parameters'].items():
+        for key in ('value', 'offset', 'std'):
+            assert found['parameters'][name][key] == pytest.approx(parameter[key], abs=tolerance)
+    for when in ('before', 'after'):
+        assert found['validation'][when] == pytest.approx(
+            expected['validation'][when], abs=1e6 * tolerance
+        )
+
+
+def test_json_is_one_document_with_all_the_keys(identified, table):
+    status, document = identified('--csv', table, '--chain', 'ur5e')
+    assert status == 0
+    assert document['accepted'] is True
+    assert document['converged'] is True
+    assert document['rank'] == 30
+    assert set(document['unidentifiable']) == {
+        *(f'shoulder_pan_joint.{kind}' for kind in ('d', 'theta')),
+        *(f'wrist_3_joint.{kind}' for kind in ('a', 'alpha', 'd', 'theta')),
+    }
+    assert document['samples'] == {'samples': TRAIN, 'held_out': TEST, 'sets': 1}
+    assert document['parameters'].keys() == set(UR.parameter_names)
+    for name, parameter in document['parameters'].items():
+        assert isinstance(parameter['value'], float)
+        assert isinstance(parameter['offset'], float)
+        if name in document['unidentifiable']:
+            assert parameter['std'] is None
+            assert parameter['offset'] == 0.0
+        else:
+            assert 0.0 < parameter['std'] < 1e-3
+    for when in ('before', 'after'):
+        assert document['validation'][when].keys() >= FIGURES
+        assert document['validation'][when]['count'] == TEST
+    before, after = (document['validation'][when]['rms_mm'] for when in ('before', 'after'))
+    assert after < 0.2 < 0.5 < before
+
+
+def test_json_of_positions_only(identified, tmp_path):
+    path = write_csv(tmp_path / 'points.csv', rows_of(measured(oriented=False)))
+    status, document = identified('--csv', path, '--chain', 'ur5e')
+    assert status == 0
+    assert document['rank'] == 27
+    assert document['validation']['after']['rms_mrad'] is None
+    assert document['validation']['after']['rms_mm'] < 0.2
+
+
+def test_the_identified_parameters_are_the_true_ones(identified, table):
+    _, document = identified('--csv', table, '--chain', 'ur5e')
+    deviations = [
+        (parameter['value'] - TRUE.value(name)) / parameter['std']
+        for name, parameter in document['parameters'].items()
+        if parameter['std'] is not None and name.partition('.')[0] not in ('base', 'tool')
+    ]
+    assert len(deviations) == 18
+    assert np.abs(deviations).max() < 4.0
+    assert 0.4 < np.sqrt(np.mean(np.square(deviations))) < 1.7
+
+
+def test_without_json_one_line_says_the_result(run, table):
+    status, out, err = run('identify', '--csv', table, '--chain', 'ur5e')
+    assert (status, err) == (0, '')
+    assert out.startswith('accepted: 30 samples, RMS ')
+    assert out.count('\n') == 1
+    assert f'{TEST} held-out samples' in out
+
+
+def test_out_writes_every_file(run, table, tmp_path):
+    out = tmp_path / 'deep' / 'result'
+    assert run('identify', '--csv', table, '--chain', 'ur5e', '--out', out)[0] == 0
+    files = contents(out)
+    assert files.keys() == set(RESULT_FILES)
+    settings = yaml.safe_load(files['settings.yaml'])['/**']['ros__parameters']
+    assert settings['sigma_position'] == 1e-4
+    assert files['before_after.png'].startswith(b'\x89PNG')
+    assert json.loads(files['result.json'])['accepted'] is True
+    assert 'wrist_1_joint.theta' in files['report.md'].decode()
+
+
+def test_out_and_json_hold_the_same(run, table, tmp_path):
+    arguments = ('--csv', table, '--chain', 'ur5e', '--out', tmp_path / 'out', '--json')
+    _, out, _ = run('identify', *arguments)
+    assert json.loads(out) == json.loads((tmp_path / 'out' / 'result.json').read_text())
+
+
+@pytest.mark.parametrize('there', RESULT_FILES)
+def test_nothing_is_overwritten_without_force(run, table, tmp_path, there):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / there).write_text('precious')
+    (out / 'notes.txt').write_text('mine')
+    before = contents(out)
+    arguments = ('identify', '--csv', table, '--chain', 'ur5e', '--out', out)
+    status, said, err = run(*arguments)
+    assert (status, said) == (1, '')
+    assert there in err
+    assert '--force' in err
+    assert contents(out) == before
+    assert run(*arguments, '--force')[0] == 0
+    after = contents(out)
+    assert after.keys() == {*RESULT_FILES, 'notes.txt'}
+    assert after['notes.txt'] == b'mine'
+    assert after[there] != b'precious'
+
+
+def test_the_corrected_chain_is_a_chain_that_predicts(run, identified, table, tmp_path):
+    out = tmp_path / 'out'
+    run('identify', '--csv', table, '--chain', 'ur5e', '--out', out)
+    corrected = load_chain(out / 'calibration.yaml')
+    q = UR.random_joints(1000, np.random.default_rng(99))
+    error = corrected.forward(q) - TRUE.forward(q)
+    assert np.sqrt((error[:, :3, 3] ** 2).sum(axis=1).mean()) < 1e-4
+    assert np.abs(error[:, :3, :3]).max() < 1e-3
+    _, document = identified('--csv', table, '--chain', out / 'calibration.yaml')
+    before, after = (document['validation'][when]['rms_mm'] for when in ('before', 'after'))
+    assert before == pytest.approx(after, abs=1e-4)
+
+
+def test_rows_marked_test_never_influence_the_fit(identified, tmp_path):
+    rows = rows_of(measured())
+    _, expected = identified('--csv', write_csv(tmp_path / 'a.csv', rows), '--chain', 'ur5e')
+    rng = np.random.default_rng(1)
+    for row in rows[TRAIN:]:
+        row.update({key: float(rng.uniform(-3.0, 3.0)) for key in ('q1', 'q4', 'x', 'y', 'z')})
+        row.update(qx=0.0, qy=1.0, qz=0.0, qw=0.0)
+    status, wild = identified('--csv', write_csv(tmp_path / 'b.csv', rows), '--chain', 'ur5e')
+    assert status == NOT_ACCEPTED
+    for key in ('parameters', 'fitted', 'rank', 'unidentifiable', 'iterations', 'noise_in_sigma'):
+        assert wild[key] == expected[key]
+    assert wild['validation']['after']['rms_mm'] > 100.0
+
+
+def test_neither_order_nor_number_of_test_rows_influences_the_fit(identified, tmp_path):
+    rows = rows_of(measured())
+    _, expected = identified('--csv', write_csv(tmp_path / 'a.csv', rows), '--chain', 'ur5e')
+    mixed = [*rows[TRAIN + 3 :], *rows[:TRAIN], rows[TRAIN]]
+    _, found = identified('--csv', write_csv(tmp_path / 'b.csv', mixed), '--chain', 'ur5e')
+    assert found['parameters'] == expected['parameters']
+    assert found['samples']['held_out'] == TEST - 2
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('held_out', [TEST, 0])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_table_and_its_bag_give_the_same(run, identified, tmp_path, storage, held_out, oriented):
+    table = write_csv(tmp_path / 'cell.csv', rows_of(measured(oriented=oriented), held_out))
+    bag = tmp_path / 'bag'
+    status, out, err = run('csv2bag', table, bag, '--chain', 'ur5e', '--storage', storage)
+    assert (status, err) == (0, '')
+    assert f'{TRAIN + TEST - held_out} poses to fit, {held_out} held out' in out
+    status, from_table = identified('--csv', table, '--chain', 'ur5e')
+    status_of_bag, from_bag = identified(bag, '--chain', 'ur5e')
+    assert status_of_bag == status == 0
+    assert_same_result(from_bag, from_table, 1e-9)
+    assert from_bag['validation']['by'] == from_table['validation']['by']
+    samples = from_bag['samples']
+    assert (samples['samples'], samples['held_out']) == (TRAIN + TEST - held_out, held_out)
+    assert samples['dropped'] == {}
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_simulate_then_identify(run, identified, tmp_path, storage):
+    bag = tmp_path / 'cells' / 'bag'
+    status, out, err = run(
+        'simulate', bag, '--chain', 'ur5e', '--poses', 25, '--seed', 3, '--storage', storage
+    )
+    assert (status, err) == (0, '')
+    assert str(bag) in out
+    status, document = identified(bag, '--chain', 'ur5e')
+    assert status == 0
+    assert document['samples']['samples'] == 25
+    assert document['samples']['configurations'] == 25
+    truth = load_chain(bag.parent / 'bag_truth.yaml')
+    for name, parameter in document['parameters'].items():
+        if parameter['std'] is not None and name.partition('.')[0] not in ('base', 'tool'):
+            assert abs(parameter['value'] - truth.value(name)) < 5.0 * parameter['std']
+
+
+def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
+    truths = {}
+    for name, seed in (('a', 1), ('b', 1), ('c', 2)):
+        bag = tmp_path / name
+        run('simulate', bag, '--chain', 'ur5e', '--poses', 3, '--seed', seed)
+        truths[name] = (tmp_path / f'{name}_truth.yaml').read_text()
+    assert truths['a'] == truths['b'] != truths['c']
+
+
+def test_simulate_overwrites_nothing(run, tmp_path):
+    arguments = ('simulate', tmp_path / 'bag', '--chain', 'ur5e', '--poses', 3)
+    run(*arguments)
+    before = contents(tmp_path / 'bag') | {'t': (tmp_path / 'bag_truth.yaml').read_bytes()}
+    status, _, err = run(*arguments, '--seed', 7)
+    assert status == 1
+    assert 'exists already' in err
+    after = contents(tmp_path / 'bag') | {'t': (tmp_path / 'bag_truth.yaml').read_bytes()}
+    assert after == before
+
+
+def test_demo_shows_the_whole_way(run, tmp_path):
+    status, out, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
+    assert (status, err) == (0, '')
+    assert 'accepted' in out
+    assert 'elbow_joint.theta' in out
+    there = {path.name for path in (tmp_path / 'demo').iterdir()}
+    assert there == {*RESULT_FILES, 'bag', 'bag_truth.yaml'}
+    status, _, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
+    assert status == 1
+    assert '--force' in err
+    for note in ('notes.txt', 'bag/notes.txt'):
+        (tmp_path / 'demo' / note).write_text('mine')
+    again = run('demo', '--poses', 20, '--out', tmp_path / 'demo', '--force')
+    assert again == (0, out, '')
+    for note in ('notes.txt', 'bag/notes.txt'):
+        assert (tmp_path / 'demo' / note).read_text() == 'mine'
+
+
+def test_demo_of_another_robot(run, tmp_path):
+    status, out, _ = run(
+        'demo', '--chain', 'franka_panda', '--poses', 20, '--out', tmp_path / 'demo'
+    )
+    assert status == 0
+    assert 'panda_joint4.alpha' in out
+
+
+def nothing_to_gain(seed=5, held_out=TEST):
+    return rows_of(measured(UR, seed=seed), held_out)
+
+
+@pytest.mark.parametrize('held_out', [TEST, 0])
+@pytest.mark.parametrize('seed', [5, 6])
+def test_where_nothing_is_to_gain_nothing_is_claimed(run, tmp_path, seed, held_out):
+    table = write_csv(tmp_path / 'cell.csv', nothing_to_gain(seed, held_out))
+    out = tmp_path / 'out'
+    status, said, err = run('identify', '--csv', table, '--chain', 'ur5e', '--out', out)
+    assert (status, err) == (NOT_ACCEPTED, '')
+    assert NOT_ACCEPTED == 3
+    assert 'NOT accepted' in said
+    assert 'no gain on held-out poses' in said
+    assert contents(out).keys() == set(RESULT_FILES) - {'calibration.yaml'}
+    document = json.loads((out / 'result.json').read_text())
+    assert document['accepted'] is False
+    assert 'no gain on held-out poses' in document['refusals'][0]
+    assert 'no gain on held-out poses' in (out / 'report.md').read_text()
+
+
+def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, table, tmp_path):
+    out = tmp_path / 'out'
+    run('identify', '--csv', table, '--chain', 'ur5e', '--out', out)
+    accepted = (out / 'calibration.yaml').read_bytes()
+    worse = write_csv(tmp_path / 'worse.csv', nothing_to_gain())
+    arguments = ('identify', '--csv', worse, '--chain', 'ur5e', '--out', out, '--force')
+    assert run(*arguments)[0] == NOT_ACCEPTED
+    assert (out / 'calibration.previous.yaml').read_bytes() == accepted
+    assert not (out / 'calibration.yaml').exists()
+
+
+def test_not_accepted_is_json_as_well(identified, tmp_path):
+    table = write_csv(tmp_path / 'cell.csv', nothing_to_gain())
+    status, document = identified('--csv', table, '--chain', 'ur5e')
+    assert status == NOT_ACCEPTED
+    assert document['accepted'] is False
+
+
+def test_one_joint_that_never_moved_is_named(run, tmp_path):
+    rng = np.random.default_rng(2)
+    joints = UR.random_joints(30, rng)
+    joints[:, 3] = 0.7
+    table = write_csv(
+        tmp_path / 'cell.csv', rows_of(simulation.measure(TRUE, joints, rng, 5e-5, 2e-4), 0)
+    )
+    status, out, _ = run('identify', '--csv', table, '--chain', 'ur5e')
+    assert status == NOT_ACCEPTED
+    assert 'the poses do not determine' in out
+
+
+def test_fixed_parameters_stay_nominal(identified, table):
+    _, document = identified('--csv', table, '--chain', 'ur5e', '--fixed', '*.alpha,elbow*.a')
+    parameters = document['parameters']
+    held = {name for name in parameters if name.endswith('.alpha')} | {'elbow_joint.a'}
+    assert {name for name in parameters if parameters[name]['status'] == 'fixed'} == held
+    for name in held:
+        assert parameters[name]['offset'] == 0.0
+        assert parameters[name]['value'] == UR.value(name)
+        assert name not in document['unidentifiable']
+
+
+def test_one_session_of_several(identified, run, tmp_path):
+    rows = [{'session': 'A', **row} for row in rows_of(measured())]
+    rows += [{'session': 'B', **row} for row in rows_of(measured(UR, seed=8))]
+    table = write_csv(tmp_path / 'cell.csv', rows)
+    status, _, err = run('identify', '--csv', table, '--chain', 'ur5e')
+    assert status == 1
+    assert 'A, B' in err
+    assert identified('--csv', table, '--chain', 'ur5e', '--session', 'A')[0] == 0
+    assert identified('--csv', table, '--chain', 'ur5e', '--session', 'B')[0] == NOT_ACCEPTED
+
+
+def test_joint_names_map_those_of_the_bag_to_the_chain(run, identified, table, tmp_path):
+    renamed = dump_chain(UR)
+    for name in UR.joint_names:
+        renamed = renamed.replace(name, f'dh_{name[:-6]}')
+    (tmp_path / 'dh.yaml').write_text(renamed)
+    run('csv2bag', table, tmp_path / 'bag', '--chain', 'ur5e')
+    status, _, err = run('identify', tmp_path / 'bag', '--chain', 'dh.yaml')
+    assert status == 1
+    assert 'none of the joints in the message' in err
+    assert 'joint_names' in err
+    _, expected = identified(tmp_path / 'bag', '--chain', 'ur5e')
+    _, found = identified(
+        tmp_path / 'bag', '--chain', 'dh.yaml', '--joint-names', ','.join(UR.joint_names)
+    )
+    assert 'dh_elbow.a' in found['parameters']
+    for old, new in zip(expected['parameters'].items(), found['parameters'].items(), strict=True):
+        assert new[0].replace('dh_', '') == old[0].replace('_joint', '')
+        assert new[1] == old[1]
+
+
+def test_a_damaged_bag_warns_and_says_so_in_the_report(run, tmp_path):
+    bag = tmp_path / 'bag'
+    run('simulate', bag, '--chain', 'ur5e', '--poses', 40)
+    (file,) = bag.glob('*.mcap')
+    file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
+    out = tmp_path / 'out'
+    given = ('identify', bag, '--chain', 'ur5e', '--json', '--out')
+    assert run(*given, tmp_path / 'refused')[0] == 3
+    status, said, err = run(*given, out, '--largest-loss', '0.5')
+    assert status == 0
+    assert err.startswith('warning: ')
+    assert err.count('\n') == 1
+    document = json.loads(said)
+    assert document['warnings'] == [err.removeprefix('warning: ').rstrip('\n')]
+    assert 15 < document['samples']['samples'] < 40
+    assert document['warnings'][0] in (out / 'report.md').read_text()
+
+
+def bad_inputs():
+    """Yield the name of a bad input, its arguments, and what the complaint must hold."""
+    csv_of = ('identify', '--chain', 'ur5e', '--csv')
+    bag_of = ('identify', '--chain', 'ur5e')
+    good = (*csv_of, 'good.csv')
+    chain_of = ('identify', '--csv', 'good.csv', '--chain')
+    yield 'no input', bag_of, 'either a bag or --csv'
+    yield 'two inputs', (*good, 'bag'), 'either a bag or --csv'
+    yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
+    yield 'a folder as table', (*csv_of, 'folder'), 'folder'
+    yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
+    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a number'
+    yield 'too few rows', (*csv_of, 'few.csv'), '3 measured configurations are too few'
+    yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
+    yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
+    yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
+    yield 'an empty bag folder', (*bag_of, 'folder'), 'folder is not a readable rosbag2'
+    yield 'an empty bag file', (*bag_of, 'empty.mcap'), 'empty.mcap is not a readable rosbag2'
+    yield 'a bag file of another kind', (*bag_of, 'good.csv'), 'good.csv is not a readable'
+    yield 'no such chain', (*chain_of, 'missing.yaml'), 'missing.yaml'
+    yield 'no such robot', (*chain_of, 'ur10x'), 'did you mean "ur10'
+    yield 'not YAML', (*chain_of, 'broken.yaml'), 'broken.yaml is not valid YAML'
+    yield 'no chain', (*chain_of, 'good.csv'), 'good.csv'
+    yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
+    yield 'unknown parameter', (*good, '--fixed', 'elbow.a'), 'did you mean "elbow_joint.a"'
+    yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
+    yield 'nothing left', (*good, '--fixed', '*'), 'nothing is left to identify'
+    yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
+    yield 'NaN', (*good, '--sigma-orientation', 'nan'), 'sigma_orientation must be'
+    yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
+    yield (
+        'useless option',
+        (*good, '--sources', '/pose'),
+        '--sources is of no use with a table',
+    )
+    yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'of no use with a bag'
+    names = ('--joint-names', 'a,a,b,c,d,e,f')
+    yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
+    yield 'out is a file', (*good, '--out', 'empty'), 'empty'
+    yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
+    yield 'csv2bag, bad table', ('csv2bag', 'number.csv', 'b', '--chain', 'ur5e'), 'line 4: q2'
+    yield 'csv2bag, bag exists', ('csv2bag', 'good.csv', 'folder', '--chain', 'ur5e'), 'exists al'
+    yield 'csv2bag, into a file', ('csv2bag', 'good.csv', 'empty/b', '--chain', 'ur5e'), 'empty'
+    yield 'simulate, bag exists', ('simulate', 'folder', '--chain', 'ur5e'), 'exists already'
+    yield 'simulate, into a file', ('simulate', 'empty/b', '--chain', 'ur5e'), 'empty'
+    yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
+    yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
+    yield 'demo, into a file', ('demo', '--out', 'empty', '--poses', '5'), 'empty'
+    yield 'demo, too few', ('demo', '--poses', '2'), '2 measured configurations are too few'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'complaint'),
+    [pytest.param(*rest, id=name) for name, *rest in bad_inputs()],
+)
+def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint):
+    rows = rows_of(measured())
+    table.rename(tmp_path / 'good.csv')
+    write_csv(tmp_path / 'few.csv', rows[:3])
+    write_csv(tmp_path / 'judging.csv', rows[TRAIN:])
+    rows[2]['q2'] = 'zero'
+    write_csv(tmp_path / 'number.csv', rows)
+    (tmp_path / 'empty').write_text('')
+    (tmp_path / 'empty.mcap').write_text('')
+    (tmp_path / 'broken.yaml').write_text('joints: [\n')
+    (tmp_path / 'folder').mkdir()
+    status, _, err = run(*arguments)
+    assert status == 1
+    assert err.startswith('calib_ros: ')
+    assert complaint in err
+    assert err.count('\n') == 1
+    assert err.endswith('\n')
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        (),
+        ('calibrate',),
+        ('identify', '--csv', 'cell.csv'),
+        ('identify', '--chain', 'ur5e', '--csv', 'cell.csv', '--folds', 'five'),
+        ('simulate', 'bag', '--chain', 'ur5e', '--storage', 'rosbag1'),
+    ],
+)
+def test_wrong_usage_is_status_2(run, arguments):
+    with pytest.raises(SystemExit) as caught:
+        run(*arguments)
+    assert caught.value.code == 2

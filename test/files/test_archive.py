@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import os
+import resource
+import shutil
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from calib_ros.errors import InputError
+from calib_ros.files.archive import Archive
+from calib_ros.sampling.sample import Sample
+
+
+def sample(number, **more):
+    return Sample(number, np.full(2, 0.1 * number), position=np.arange(3.0) + number, **more)
+
+
+def open_archive(folder, robot='arm', joints=2):
+    return Archive(folder, robot, joints, lambda: 'settings: none\n')
+
+
+def stamps(folder, robot='arm'):
+    """Return the stamps that a resumed session has, while another may still write."""
+    with TemporaryDirectory() as copy:
+        shutil.copytree(folder, copy, dirs_exist_ok=True)
+        archive = open_archive(Path(copy), robot)
+        samples, _ = archive.resume()
+        archive.close()
+    return [each.stamp_ns for each in samples]
+
+
+@contextmanager
+def full_disk(limit):
+    """Let no file grow beyond a limit [bytes]."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
+    first = open_archive(tmp_path)
+    first.add(sample(1))
+    first.close()
+    second = open_archive(tmp_path)
+    samples = [sample(2), sample(3), sample(3, validation=True), sample(4)]
+    for each in samples:
+        second.add(each)
+    second.remove(samples[2])
+    second.remove(samples[3])
+    with pytest.raises(InputError, match='written by another process'):
+        open_archive(tmp_path).resume()
+    second.close()
+    third = open_archive(tmp_path)
+    found, warnings = third.resume()
+    assert [(each.stamp_ns, each.validation) for each in found] == [(2, False), (3, False)]
+    assert warnings == ()
+    third.add(sample(5))
+    assert stamps(tmp_path) == [2, 3, 5]
+    assert len(list(tmp_path.glob('*.csv'))) == len(list(tmp_path.glob('*.settings.yaml'))) == 2
+
+
+def test_nothing_to_resume(tmp_path):
+    samples, (warning,) = open_archive(tmp_path / 'none').resume()
+    assert samples == ()
+    assert 'nothing to resume' in warning
+
+
+def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
+    archive, only = open_archive(tmp_path), sample(1)
+    archive.add(only)
+    archive.remove(only)
+    assert stamps(tmp_path) == []
+
+
+def test_cleared_samples_do_not_come_back(tmp_path):
+    archive = open_archive(tmp_path)
+    archive.add(sample(1))
+    old = archive.begin_anew()
+    assert 'train' in old.read_text()
+    assert stamps(tmp_path) == []
+
+
+def test_a_folder_of_several_robots(tmp_path):
+    for number, robot in enumerate(('arm', 'arm_on_linear_axis', 'arm_A7', 'an/arm')):
+        archive = open_archive(tmp_path, robot)
+        archive.add(sample(1 + number))
+        archive.save(f'calibration: {robot}\n', '')
+    assert stamps(tmp_path) == [1]
+    assert open_archive(tmp_path).newest_calibration().read_text() == 'calibration: arm\n'
+    assert stamps(tmp_path, 'an/arm') == [4]
+
+
+def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
+    archive = open_archive(tmp_path, joints=2)
+    archive.add(sample(1))
+    archive.close()
+    with pytest.raises(InputError, match='q3'):
+        open_archive(tmp_path, joints=3).resume()
+    (path,) = tmp_path.glob('*.csv')
+    path.write_text(path.read_text().replace('spread', 'width'))
+    with pytest.raises(InputError, match='not the columns of a journal'):
+        open_archive(tmp_path, joints=2).resume()
+
+
+@pytest.mark.parametrize('cut', [1, 40])
+def test_a_row_that_was_cut_off_is_left_out(tmp_path, cut):
+    archive = open_archive(tmp_path)
+    archive.add(sample(1))
+    archive.add(sample(2))
+    with archive.journal.open('r+b') as file:
+        file.truncate(archive.journal.stat().st_size - cut)
+    archive.close()
+    again = open_archive(tmp_path)
+    found, (warning,) = again.resume()
+    assert [each.stamp_ns for each in found] == [1]
+    assert 'line 3 was cut off' in warning
+    again.add(sample(3))
+    assert stamps(tmp_path) == [1, 3]
+
+
+def test_a_full_disk_loses_nothing(tmp_path):
+    archive = open_archive(tmp_path)
+    samples = [sample(k) for k in range(1, 8)]
+    files = len(os.listdir('/proc/self/fd'))
+    with full_disk(100):  # not even the header fits
+        archive.add(samples[0])
+        assert 'the disk is full' in archive.error
+        archive.write()
+        assert len(list(tmp_path.glob('*.csv'))) == 1
+        assert stamps(tmp_path) == []
+    assert len(os.listdir('/proc/self/fd')) == files
+    archive.write()
+    assert archive.error == ''
+    archive.add(samples[1])
+    with full_disk(archive.journal.stat().st_size + 20):
+        for each in samples[2:]:
+            archive.add(each)
+        assert archive.error
+        assert stamps(tmp_path) == [1, 2]
+        archive.remove(samples[1])
+        archive.remove(samples[3])
+    archive.write()
+    assert archive.error == ''
+    assert stamps(tmp_path) == [1, 3, 5, 6, 7]
+
+
+def test_what_waits_for_room_is_not_lost_by_a_clear(tmp_path):
+    archive = open_archive(tmp_path)
+    archive.add(sample(1))
+    with full_disk(archive.journal.stat().st_size):
+        archive.add(sample(2))
+        with pytest.raises(InputError, match='in memory only and would be lost'):
+            archive.begin_anew()
+    archive.add(sample(3))
+    assert stamps(tmp_path) == [1, 2, 3]
+    assert archive.begin_anew() is not None
+    assert stamps(tmp_path) == []
+
+
+def test_no_calibration_is_overwritten(tmp_path):
+    archive = open_archive(tmp_path)
+    path = archive.save('first', 'settings: a\n', tmp_path / 'sub' / 'arm.yaml')
+    with pytest.raises(InputError, match='exists already'):
+        archive.save('second', 'settings: b\n', path)
+    with full_disk(2), pytest.raises(OSError, match='File too large'):
+        archive.save('third', '')
+    assert path.read_text() == 'first'
+    assert path.with_suffix('.settings.yaml').read_text() == 'settings: a\n'
+    assert not list(tmp_path.glob('*Z.yaml'))
+
+
+def test_an_export_is_whole_or_absent(tmp_path):
+    archive = open_archive(tmp_path / 'data')
+    files = {'a.csv': 'short', 'b.csv': 'too long for the disk'}
+    with full_disk(10), pytest.raises(OSError, match='File too large'):
+        archive.export(files)
+    assert list((tmp_path / 'data').iterdir()) == []
+    folder = archive.export(files)
+    assert list((tmp_path / 'data').iterdir()) == [folder]
+    assert {path.name: path.read_text() for path in folder.iterdir()} == files
+
+
+def test_the_folder_is_made_at_the_start(tmp_path):
+    folder = tmp_path / 'not' / 'there'
+    archive = open_archive(folder)
+    assert folder.is_dir()
+    archive.add(sample(1))
+    assert not archive.error
+    assert not archive.trouble
+    assert stamps(folder) == [1]
+    shutil.rmtree(folder)  # by mistake, before a new journal begins
+    archive.begin_anew()
+    archive.add(sample(2))
+    archive.close()
+    assert not archive.error
+    assert stamps(folder) == [2]
+
+
+@pytest.mark.parametrize('folder', ['/proc/nope', '/dev/null/nope', '/dev/null'])
+def test_a_folder_in_which_nothing_can_be_written_is_refused(folder):
+    with pytest.raises(InputError, match='set data_dir') as caught:
+        open_archive(Path(folder))
+    assert folder in str(caught.value)
+    assert '\n' not in str(caught.value)

@@ -1,0 +1,680 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import os
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from recorded import (
+    ARM,
+    MS,
+    TYPESTORE,
+    account_of,
+    assert_equal,
+    joint_state,
+    observations_of,
+    odometry,
+    point_stamped,
+    pose_stamped,
+    pose_with_covariance,
+    record,
+    recording,
+    session_of,
+    standing,
+    storages,
+    text_message,
+    transform_stamped,
+)
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
+
+from calib_ros.errors import InputError
+from calib_ros.files.bags import (
+    CHUNK,
+    STORAGE,
+    STORAGES,
+    read,
+    replay,
+    write_bag,
+)
+from calib_ros.files.mcap import DATA_END, MAGIC, records
+from calib_ros.sampling.intake import Stream
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE
+from calib_ros.sampling.session import CalibrationSession
+
+
+@storages
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('held_out', [0, 2])
+@pytest.mark.parametrize('mode', ['continuous', 'dwell'])
+def test_a_bag_gives_what_its_arrays_hold(tmp_path, storage, oriented, held_out, mode):
+    made = recording(oriented=oriented, held_out=held_out)
+    write_bag(tmp_path / 'bag', made, storage)
+    session, warnings = session_of(tmp_path / 'bag', mode=mode, settle=0.0, shortest_stop=0.05)
+    problem = session.problem()
+    account = session.account()
+    assert warnings == ()
+    assert (account.samples, account.held_out) == (30 - 6 * held_out, 6 * held_out)
+    assert (account.waiting, account.unused, account.dropped) == (0, {}, {})
+    sets = (problem.observations, *problem.held_out)
+    assert len(sets) == 1 + (held_out > 0)
+    for found, chosen in zip(sets, (~made.held_out, made.held_out), strict=False):
+        expected = made.poses.select(chosen)
+        for name in ('stamps_ns', 'positions', 'oriented'):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        np.testing.assert_allclose(found.rotations, expected.rotations, atol=1e-14)
+        np.testing.assert_allclose(found.joints, expected.joints, atol=1e-12)
+
+
+@storages
+def test_a_file_of_a_bag_is_as_good_as_its_folder(tmp_path, storage):
+    write_bag(tmp_path / 'bag', recording(), storage)
+    (file,) = (path for path in (tmp_path / 'bag').iterdir() if path.suffix != '.yaml')
+    folder, _ = session_of(tmp_path / 'bag')
+    alone, warnings = session_of(file)
+    assert warnings == ()
+    assert_equal(alone.problem().observations, folder.problem().observations)
+
+
+@storages
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('held_out', [0, 2])
+def test_a_bag_holds_only_the_topics_it_needs(tmp_path, storage, oriented, held_out):
+    write_bag(tmp_path / 'bag', recording(10, oriented, held_out), storage)
+    noun, kind = ('pose', 'PoseStamped') if oriented else ('point', 'PointStamped')
+    expected = {'/joint_states': JOINT_STATE, f'/measured_{noun}': f'geometry_msgs/msg/{kind}'}
+    if held_out:
+        expected[f'/validation_{noun}'] = f'geometry_msgs/msg/{kind}'
+    with Reader(tmp_path / 'bag') as reader:
+        assert {c.topic: c.msgtype for c in reader.connections} == expected
+
+
+def test_a_bag_is_never_overwritten(tmp_path):
+    write_bag(tmp_path / 'bag', recording(5))
+    before = {path.name: path.read_bytes() for path in (tmp_path / 'bag').iterdir()}
+    with pytest.raises(InputError, match='exists already'):
+        write_bag(tmp_path / 'bag', recording(6))
+    assert {path.name: path.read_bytes() for path in (tmp_path / 'bag').iterdir()} == before
+
+
+def test_messages_in_any_order_give_the_same(tmp_path, rng):
+    events = standing([pose_stamped((k * 33 + 15) * MS, (k, 0.0, 0.0)) for k in range(25)])
+    shuffled = [events[k] for k in rng.permutation(len(events))]
+    first, _ = session_of(record(tmp_path / 'first', events))
+    second, _ = session_of(record(tmp_path / 'second', shuffled))
+    assert_equal(second.problem().observations, first.problem().observations)
+    assert second.account().samples == 25
+    assert second.account().dropped == first.account().dropped == {}
+    assert first.account().notes == {}
+    assert set(second.account().notes) == {
+        'joints with a stamp older than the one before',
+        'poses with a stamp older than the one before',
+    }
+
+
+@pytest.mark.parametrize(
+    ('make', 'oriented'),
+    [
+        (pose_stamped, True),
+        (point_stamped, False),
+        (transform_stamped, True),
+        (odometry, True),
+        (lambda stamp_ns: pose_with_covariance(stamp_ns, np.zeros((6, 6))), True),
+    ],
+)
+def test_every_type_of_measurement_is_taken(tmp_path, make, oriented):
+    path = record(tmp_path / 'bag', standing([make(105 * MS), make(205 * MS)]))
+    observations = observations_of(path)
+    np.testing.assert_array_equal(observations.positions, [[1.0, 2.0, 3.0]] * 2)
+    np.testing.assert_allclose(observations.joints, [[0.1, 0.2, 0.3]] * 2, atol=1e-15)
+    assert observations.oriented.tolist() == [oriented] * 2
+    assert observations.covariance is None
+
+
+def test_a_covariance_of_the_message_is_kept(tmp_path):
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
+    path = record(tmp_path / 'bag', standing([pose_with_covariance(105 * MS, covariance)]))
+    observations = observations_of(path)
+    np.testing.assert_array_equal(observations.covariance, [covariance])
+
+
+def test_joints_are_taken_by_name(tmp_path):
+    events = [
+        ('/joint_states', joint_state(10 * MS, (3.0, 9.0, 1.0, 2.0), ('c', 'gripper', 'a', 'b'))),
+        ('/joint_states', joint_state(20 * MS, (1.0, 2.0, 3.0), ('a', 'b', 'c'))),
+        ('/joint_states', joint_state(30 * MS, (2.0, 1.0, 3.0), ('b', 'a', 'c'))),
+        *(('/pose', pose_stamped(ms * MS)) for ms in (10, 15, 20, 25, 30)),
+    ]
+    observations = observations_of(record(tmp_path / 'bag', events))
+    np.testing.assert_array_equal(observations.joints, [[1.0, 2.0, 3.0]] * 5)
+
+
+def test_joints_by_other_names(tmp_path):
+    joints = [joint_state(k * MS, (3.0, 1.0, 2.0), ('r/c', 'r/a', 'r/b')) for k in (10, 20)]
+    events = [*(('/joint_states', message) for message in joints), ('/p', pose_stamped(15 * MS))]
+    path = record(tmp_path / 'bag', events)
+    session, _ = session_of(path, joint_names=('r/a', 'r/b', 'r/c'))
+    np.testing.assert_array_equal(session.problem().observations.joints, [[1.0, 2.0, 3.0]])
+    with pytest.raises(
+        InputError, match=r'no samples to fit: .*2 x joints: none of .*r/a, r/b, r/c'
+    ):
+        session_of(path)[0].problem()
+
+
+def test_topics_of_other_types_are_left_alone(tmp_path):
+    extra = [('/chatter', text_message()), ('/tf_static', text_message('x' * 1000))]
+    events = standing([pose_stamped(105 * MS), pose_stamped(205 * MS)])
+    plain = account_of(record(tmp_path / 'plain', events))
+    mixed = account_of(record(tmp_path / 'mixed', [*extra, *events, *extra]))
+    assert mixed == plain
+    assert (mixed.joint_states, mixed.poses, mixed.samples) == (100, 2, 2)
+
+
+def test_validation_topics_are_held_out(tmp_path):
+    events = standing([pose_stamped(105 * MS, (1, 0, 0)), pose_stamped(205 * MS, (2, 0, 0))])
+    for topic, ms in (('/validation_pose', 300), ('/cell/validation_2', 400)):
+        events.append((topic, pose_stamped(ms * MS, (ms, 0, 0))))
+    session, _ = session_of(record(tmp_path / 'bag', events))
+    problem = session.problem()
+    assert problem.observations.positions[:, 0].tolist() == [1, 2]
+    (held_out,) = problem.held_out
+    assert held_out.positions[:, 0].tolist() == [300, 400]
+    assert '2 samples to fit and 2 held out' in str(session.account())
+
+
+def test_only_validation_poses_are_not_guessed_to_be_fitted(tmp_path):
+    path = record(tmp_path / 'bag', standing([pose_stamped(105 * MS)], '/validation_pose'))
+    with pytest.raises(InputError, match='has no pose topic'):
+        session_of(path)
+
+
+def test_of_several_topics_some_must_be_chosen(tmp_path):
+    events = standing([pose_stamped(105 * MS, (1, 0, 0))], '/left')
+    events.append(('/right', point_stamped(105 * MS, (2, 0, 0))))
+    path = record(tmp_path / 'bag', events)
+    with pytest.raises(InputError, match=r'several pose topics, .*--sources: /left, /right'):
+        session_of(path)
+    for topic, expected in (('/left', 1.0), ('/right', 2.0)):
+        assert observations_of(path, sources=(topic,)).positions[:, 0].tolist() == [expected]
+    both, _ = session_of(path, sources=('/left device=L', '/right device=R'))
+    assert [each.base for each in both.problem().sets] == ['base', 'base_R']
+
+
+def test_of_several_joint_topics_some_can_be_chosen(tmp_path):
+    events = standing([pose_stamped(105 * MS)])
+    events += [('/gripper', joint_state(ms * MS, (5.0, 6.0, 7.0))) for ms in (101, 109)]
+    path = record(tmp_path / 'bag', events)
+    joints = observations_of(path, joint_topics=('/gripper',)).joints
+    np.testing.assert_array_equal(joints, [[5.0, 6.0, 7.0]])
+    joints = observations_of(path, joint_topics=('/joint_states',)).joints
+    np.testing.assert_allclose(joints, [[0.1, 0.2, 0.3]], atol=1e-15)
+
+
+def test_all_joint_topics_are_heard_together(tmp_path):
+    """As of an arm and the axis it stands on, each with a driver of its own."""
+    arm = [joint_state(k * 10 * MS, (0.1 * k, 0.2), ('a', 'b')) for k in range(1, 100)]
+    axis = [joint_state((k * 20 + 3) * MS, (7.0, -0.3 * k), ('grip', 'c')) for k in range(50)]
+    events = [('/arm/joint_states', each) for each in arm]
+    events += [('/axis/joint_states', each) for each in axis]
+    events += [('/pose', pose_stamped(505 * MS)), ('/pose', pose_stamped(603 * MS))]
+    joints = observations_of(record(tmp_path / 'bag', events)).joints
+    np.testing.assert_allclose(joints, [[5.05, 0.2, -7.53], [6.03, 0.2, -9.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('settings', 'named'),
+    [
+        ({'joint_topics': ('/joints',)}, '/joints'),
+        ({'joint_topics': ('/pose',)}, '/pose'),
+        ({'sources': ('/poze',)}, '/poze'),
+        ({'sources': ('/joint_states',)}, '/joint_states'),
+        ({'sources': ('/pose type=PointStamped',)}, '/pose'),
+    ],
+)
+def test_a_topic_that_is_not_there_lists_the_contents(tmp_path, settings, named):
+    path = record(tmp_path / 'bag', [*standing([pose_stamped(105 * MS)]), ('/x', text_message())])
+    with pytest.raises(InputError, match=f'no "{named}" \\(') as caught:
+        session_of(path, **settings)
+    contents = '/joint_states (JointState), /pose (PoseStamped), /x (String)'
+    assert contents in str(caught.value)
+
+
+@storages
+@pytest.mark.parametrize(
+    ('events', 'missing'),
+    [
+        ([('/chatter', text_message())], 'joint topic'),
+        ([('/joint_states', joint_state(10 * MS))], 'pose topic'),
+        ([('/pose', pose_stamped(10 * MS))], 'joint topic'),
+    ],
+)
+def test_a_bag_without_the_topics_is_refused(tmp_path, storage, events, missing):
+    path = record(tmp_path / 'bag', events, storage)
+    with pytest.raises(InputError, match=f'has no {missing}') as caught:
+        session_of(path)
+    assert events[0][0] in str(caught.value)
+
+
+@storages
+def test_topics_without_messages_make_no_pairs(tmp_path, storage):
+    kinds = [('/joint_states', JOINT_STATE), ('/pose', 'geometry_msgs/msg/PoseStamped')]
+    path = record(tmp_path / 'bag', [('/chatter', text_message())], storage, silent=kinds)
+    session, _ = session_of(path)
+    with pytest.raises(InputError, match='no samples to fit: 0 joint states and 0 poses'):
+        session.problem()
+
+
+def test_poses_in_different_frames_are_refused(tmp_path):
+    poses = [pose_stamped(105 * MS), pose_stamped(205 * MS, frame='other')]
+    session, _ = session_of(record(tmp_path / 'bag', standing(poses)))
+    with pytest.raises(InputError, match=r'different frames \(other, tracker\)'):
+        session.problem()
+
+
+GOOD = np.eye(6)
+NAN = GOOD.copy()
+NAN[0, 0] = np.nan
+SKEW = GOOD.copy()
+SKEW[0, 1] = 0.5
+BAD_POSES = [
+    (pose_stamped(0), 'poses: zero stamp'),
+    (pose_stamped(105 * MS, (np.nan, 0, 0)), 'poses: NaN or infinite position'),
+    (pose_stamped(105 * MS, (0, 0, np.inf)), 'poses: NaN or infinite position'),
+    (pose_stamped(105 * MS, quat=(0, 0, 0, 0)), 'poses: quaternion not of length 1'),
+    (pose_stamped(105 * MS, quat=(0, 0, 0, 1.01)), 'poses: quaternion not of length 1'),
+    (pose_stamped(105 * MS, quat=(0, 0, np.nan, 1)), 'poses: quaternion not of length 1'),
+    (point_stamped(105 * MS, (0, -np.inf, 0)), 'poses: NaN or infinite position'),
+    (transform_stamped(0), 'poses: zero stamp'),
+    (transform_stamped(105 * MS, child='a\nb'), 'poses: child frame whose name cannot be printed'),
+    (transform_stamped(105 * MS, quat=(1, 1, 1, 1)), 'poses: quaternion not of length 1'),
+    (pose_with_covariance(105 * MS, NAN), 'poses: covariance with NaN or infinite values'),
+    (pose_with_covariance(105 * MS, SKEW), 'poses: covariance not symmetric'),
+    (pose_with_covariance(105 * MS, -GOOD), 'poses: covariance not positive definite'),
+    (pose_with_covariance(105 * MS, np.diag([1, 1, 1, 1, 1, 0])), 'poses: covariance not posit'),
+    (pose_stamped(5 * MS), 'poses: no joint sample before'),
+    (pose_stamped(1005 * MS), 'poses: no joint sample after'),
+]
+
+
+@pytest.mark.parametrize(('bad', 'cause'), BAD_POSES)
+def test_a_bad_measurement_is_dropped_and_counted_by_cause(tmp_path, bad, cause):
+    kind = type(bad)
+    makers = {
+        'PoseStamped': pose_stamped,
+        'PointStamped': point_stamped,
+        'TransformStamped': transform_stamped,
+        'PoseWithCovarianceStamped': lambda stamp_ns: pose_with_covariance(stamp_ns, GOOD),
+    }
+    good = makers[kind.__msgtype__.rpartition('/')[2]](305 * MS)
+    account = account_of(record(tmp_path / 'bag', standing([bad, good, bad])))
+    assert (account.poses, account.samples) == (3, 1)
+    ((found, count),) = (
+        item for item in account.dropped.items() if item[0] != 'poses: same stamp twice'
+    )
+    assert found.startswith(cause)
+    assert count + account.dropped.get('poses: same stamp twice', 0) == 2
+    assert f'{count} x {cause}' in str(account)
+
+
+BAD_JOINTS = [
+    (joint_state(0), 'joints: zero stamp'),
+    (joint_state(55 * MS, (0.1, np.nan, 0.3)), 'joints: NaN or infinite joint value'),
+    (joint_state(55 * MS, (0.1, np.inf, 0.3)), 'joints: NaN or infinite joint value'),
+    (joint_state(55 * MS, (0.1, 0.2)), 'joints: names and positions differ in number'),
+    (joint_state(55 * MS, ()), 'joints: names and positions differ in number'),
+    (joint_state(55 * MS, (0.1,), ('gripper',)), 'joints: none of the joints in the message'),
+    (joint_state(55 * MS, (), ()), 'joints: none of the joints in the message'),
+]
+
+
+@pytest.mark.parametrize('first', [True, False])
+@pytest.mark.parametrize(('bad', 'cause'), BAD_JOINTS)
+def test_a_bad_joint_state_is_dropped_and_counted_by_cause(tmp_path, bad, cause, first):
+    events = standing([pose_stamped(55 * MS)])
+    bad = [('/joint_states', bad)] * 2
+    account = account_of(record(tmp_path / 'bag', [*bad, *events] if first else [*events, *bad]))
+    assert (account.joint_states, account.samples) == (102, 1)
+    ((found, count),) = account.dropped.items()
+    assert count == 2
+    assert found.startswith(cause)
+    assert f'2 x {cause}' in str(account)
+
+
+def test_a_nan_of_a_foreign_joint_does_not_matter(tmp_path):
+    events = [
+        ('/joint_states', joint_state(k * MS, (1, 2, 3, np.nan), ('a', 'b', 'c', 'grip')))
+        for k in (10, 20)
+    ]
+    account = account_of(record(tmp_path / 'bag', [*events, ('/pose', pose_stamped(15 * MS))]))
+    assert (account.samples, account.dropped) == (1, {})
+
+
+def test_stamps_going_backwards_lose_nothing_and_are_noted(tmp_path):
+    events = standing([pose_stamped(ms * MS, (ms, 0, 0)) for ms in (305, 105, 405, 205)])
+    session, _ = session_of(record(tmp_path / 'bag', events))
+    assert session.problem().observations.positions[:, 0].tolist() == [105, 205, 305, 405]
+    assert session.account().notes == {'poses with a stamp older than the one before': 2}
+    assert 'note: 2 x poses with a stamp older than the one before' in str(session.account())
+
+
+def test_poses_between_distant_joint_samples_are_counted(tmp_path):
+    events = [('/joint_states', joint_state(ms * MS)) for ms in (100, 300, 320)]
+    events += [('/pose', pose_stamped(ms * MS)) for ms in (150, 310)]
+    path = record(tmp_path / 'bag', events)
+    account = account_of(path)
+    assert (account.samples, account.dropped) == (1, {'poses: joint samples too far apart': 1})
+    assert account_of(path, max_gap=0.2).samples == 2
+
+
+def test_a_session_that_does_not_record_counts_what_it_leaves_out(tmp_path):
+    path = record(tmp_path / 'bag', standing([pose_stamped(105 * MS)]))
+    session = CalibrationSession(ARM)
+    session.recording = False
+    replay(path, session)
+    assert session.account().unused == {'joints: not recording': 100, 'poses: not recording': 1}
+
+
+def damage(path, share=None, metadata=True):
+    """Cut the bag's file off, as by a full disk; without metadata as by kill -9."""
+    (file,) = (item for item in path.iterdir() if item.suffix in ('.mcap', '.db3'))
+    if share is not None:
+        content = file.read_bytes()
+        file.write_bytes(content[: int(share * len(content))])
+    if not metadata:
+        (path / 'metadata.yaml').unlink()
+    return file
+
+
+@storages
+@pytest.mark.parametrize(('metadata', 'alone'), [(True, False), (False, False), (True, True)])
+@pytest.mark.parametrize('share', [0.45, 0.55, 0.9])
+def test_of_a_truncated_bag_the_rest_is_used(tmp_path, storage, metadata, alone, share):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(300), storage)
+    whole = observations_of(path)
+    file = damage(path, share, metadata)
+    session, warnings = session_of(file if alone else path)
+    part = session.problem().observations
+    (warning,) = warnings
+    assert str(path) in warning
+    assert 'damaged' in warning
+    assert 'lost' in warning
+    account = session.account()
+    assert str(account.joint_states + account.poses) in warning
+    assert 0.2 * share * len(whole) < len(part) < len(whole)
+    # What is read is what was recorded.
+    index = np.searchsorted(whole.stamps_ns, part.stamps_ns)
+    np.testing.assert_array_equal(whole.stamps_ns[index], part.stamps_ns)
+    np.testing.assert_array_equal(whole.positions[index], part.positions)
+    np.testing.assert_array_equal(whole.joints[index], part.joints)
+
+
+@storages
+def test_a_bag_that_was_never_closed_is_read(tmp_path, storage):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(), storage)
+    whole = observations_of(path)
+    damage(path, metadata=False)
+    session, warnings = session_of(path)
+    assert_equal(session.problem().observations, whole)
+    assert len(warnings) == 1
+
+
+@storages
+def test_the_count_of_a_damaged_bag_is_of_the_messages_used(tmp_path, storage):
+    events = [*standing([pose_stamped(105 * MS)]), *[('/chatter', text_message())] * 7]
+    path = record(tmp_path / 'bag', events, storage)
+    damage(path, metadata=False)
+    assert ' 101 messages' in session_of(path)[1][0]
+
+
+@storages
+def test_a_damaged_bag_in_a_folder_with_an_odd_name(tmp_path, storage):
+    write_bag(tmp_path / 'bag', recording(), storage)
+    damage(tmp_path / 'bag', metadata=False)
+    path = (tmp_path / 'bag').rename(tmp_path / 'cell #1 50%20?')
+    assert session_of(path)[0].account().samples == 30
+
+
+@pytest.mark.parametrize('share', [0.6, 0.75, 0.9])
+def test_of_a_truncated_compressed_bag_the_whole_chunks_are_used(tmp_path, share):
+    path = tmp_path / 'bag'
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    noise = np.random.default_rng(1)
+    with writer:
+        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=TYPESTORE)
+        kind = 'geometry_msgs/msg/PoseStamped'
+        poses = writer.add_connection('/pose', kind, typestore=TYPESTORE)
+        for k in range(1, 6001):
+            message = joint_state(k * 10 * MS, noise.normal(size=3))
+            writer.write(joints, k, TYPESTORE.serialize_cdr(message, JOINT_STATE))
+            message = pose_stamped(k * 10 * MS, noise.normal(size=3))
+            writer.write(poses, k, TYPESTORE.serialize_cdr(message, kind))
+    assert session_of(path)[0].account().samples == 6000
+    session, warnings = session_of(damage(path, share))
+    assert 1000 < session.account().samples < 6000
+    assert len(warnings) == 1
+
+
+@storages
+def test_a_hole_in_a_file_is_reported(tmp_path, storage):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(300), storage)
+    file = damage(path)
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 9000] = b'\xff' * 9000
+    file.write_bytes(bytes(content))
+    session, warnings = session_of(path)
+    account = session.account()
+    assert 0 < account.samples < 300
+    assert len(warnings) == 1
+    assert 'lost' in warnings[0]
+
+
+@pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3', 'bag.bag', 'bag'])
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'',
+        b'garbage ' * 500,
+        bytes(range(256)) * 8,
+        b'\x89MCAP0\r\n' + b'\x05' * 500,
+        b'SQLite format 3\0' + b'\x01' * 500,
+    ],
+)
+def test_a_file_that_is_no_bag_is_refused(tmp_path, name, content):
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
+        session_of(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize('metadata', [None, b'', b'\xff\xfe', b'- 1', b'rosbag2_bagfile: {'])
+def test_a_folder_that_is_no_bag_is_refused(tmp_path, metadata):
+    path = tmp_path / 'folder'
+    path.mkdir()
+    (path / 'notes.txt').write_text('no bag')
+    if metadata is not None:
+        (path / 'metadata.yaml').write_bytes(metadata)
+    with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
+        session_of(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_path_to_nothing_is_refused(tmp_path):
+    with pytest.raises(InputError, match=f'no bag at {tmp_path}{os.sep}missing'):
+        session_of(tmp_path / 'missing')
+
+
+def test_one_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
+    path = tmp_path / 'bag'
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=TYPESTORE)
+        kind = 'geometry_msgs/msg/PointStamped'
+        poses = writer.add_connection('/point', kind, typestore=TYPESTORE)
+        for k in range(1, 11):
+            data = TYPESTORE.serialize_cdr(joint_state(k * 10 * MS), JOINT_STATE)
+            writer.write(joints, k, data)
+            data = TYPESTORE.serialize_cdr(point_stamped(k * 10 * MS), kind)
+            writer.write(poses, k, data[:-9] if k == 3 else data)
+    session, warnings = session_of(path)
+    assert session.account().samples >= 2
+    assert len(warnings) == 1
+    assert 'lost' in warnings[0]
+
+
+STREAMS = {
+    '/joint_states': Stream('/joint_states', JOINT_STATE),
+    '/pose': Stream('/pose', 'geometry_msgs/msg/PoseStamped'),
+}
+COMPRESSIONS = [
+    *((storage, mode) for storage in sorted(STORAGES) for mode in ('none', 'message', 'file')),
+    ('mcap', 'storage'),
+]
+LOG_TIMES = {
+    'in order': lambda k, rng: k,
+    'of a coarse clock': lambda k, rng: k // 40,
+    'not in order within a chunk': lambda k, rng: k - (k - 1) % 5 + rng.integers(5),
+    'not in order among chunks': lambda k, rng: rng.integers(300),
+}
+
+
+def record_in_chunks(path, storage, mode='none', log_time=LOG_TIMES['in order']):
+    """Write 300 messages in some chunks of 1 MB, filled with long texts that nobody wants."""
+    rng = np.random.default_rng(7)
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if mode != 'none':
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    types = {each.topic: each.type for each in STREAMS.values()} | {'/x': 'std_msgs/msg/String'}
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
+            for topic, kind in types.items()
+        }
+        for k in range(300):
+            topic, message = '/joint_states', joint_state((k + 1) * 10 * MS, rng.normal(size=3))
+            if k % 3 == 1:
+                topic, message = '/pose', pose_stamped((k + 1) * 10 * MS, rng.normal(size=3))
+            elif k % 10 == 0:
+                topic, message = '/x', text_message(rng.bytes(200_000).hex())
+            data = TYPESTORE.serialize_cdr(message, types[topic])
+            writer.write(connections[topic], 10 + int(log_time(k, rng)), data)
+    return path
+
+
+@pytest.mark.parametrize('log_times', LOG_TIMES)
+@pytest.mark.parametrize(('storage', 'mode'), COMPRESSIONS)
+def test_messages_are_those_of_the_library_in_its_order(tmp_path, storage, mode, log_times):
+    path = record_in_chunks(tmp_path / 'bag', storage, mode, LOG_TIMES[log_times])
+    with Reader(path) as reader:
+        connections = [each for each in reader.connections if each.topic in STREAMS]
+        library = list(reader.messages(connections))
+        found = list(read(reader, STREAMS))
+    times = {bytes(data): time for _, time, data in library}
+    assert len(times) == 280
+    # Of messages of one time, which comes first differs between versions of the library.
+    assert [times[data] for _, data in found] == [time for _, time, _ in library]
+    streams = {bytes(data): STREAMS[each.topic] for each, _, data in library}
+    assert {data: stream for stream, data in found} == streams
+
+
+@pytest.mark.parametrize('log_times', LOG_TIMES)
+def test_messages_without_chunks_come_as_they_stand_in_the_file(tmp_path, log_times):
+    """As of rosbag2 with the preset fastwrite; its log times need not be in order."""
+    path = record_in_chunks(tmp_path / 'bag', 'mcap', log_time=LOG_TIMES[log_times])
+    (file,) = path.glob('*.mcap')
+    flat = MAGIC
+    for kind, content in records(file.read_bytes(), len(MAGIC)):
+        flat += struct.pack('<BQ', kind, len(content)) + content
+        if kind == DATA_END:
+            break
+    file.write_bytes(flat + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + MAGIC)
+    session, warnings = session_of(file)
+    account = session.account()
+    assert (account.joint_states, account.poses) == (180, 100)
+    assert not warnings
+
+
+def test_chunks_without_an_index_of_their_messages_are_read(tmp_path):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    with Reader(path) as reader:
+        expected = list(read(reader, STREAMS))
+        for chunk in reader.storage.storages[0].chunks:
+            chunk.channel_count.clear()
+        assert list(read(reader, STREAMS)) == expected
+    assert len(expected) == 280
+
+
+@pytest.mark.parametrize('missing', ['storage', *STORAGE, *CHUNK])
+def test_a_library_with_other_attributes_is_asked_itself(missing):
+    chunk = SimpleNamespace(**dict.fromkeys(CHUNK, 1))
+    storage = SimpleNamespace(**dict.fromkeys(STORAGE), storages=None)
+    storage.chunks, storage.storages = [chunk], [storage]
+    pose = SimpleNamespace(topic='/pose', msgtype=STREAMS['/pose'].type)
+    reader = SimpleNamespace(
+        storage=storage,
+        compression_mode=None,
+        connections=[pose],
+        messages=lambda connections: [(connections[0], 1, b'data')],
+    )
+    for each in (reader, storage, chunk):
+        if hasattr(each, missing) and not (each is reader and missing == 'connections'):
+            delattr(each, missing)
+    assert list(read(reader, STREAMS)) == [(STREAMS['/pose'], b'data')]
+
+
+def test_the_files_of_a_split_bag_are_read_one_after_the_other(tmp_path):
+    path, other = (record_in_chunks(tmp_path / name, 'mcap') for name in ('bag', 'other'))
+    (other / 'other.mcap').rename(path / 'a.mcap')
+    metadata = (path / 'metadata.yaml').read_text()
+    (path / 'metadata.yaml').write_text(
+        metadata.replace('  - bag.mcap', '  - bag.mcap\n  - a.mcap')
+    )
+    with Reader(path) as reader:
+        connections = [each for each in reader.connections if each.topic in STREAMS]
+        expected = [(STREAMS[c.topic], bytes(data)) for c, _, data in reader.messages(connections)]
+        assert list(read(reader, STREAMS)) == expected
+    assert len(expected) == 560
+
+
+@storages
+@pytest.mark.parametrize('kind', ['std_msgs/msg/String', 'geometry_msgs/msg/PointStamped'])
+def test_a_channel_of_another_type_is_not_read(tmp_path, storage, kind):
+    path = record_in_chunks(tmp_path / 'bag', storage)
+    with Reader(path) as reader:
+        found = list(read(reader, {'/pose': Stream('/pose', kind)}))
+    assert found == []
+
+
+@pytest.mark.parametrize('damaged', [0, 5])
+def test_a_damaged_chunk_costs_its_messages_only(tmp_path, damaged):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    with Reader(path) as reader:
+        chunks = list(reader.storage.storages[0].chunks)
+        wanted = [each.id for each in reader.connections if each.topic in STREAMS]
+    assert len(chunks) > 6
+    lost = sum(chunks[damaged].channel_count.get(key, 0) for key in wanted)
+    file = damage(path)
+    content = bytearray(file.read_bytes())
+    place = chunks[damaged].chunk_start_offset + 33
+    content[place : place + 4] = b'\1\2\3\4'  # not its checksum
+    file.write_bytes(bytes(content))
+    session, (warning,) = session_of(path)
+    account = session.account()
+    assert 10 < lost < 100
+    assert account.joint_states + account.poses == 280 - lost
+    assert f'{lost} of 280 messages are lost' in warning
+
+
+def test_messages_are_read_by_their_attributes_only():
+    # What rclpy delivers is another class with the same attributes.
+    stamp = SimpleNamespace(sec=1, nanosec=5)
+    message = SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id='tracker'),
+        point=SimpleNamespace(x=1, y=2, z=3),
+    )
+    reading = DECODERS['geometry_msgs/msg/PointStamped'](message)
+    assert reading[:5] == (1_000_000_005, 'tracker', (1.0, 2.0, 3.0), None, None)

@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import csv
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calib_ros.apply.simulation import Cell, faulty
+from calib_ros.cli.main import main
+from calib_ros.files import export
+from calib_ros.files.export import ExportError, converted, exports, forward_of, kinematics_yaml
+from calib_ros.files.waypoints import joints_csv
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain_file import (
+    calibration_record,
+    dump_chain,
+    load_chain,
+    parse_chain,
+    shipped_robots,
+)
+
+KEYS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+ROBOTS = sorted(shipped_robots())
+
+
+def corrected(name, seed=0):
+    nominal = load_chain(name)
+    return nominal, faulty(nominal, Cell(), np.random.default_rng(seed))
+
+
+def scara():
+    rows = (
+        Joint('j1', a=0.3, d=0.2),
+        Joint('j2', a=0.25, alpha=np.pi, sign=-1),
+        Joint('j3', 'prismatic', d=0.1, lower=0.0, upper=0.2),
+        Joint('j4', d=0.05),
+    )
+    return Chain('scara', 'standard', rows)
+
+
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_a_table_in_yaml_is_a_chain_file_with_its_origin(convention):
+    nominal, chain = corrected('ur10e')
+    found = exports(chain, nominal, origin={'robot_serial': '2019'})
+    text = next(each for each in found if each.name == f'dh_{convention}.yaml').content
+    again = parse_chain(text)
+    assert again.convention == convention
+    assert calibration_record(text) == {'robot_serial': '2019'}
+    q = chain.random_joints(100, np.random.default_rng(2))
+    np.testing.assert_allclose(again.forward(q), chain.forward(q), rtol=0, atol=1e-9)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([*ROBOTS, 'scara']))
+@settings(max_examples=60, deadline=None)
+def test_both_conventions_are_the_same_arm(seed, name):
+    nominal = scara() if name == 'scara' else load_chain(name)
+    chain = faulty(nominal, Cell(), np.random.default_rng(seed))
+    q = chain.random_joints(20, np.random.default_rng(seed + 1))
+    other = 'modified' if chain.convention == 'standard' else 'standard'
+    there = converted(chain, other)
+    assert there.convention == other
+    np.testing.assert_allclose(there.forward(q), chain.forward(q), rtol=0, atol=1e-12)
+    back = converted(there, chain.convention)
+    np.testing.assert_allclose(back.forward(q), chain.forward(q), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize('name', ROBOTS)
+def test_every_form_says_how_far_it_is_from_the_calibration(name):
+    nominal, chain = corrected(name)
+    by_name = {each.name: each for each in exports(chain, nominal)}
+    assert by_name['dh_standard.csv'].error == by_name['kinematics.yaml'].error == 0.0
+    offsets = by_name['joint_offsets.csv']
+    assert 1e-4 < offsets.error < 0.02
+    assert f'{1e3 * offsets.error:.3f} mm off' in offsets.content.splitlines()[0]
+    # Beta can be given up where no axes are parallel, and only there.
+    assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
+
+
+def test_the_table_without_beta_is_best_where_it_is_asked_for():
+    nominal, chain = corrected('ur10e', 3)
+    rng = np.random.default_rng(4)
+    near = chain.random_joints(1, rng) + rng.uniform(-0.2, 0.2, (300, 6))
+    text = next(
+        each for each in exports(chain, nominal, near) if each.name == 'dh_without_beta.csv'
+    )
+    everywhere = next(
+        each for each in exports(chain, nominal) if each.name == 'dh_without_beta.csv'
+    )
+    rows = list(csv.DictReader(text.content.splitlines()[1:]))
+    assert all(float(row['beta']) == 0.0 for row in rows)
+    assert text.error < 0.5 * everywhere.error
+
+
+def test_kinematics_tell_a_changed_robot_by_their_hash():
+    _, chain = corrected('ur5e')
+    first = yaml.safe_load(kinematics_yaml(chain))
+    again = yaml.safe_load(kinematics_yaml(chain, {'robot_serial': '2019'}))
+    assert first['hash'] == again['hash']
+    assert again['calibration'] == {'robot_serial': '2019'}
+    other = chain.with_offsets({'elbow_joint.a': 1e-6})
+    assert yaml.safe_load(kinematics_yaml(other))['hash'] != first['hash']
+
+
+def test_kinematics_with_prismatic_and_reversed_joints():
+    chain = faulty(scara(), Cell(), np.random.default_rng(1))
+    q = chain.random_joints(50, np.random.default_rng(2))
+    poses = forward_of(kinematics_yaml(chain), chain, q)
+    np.testing.assert_allclose(poses, chain.forward(q), rtol=0, atol=1e-12)
+
+
+def test_what_a_table_cannot_say_is_said_at_its_head():
+    nominal, chain = corrected('ur10e')
+    chain = replace(chain, effects=(('elbow_joint.ratio', 1e-3),))
+    table = next(each for each in exports(chain, nominal) if each.name == 'dh_standard.csv')
+    assert table.error > 1e-4
+    assert 'off the calibrated arm' in table.content.splitlines()[0]
+
+
+def test_a_file_that_differs_is_refused(monkeypatch):
+    nominal, chain = corrected('ur10e')
+    monkeypatch.setattr(export, 'xyz_rpy', lambda matrix: dict.fromkeys(KEYS, 0.0))
+    with pytest.raises(ExportError, match=r'kinematics\.yaml, read back, differs'):
+        exports(chain, nominal)
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """Return a function that exports on the command line and returns the files by name."""
+    monkeypatch.chdir(tmp_path)
+    _, chain = corrected('ur10e', 3)
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(chain, {'samples': 60}))
+
+    def run(*arguments):
+        common = ['export', 'calibration.yaml', '--chain', 'ur10e', '--out', 'out', '--force']
+        assert main([*common, *arguments]) == 0
+        return {path.name: path.read_text() for path in (tmp_path / 'out').iterdir()}
+
+    return run
+
+
+def test_the_command_line_hands_on_where_the_numbers_come_from(files):
+    for name, text in files().items():
+        if name.endswith('.yaml'):
+            assert yaml.safe_load(text)['calibration'] == {'samples': 60}
+
+
+def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
+    rng = np.random.default_rng(4)
+    near = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2]) + rng.uniform(-0.2, 0.2, (300, 6))
+    (tmp_path / 'measured.csv').write_text(joints_csv(near))
+
+    def error(found):
+        return float(re.search('up to (.*) mm off', found['dh_without_beta.csv']).group(1))
+
+    assert error(files('--measured', 'measured.csv')) < 0.5 * error(files())

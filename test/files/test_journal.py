@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib_ros.errors import InputError
+from calib_ros.files.journal import Journal
+from calib_ros.files.tables import read_journal, read_table
+from calib_ros.kinematics import se3
+from calib_ros.sampling.sample import Sample
+
+JOINTS = 3
+floats = st.floats(-1e6, 1e6)  # what a session takes
+vectors = st.lists(floats, min_size=JOINTS, max_size=JOINTS).map(np.array)
+names = st.text(st.characters(exclude_categories=['C', 'Z'], include_characters=' '), max_size=8)
+
+
+def rotation(seed):
+    return se3.exp_rotation(np.random.default_rng(seed).normal(scale=2.0, size=(1, 3)))[0]
+
+
+def covariance(seed):
+    root = np.random.default_rng(seed).normal(size=(6, 6))
+    return root @ root.T
+
+
+@st.composite
+def samples(draw):
+    """Draw a sample of any kind, with whatever may be missing missing or not."""
+    optional = {
+        'approach': st.lists(
+            st.sampled_from([-1.0, 0.0, 1.0]), min_size=JOINTS, max_size=JOINTS
+        ).map(np.array),
+        'velocity': vectors,
+        'acceleration': vectors,
+    }
+    seed = st.integers(0, 2**32 - 1)
+    if draw(st.booleans()):
+        measured = {'distance': draw(floats)}
+        eye = False
+    else:
+        measured = {'position': draw(vectors)}
+        if draw(st.booleans()):
+            measured['rotation'] = rotation(draw(seed))
+        if draw(st.booleans()):
+            measured['covariance'] = covariance(draw(seed))
+        eye = draw(st.booleans())
+    return Sample(
+        draw(st.integers(1, 2**62)),
+        draw(vectors),
+        **{name: draw(kind) for name, kind in optional.items() if draw(st.booleans())},
+        **measured,
+        session=draw(names),
+        device=draw(names.filter(bool)),
+        target=draw(names),
+        frame_id=draw(names),
+        eye_in_hand=eye,
+        validation=draw(st.booleans()),
+        delay=draw(floats),
+        count=draw(st.integers(1, 10**6)),
+        spread=draw(st.floats(0.0, allow_infinity=False, allow_nan=False)),
+    )
+
+
+def written(path, many, joints=JOINTS):
+    journal = Journal(path, joints)
+    for sample in many:
+        journal.add(sample)
+    journal.close()
+
+
+def assert_equal(found, expected):
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        for field in fields(Sample):
+            first, second = getattr(one, field.name), getattr(other, field.name)
+            if field.name in ('rotation', 'covariance') and first is not None:
+                np.testing.assert_allclose(first, second, rtol=1e-15, atol=4e-15)
+            else:
+                np.testing.assert_array_equal(first, second, field.name)
+
+
+@given(st.lists(samples(), min_size=1, max_size=8, unique_by=lambda sample: sample.stamp_ns))
+def test_what_is_written_is_read(tmp_path_factory, many):
+    """Numbers exactly; a rotation goes as a quaternion, which costs the last digit."""
+    path = tmp_path_factory.mktemp('journal') / 'cell.csv'
+    written(path, many)
+    found, warnings = read_journal(path, JOINTS)
+    assert warnings == ()
+    assert_equal(found, many)
+
+
+def plain(number, **more):
+    return Sample(number, 0.1 * number * np.ones(JOINTS), position=np.arange(3.0), **more)
+
+
+def test_kinds_of_one_stop_are_told_apart(tmp_path):
+    """A stop gives each source the same stamp, often between the same device and target."""
+    many = [
+        plain(1),
+        plain(1, validation=True),
+        plain(1, device='b'),
+        plain(1, target='b'),
+        plain(1, session='b'),
+        replace(plain(1), rotation=np.eye(3), eye_in_hand=True),
+        replace(plain(1, device='d'), position=None, distance=2.0),
+        replace(plain(1, device='d')),
+    ]
+    written(tmp_path / 'cell.csv', many)
+    assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], many)
+
+
+def test_a_row_written_twice_is_refused(tmp_path):
+    written(tmp_path / 'cell.csv', [plain(1), plain(2), plain(1)])
+    with pytest.raises(InputError, match='line 4: stamp_ns 1 is there already'):
+        read_journal(tmp_path / 'cell.csv', JOINTS)
+
+
+def test_what_was_taken_back_is_left_out_and_can_be_taken_again(tmp_path):
+    journal = Journal(tmp_path / 'cell.csv', JOINTS)
+    for number in (1, 2, 3):
+        journal.add(plain(number))
+    journal.remove(plain(3))
+    journal.remove(plain(2))
+    journal.add(plain(2, count=7))
+    journal.close()
+    found, _ = read_journal(tmp_path / 'cell.csv', JOINTS)
+    assert [(each.stamp_ns, each.count) for each in found] == [(1, 1), (2, 7)]
+    table = read_table(tmp_path / 'cell.csv', JOINTS)
+    assert [each.stamp_ns for each in table.samples] == [1, 2]
+    assert len((tmp_path / 'cell.csv').read_text().splitlines()) == 7
+
+
+@pytest.mark.parametrize('name', ['ball', 'a,b', 'say "ball"', 'Kugel \u00e4\u2460'])
+@pytest.mark.parametrize('share', np.linspace(0.02, 0.98, 13))
+def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
+    """Whatever is in it: the rows before are there, and new ones can be added."""
+    path = tmp_path / 'cell.csv'
+    written(path, [plain(1, target=name)])
+    begin = path.stat().st_size
+    written(path, [plain(2, target=name)])
+    with path.open('r+b') as file:
+        file.truncate(begin + round(share * (path.stat().st_size - begin)))
+    found, (warning,) = read_journal(path, JOINTS)
+    assert_equal(found, [plain(1, target=name)])
+    assert 'was cut off and is left out' in warning
+    written(path, [plain(3, target=name)])
+    assert_equal(read_journal(path, JOINTS)[0], [plain(1, target=name), plain(3, target=name)])
+
+
+def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
+    path = tmp_path / 'cell.csv'
+    written(path, [])
+    header = path.read_bytes()
+    path.write_bytes(header[:20])
+    written(path, [plain(1)])
+    assert path.read_bytes().startswith(header)
+    assert_equal(read_journal(path, JOINTS)[0], [plain(1)])
+
+
+@pytest.mark.parametrize(
+    'content', ['q1,q2,q3,x,y,z\n1,2,3,4,5,6', 'notes of mine', 'q1\n', 'x' * 100_000]
+)
+def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, content):
+    path = tmp_path / 'cell.csv'
+    path.write_text(content)
+    with pytest.raises(InputError, match='not the columns of a journal'):
+        Journal(path, JOINTS)
+    assert path.read_text() == content
+
+
+WRITER = """
+import sys
+from pathlib import Path
+import numpy as np
+from calib_ros.files.journal import Journal
+from calib_ros.sampling.sample import Sample
+journal = Journal(Path(sys.argv[1]), 3)
+for number in range(1, 10**7):
+    journal.add(Sample(number, np.full(3, 0.1 * number), position=np.full(3, 1.0 / number)))
+    if number == 20:
+        print('running', flush=True)
+"""
+
+
+def test_a_killed_process_leaves_all_whole_rows(tmp_path):
+    path = tmp_path / 'cell.csv'
+    for attempt in range(3):
+        process = subprocess.Popen(
+            [sys.executable, '-c', WRITER, path],
+            stdout=subprocess.PIPE,
+            env=os.environ | {'PYTHONPATH': str(Path(__file__).parents[2])},
+        )
+        assert process.stdout.readline() == b'running\n'
+        time.sleep(0.03 * attempt)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        found, warnings = read_journal(path, JOINTS)
+        assert warnings == ()
+        assert [each.stamp_ns for each in found] == list(range(1, len(found) + 1))
+        assert len(found) >= 20
+        last = found[-1]
+        assert last.position.tolist() == [1.0 / last.stamp_ns] * 3
+        path.unlink()
+
+
+@pytest.mark.parametrize('room', [0, 1, 50])
+def test_a_full_disk_leaves_no_half_row(tmp_path, monkeypatch, room):
+    journal = Journal(tmp_path / 'cell.csv', JOINTS)
+    journal.add(plain(1))
+    write = os.write
+
+    def part(file, data):
+        if room == 0:
+            raise OSError(28, 'No space left on device')
+        return write(file, data[:room])
+
+    monkeypatch.setattr(os, 'write', part)
+    with pytest.raises(OSError, match=r'disk is full|No space left'):
+        journal.add(plain(2))
+    monkeypatch.setattr(os, 'write', write)
+    journal.add(plain(3))
+    journal.close()
+    found, warnings = read_journal(tmp_path / 'cell.csv', JOINTS)
+    assert [each.stamp_ns for each in found] == [1, 3]
+    assert warnings == ()

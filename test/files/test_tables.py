@@ -1,0 +1,225 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.files.tables import read_table
+
+POINTS = """q1,q2,x,y,z
+0.1,0.2,1,2,3
+-0.3,4e-1,4.5,5.5,6.5
+"""
+POSES = """id,q1,q2,x,y,z,qx,qy,qz,qw,temperature
+7,0.1,0.2,1,2,3,0,0,0,1,23.5
+8,0.3,0.4,4,5,6,0.5,-0.5,0.5,0.5,
+"""
+SPLIT = """split,q1,q2,x,y,z
+train,1,0,1,0,0
+test,2,0,2,0,0
+train,3,0,3,0,0
+,4,0,4,0,0
+test,5,0,5,0,0
+"""
+SESSIONS = """session,q1,q2,x,y,z
+A,1,0,1,0,0
+B,2,0,2,0,0
+A,3,0,3,0,0
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text, session=None):
+        path = tmp_path / 'cell.csv'
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        table = read_table(path, 2, (session,) if session else ())
+        (fitted,) = table.fitted
+        (held_out,) = table.held_out or (fitted.select([]),)
+        return fitted, held_out
+
+    return read
+
+
+def test_positions_without_orientation(read):
+    fitted, held_out = read(POINTS)
+    np.testing.assert_array_equal(fitted.joints, [[0.1, 0.2], [-0.3, 0.4]])
+    np.testing.assert_array_equal(fitted.positions, [[1, 2, 3], [4.5, 5.5, 6.5]])
+    assert fitted.oriented.tolist() == [False, False]
+    assert len(held_out) == 0
+
+
+def test_poses_and_columns_that_are_not_known(read):
+    fitted, _ = read(POSES)
+    np.testing.assert_array_equal(fitted.positions, [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(fitted.rotations[0], np.eye(3))
+    np.testing.assert_allclose(
+        fitted.rotations[1], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-15
+    )
+    assert fitted.oriented.tolist() == [True, True]
+
+
+def test_columns_in_any_order_with_byte_order_mark_and_windows_lines(read):
+    text = '\ufeffz,y,x,q2,q1\r\n3,2,1,0.2,0.1\r\n\r\n'
+    fitted, _ = read(text)
+    np.testing.assert_array_equal(fitted.joints, [[0.1, 0.2]])
+    np.testing.assert_array_equal(fitted.positions, [[1, 2, 3]])
+
+
+def test_rows_marked_test_are_held_out(read):
+    fitted, held_out = read(SPLIT)
+    assert fitted.positions[:, 0].tolist() == [1, 3, 4]
+    assert held_out.positions[:, 0].tolist() == [2, 5]
+    assert held_out.joints[:, 0].tolist() == [2, 5]
+
+
+@pytest.mark.parametrize('split', ['Test', ' test', 'validation'])
+def test_a_split_that_is_neither_train_nor_test_is_refused(read, split):
+    with pytest.raises(InputError, match=r'line 2: split must be train or test'):
+        read(SPLIT.replace('train', split, 1))
+
+
+def test_one_of_several_sessions_must_be_chosen(read):
+    with pytest.raises(InputError, match=r'cell\.csv holds several sessions, .*A, B'):
+        read(SESSIONS)
+    fitted, _ = read(SESSIONS, 'A')
+    assert fitted.positions[:, 0].tolist() == [1, 3]
+
+
+def test_a_session_that_is_not_there_lists_those_that_are(read):
+    with pytest.raises(UnknownNameError) as caught:
+        read(SESSIONS, 'C')
+    assert caught.value.alternatives == ('A', 'B')
+    with pytest.raises(InputError, match='no column "session" to choose "A" from'):
+        read(POINTS, 'A')
+
+
+def test_a_single_session_needs_no_choice(read):
+    fitted, _ = read(SESSIONS.replace('B,', 'A,'))
+    assert len(fitted) == 3
+
+
+def test_a_bad_row_of_another_session_does_not_matter(read):
+    fitted, _ = read(SESSIONS.replace('B,2', 'B,nan'), 'A')
+    assert len(fitted) == 2
+
+
+@pytest.mark.parametrize('column', ['q2', 'y'])
+def test_a_missing_column_is_named(read, column):
+    text = POINTS.replace(f',{column},', ',other,')
+    with pytest.raises(InputError, match=f'no column {column}; expected q1, q2, x, y, z .*other'):
+        read(text)
+
+
+def test_a_part_of_a_quaternion_is_not_taken_for_none(read):
+    with pytest.raises(InputError, match='no column qw;'):
+        read(POSES.replace('qw', 'w'))
+
+
+@pytest.mark.parametrize('bad', ['nan', 'inf', '-inf', '', ' ', 'twelve', '1;2', '0,5'])
+def test_what_is_no_number_is_named_with_its_line(read, bad):
+    with pytest.raises(InputError, match=r'cell\.csv, line 3: y must be a number') as caught:
+        read(POINTS.replace('5.5', f'"{bad}"'))
+    assert repr(bad) in str(caught.value)
+
+
+def test_the_line_is_that_of_the_file_after_blank_lines(read):
+    with pytest.raises(InputError, match=r'line 6: x must be a number'):
+        read(POINTS.replace('\n-0.3', '\n\n\n\n-0.3').replace('4.5', 'bad'))
+
+
+@pytest.mark.parametrize(
+    ('row', 'column'), [('0.1,0.2,1,2', 'z'), ('0.1', 'q2'), ('0.1,0.2,1,2,', 'z')]
+)
+def test_a_row_that_ends_early_is_named(read, row, column):
+    with pytest.raises(InputError, match=f'line 4: {column} must be a number'):
+        read(f'{POINTS}{row}\n')
+
+
+def test_a_row_that_ends_before_its_session_is_refused(read):
+    text = 'q1,q2,x,y,z,session\n1,0,1,0,0,A\n2,0,2,0,0\n'
+    with pytest.raises(InputError, match=r'cell\.csv'):
+        read(text)
+
+
+@pytest.mark.parametrize('quat', ['0,0,0,2', '0,0,0,0', '0.6,0,0,0.9', '0,0,0,1.01'])
+def test_a_quaternion_of_another_length_is_named_with_its_line(read, quat):
+    with pytest.raises(InputError, match=r'cell\.csv, line 3: quaternion .* expected 1'):
+        read(POSES.replace('0.5,-0.5,0.5,0.5', quat))
+
+
+def test_a_blank_quaternion_makes_a_position(read):
+    fitted, _ = read(POSES.replace('0.5,-0.5,0.5,0.5', ',,,'))
+    assert fitted.oriented.tolist() == [True, False]
+
+
+@pytest.mark.parametrize('part', ['0.5,-0.5,0.5,', ',,,1', '0.5,,0.5,0.5'])
+def test_a_part_of_a_quaternion_is_no_orientation_by_chance(read, part):
+    with pytest.raises(InputError, match=r'line 3: q[xyzw] must be a number'):
+        read(POSES.replace('0.5,-0.5,0.5,0.5', part))
+
+
+@pytest.mark.parametrize('text', ['', '\n', 'q1,q2,x,y,z\n', 'q1,q2,x,y,z\n\n\n'])
+def test_an_empty_table_is_refused(read, text):
+    with pytest.raises(InputError, match=r'cell\.csv has no'):
+        read(text)
+
+
+def test_a_table_that_is_no_text_is_refused(read):
+    with pytest.raises(InputError, match=r'cannot read .*cell\.csv'):
+        read(b'\xff\xfe\x00\x80')
+
+
+def test_a_path_that_holds_no_file_is_refused(tmp_path):
+    for path in (tmp_path, tmp_path / 'missing.csv'):
+        with pytest.raises(InputError, match=f'cannot read {path}'):
+            read_table(path, 2)
+
+
+@pytest.mark.parametrize('flag', ['yes', 'True', '2'])
+def test_a_flag_that_is_none_is_named_with_its_line(read, flag):
+    text = f'q1,q2,x,y,z,qx,qy,qz,qw,eye_in_hand\n1,0,1,0,0,0,0,0,1,{flag}\n'
+    with pytest.raises(InputError, match=f"line 2: eye_in_hand must be 0 or 1, not '{flag}'"):
+        read(text)
+
+
+FRAMES = """session,device,frame_id,q1,q2,x,y,z,split
+A,left,world,1,0,1,0,0,
+A,left,,2,0,2,0,0,
+A,right,cell,3,0,3,0,0,
+A,left,map,4,0,4,0,0,
+A,left,world,5,0,5,0,0,test
+B,left,map,6,0,6,0,0,
+"""
+
+
+def test_different_frames_of_one_device_are_refused_with_their_lines(read):
+    said = r'different frames: world \(lines 2, 6\), map \(line 5\); one is needed'
+    with pytest.raises(InputError, match=said):
+        read(FRAMES, 'A')
+
+
+def test_many_lines_are_cut_short(read):
+    rows = [f'{k},0,1,0,0,{"map" if k else "world"}' for k in range(9)]
+    with pytest.raises(InputError, match=r'map \(lines 3, 4, 5, 6, 7 and 3 more\)'):
+        read('\n'.join(['q1,q2,x,y,z,frame_id', *rows, '']))
+
+
+def test_each_device_and_session_has_a_frame_of_its_own(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(FRAMES.replace('A,left,map', 'A,other,map'))
+    table = read_table(path, 2, ('A', 'B'))
+    assert [each.base for each in table.fitted] == ['base', 'base_right', 'base_other', 'base_B']
+    assert table.world_frame == 'world'
+
+
+def test_a_row_that_was_taken_back_may_be_in_any_frame(read):
+    rows = ['1,1,0,1,0,0,world,', '2,2,0,2,0,0,map,', '2,2,0,2,0,0,map,removed']
+    fitted, _ = read('\n'.join(['stamp_ns,q1,q2,x,y,z,frame_id,split', *rows, '']))
+    assert len(fitted) == 1
+
+
+def test_a_table_without_frames_has_none(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(POINTS)
+    assert read_table(path, 2).world_frame == ''

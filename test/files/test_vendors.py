@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Vendors' files, put into what their descriptions make of them and read by a public library."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from urdfs import PANDA, UR10E, by_kinpy
+
+from calib_ros.apply.simulation import Cell, faulty
+from calib_ros.cli.main import main
+from calib_ros.errors import ConfigError
+from calib_ros.files import vendors
+from calib_ros.files.export import ExportError, converted
+from calib_ros.files.vendors import vendor_files
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.kinematics.urdf_tree import parse_urdf
+
+URS = ('ur5e', 'ur10', 'ur10e')
+FRANKAS = ('franka_panda', 'franka_fr3')
+TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""From base_link of ur_description to the base of the controller, and of the table."""
+NUMBERS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
+
+
+def corrected(nominal, seed=0):
+    return faulty(nominal, Cell(), np.random.default_rng(seed))
+
+
+def arm(chain):
+    return replace(chain, base=Frame(), tool=Frame(), frames=(), effects=())
+
+
+def joint(name, kind, parent, child, pose, axis=''):
+    x, y, z, roll, pitch, yaw = (pose[key] for key in NUMBERS)
+    limit = '<limit lower="-3" upper="3" effort="1" velocity="1"/>' if axis else ''
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} {pitch!r} {yaw!r}"/>{axis}{limit}</joint>'
+    )
+
+
+def pose(**values):
+    return dict.fromkeys(NUMBERS, 0.0) | values
+
+
+def ur_description(text):
+    """Return the URDF that ur_description makes of a file, without what is drawn."""
+    poses = yaml.safe_load(text)['kinematics']
+    z = '<axis xyz="0 0 1"/>'
+    links = ['base_link', 'base_link_inertia']
+    links += [f'{key}_link' for key in vendors.UR.keys]
+    parts = [joint('base', 'fixed', links[0], links[1], pose(yaw=np.pi))]
+    for k, (name, key) in enumerate(zip(vendors.UR.joints, vendors.UR.keys, strict=True)):
+        parts.append(joint(name, 'revolute', links[k + 1], links[k + 2], poses[key], z))
+    parts.append(
+        joint('flange', 'fixed', 'wrist_3_link', 'flange', pose(pitch=-np.pi / 2, yaw=-np.pi / 2))
+    )
+    turn = pose(roll=np.pi / 2, yaw=np.pi / 2)
+    parts.append(joint('tool', 'fixed', 'flange', 'tool0', turn))
+    return described([*links, 'flange', 'tool0'], parts)
+
+
+def franka_description(text, name):
+    poses = yaml.safe_load(text)
+    links = [f'link{k}' for k in range(9)]
+    parts = [
+        joint(
+            f'{name}_joint{k}',
+            'revolute' if k < 8 else 'fixed',
+            links[k - 1],
+            links[k],
+            poses[f'joint{k}']['kinematic'],
+            '<axis xyz="0 0 1"/>' if k < 8 else '',
+        )
+        for k in range(1, 9)
+    ]
+    return described(links, parts)
+
+
+def described(links, parts):
+    parts = [*(f'<link name="{name}"/>' for name in links), *parts]
+    return f'<robot name="r">{"".join(parts)}</robot>'
+
+
+def poses_of(text, names, q):
+    """Return the poses of the flange by the description of the vendor."""
+    if 'wrist_3_joint' in names[-1]:
+        return by_kinpy(ur_description(text), names, q, 'base_link', 'tool0')
+    name = names[0].partition('_')[0]
+    return by_kinpy(franka_description(text, name), names, q, 'link0', 'link8')
+
+
+def published(text, vendor):
+    """Return the numbers of a file, row by row."""
+    document = yaml.safe_load(text)
+    if vendor is vendors.UR:
+        rows = [document['kinematics'][key] for key in vendor.keys]
+    else:
+        rows = [document[key]['kinematic'] for key in (*vendor.keys, vendor.end)]
+    assert all(tuple(row) == NUMBERS for row in rows)
+    return np.array([[row[key] for key in NUMBERS] for row in rows])
+
+
+@pytest.mark.parametrize('name', [*URS, *FRANKAS])
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_the_description_of_the_vendor_makes_the_corrected_arm(name, convention, rng):
+    nominal = load_chain(name)
+    chain = converted(corrected(nominal), convention)
+    (found,) = vendor_files(chain, converted(nominal, convention), {'robot_serial': '2019'})
+    assert found.error == 0.0
+    assert yaml.safe_load(found.content)['calibration'] == {'robot_serial': '2019'}
+    q = chain.random_joints(20, rng)
+    expected = arm(chain).forward(q)
+    if name in URS:
+        expected = TURNED @ expected
+    poses = poses_of(found.content, chain.joint_names, q)
+    np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-9)
+
+
+def test_nominal_files_are_those_of_the_vendors():
+    """The numbers that ur_description has for the UR10e, franka_description for all its arms."""
+    (ours,) = vendor_files(load_chain('ur10e'), load_chain('ur10e'))
+    assert ours.name == 'ur_kinematics.yaml'
+    numbers = published(ours.content, vendors.UR)
+    quarter = np.pi / 2
+    expected = np.zeros((6, 6))
+    expected[0, 2], expected[1, 3], expected[2, 0] = 0.1807, quarter, -0.6127
+    expected[3, [0, 2]], expected[4, [1, 3]] = (-0.57155, 0.17415), (-0.11985, quarter)
+    expected[5, [1, 3]] = 0.11655, -quarter
+    np.testing.assert_allclose(numbers, expected, rtol=0, atol=1e-12)
+    for name in FRANKAS:
+        (ours,) = vendor_files(load_chain(name), load_chain(name))
+        assert ours.name == 'franka_kinematics.yaml'
+        expected = np.zeros((8, 6))
+        expected[:, 3] = np.array([0, -1, 1, 1, -1, 1, 1, 0]) * quarter
+        expected[[0, 3, 4, 6], [2, 0, 0, 0]] = 0.333, 0.0825, -0.0825, 0.088
+        expected[[2, 4, 7], [1, 1, 2]] = -0.316, 0.384, 0.107
+        np.testing.assert_allclose(
+            published(ours.content, vendors.FRANKA), expected, rtol=0, atol=1e-12
+        )
+
+
+@pytest.mark.parametrize(
+    ('text', 'ends', 'tip'),
+    [(UR10E, ('base_link', 'tool0'), None), (PANDA, ('panda_link0', 'panda_link8'), 'panda_hand')],
+)
+def test_frames_are_those_of_the_urdf_if_there_is_one(text, ends, tip, rng):
+    nominal = replace(chain_from_urdf(text, tip_link=tip), base=None, tool=None)
+    chain = corrected(nominal)
+    (found,) = vendor_files(chain, nominal, urdf=text, links={'tip_link': tip})
+    q = chain.random_joints(20, rng)
+    expected = by_kinpy(corrected_urdf(text, chain, tip_link=tip), chain.joint_names, q, *ends)
+    poses = poses_of(found.content, chain.joint_names, q)
+    np.testing.assert_allclose(poses, expected, rtol=0, atol=1e-9)
+    (unchanged,) = vendor_files(nominal, nominal, urdf=text, links={'tip_link': tip})
+    vendor = vendors.UR if text is UR10E else vendors.FRANKA
+    described = {each.name: each.origin for each in parse_urdf(text).joints}
+    numbers = published(unchanged.content, vendor)
+    for name, row in zip(nominal.joint_names, numbers, strict=False):
+        np.testing.assert_allclose(row[:3], described[name][:3, 3], rtol=0, atol=1e-9)
+
+
+def test_a_tool_in_the_table_of_a_franka_is_no_flange():
+    nominal = replace(chain_from_urdf(PANDA, tip_link='panda_hand'), base=None, tool=None)
+    longer = nominal.with_offsets({'panda_joint7.d': 0.1034})
+    assert vendor_files(longer, longer) == ()
+
+
+def test_what_the_file_cannot_hold_is_said():
+    nominal = load_chain('ur10e')
+    chain = corrected(nominal).with_offsets({'wrist_3_joint.a': 1e-3})
+    (found,) = vendor_files(chain, nominal)
+    assert found.error == pytest.approx(abs(chain.joints[-1].a - nominal.joints[-1].a), rel=0.5)
+    gear = replace(corrected(nominal), effects=(('elbow_joint.ratio', 1e-3),))
+    assert vendor_files(gear, nominal)[0].error > 1e-4
+
+
+@pytest.mark.parametrize('name', ['kuka_iiwa14', 'puma560', 'meca500'])
+def test_other_arms_get_no_file(name):
+    assert vendor_files(load_chain(name), load_chain(name)) == ()
+
+
+def test_an_arm_that_is_laid_out_otherwise_gets_no_file():
+    nominal = load_chain('ur10e').with_offsets({'elbow_joint.alpha': np.pi / 2})
+    assert vendor_files(nominal, nominal) == ()
+
+
+def test_the_hash_is_that_of_the_robot_or_of_the_numbers():
+    nominal = load_chain('ur10e')
+
+    def checksum(chain, given=''):
+        (found,) = vendor_files(chain, nominal, checksum=given)
+        return yaml.safe_load(found.content)['kinematics']['hash']
+
+    assert checksum(nominal, 'calib_12788084448423163542') == 'calib_12788084448423163542'
+    assert checksum(nominal) == checksum(nominal)
+    assert checksum(nominal).removeprefix('calib_').isdigit()
+    assert checksum(nominal) != checksum(nominal.with_offsets({'elbow_joint.a': 1e-6}))
+    with pytest.raises(ConfigError, match='no checksum'):
+        checksum(nominal, '12788084448423163542')
+
+
+def test_a_file_that_differs_is_refused(monkeypatch):
+    nominal = load_chain('ur10e')
+    monkeypatch.setattr(vendors, 'xyz_rpy', lambda matrix: pose())
+    with pytest.raises(ExportError, match=r'ur_kinematics\.yaml, read back, differs'):
+        vendor_files(nominal, nominal)
+
+
+@pytest.mark.parametrize('chain', ['ur10e', 'robot.urdf'])
+def test_the_command_line_writes_it(tmp_path, monkeypatch, chain):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'robot.urdf').write_text(UR10E)
+    (tmp_path / 'calibration.yaml').write_text(
+        dump_chain(corrected(load_chain(chain)), {'samples': 60})
+    )
+    common = ['export', 'calibration.yaml', '--chain', chain, '--out', 'out']
+    assert main([*common, '--ur-hash', 'calib_42']) == 0
+    document = yaml.safe_load((tmp_path / 'out/ur_kinematics.yaml').read_text())
+    assert document['kinematics']['hash'] == 'calib_42'
+    assert document['calibration'] == {'samples': 60}

@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.evidence import TYPICAL, considered
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain_file import load_chain
+
+UR = load_chain('ur10e')
+NO_PRIOR = {'*_joint.*': 1e6}
+"""As good as none, but given: so none is told by the data."""
+EFFECTS = [name for group in ('eccentricity', 'gravity') for name in effects.members(UR, group)]
+
+
+def arm(seed, errors=1.0):
+    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
+    return faulty(UR, cell, np.random.default_rng(seed))
+
+
+def spread(seed, reach=2.5, count=60):
+    return np.random.default_rng(seed + 50).uniform(-reach, reach, (count, 6))
+
+
+def problem_of(true, q, seed=0, noise=1.0, **more):
+    rng = np.random.default_rng(seed + 7)
+    return Problem(UR, measure(true, q, rng, noise * 5e-5, noise * 2e-4), **more)
+
+
+def whole_range(chain, true):
+    """Return the RMS position error [m] over the joint range, after the best base and tool."""
+    q = np.random.default_rng(99).uniform(-2.5, 2.5, (200, 6))
+    wanted = measure(true, q, np.random.default_rng(0))
+    frames = [name for name in chain.parameter_names if chain.owns_frame(name)]
+    fit = minimise(chain, frames, System((Samples(wanted, 1e-4, 1e-2),)))
+    error = fit.chain.forward(q)[:, :3, 3] - wanted.positions
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def moved_a_little(seed, reach):
+    """Return joint values (60, 6) with the elbow within `reach` [rad]."""
+    q = spread(seed)
+    q[:, 2] = 1.0 + np.random.default_rng(seed).uniform(-reach, reach, 60)
+    return q
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_parameters_that_the_data_determine_stay_where_they_are(seed):
+    given = problem_of(arm(seed), spread(seed), seed)
+    free = identify(replace(given, priors=NO_PRIOR))
+    found = identify(given)
+    assert found.names == free.names
+    for ours, theirs in zip(found.parameters, free.parameters, strict=True):
+        if ours.std is not None and not UR.owns_frame(ours.name):
+            assert abs(ours.offset - theirs.offset) < 0.05 * theirs.std, ours.name
+
+
+@pytest.mark.parametrize('reach', [3e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize('seed', range(3))
+def test_a_joint_that_hardly_moved_does_no_harm(reach, seed):
+    true = arm(seed)
+    given = problem_of(true, moved_a_little(seed, reach), seed)
+    found = identify(given)
+    free = identify(replace(given, priors=NO_PRIOR))
+    error = whole_range(found.chain, true)
+    assert error < whole_range(found.before, true)
+    assert error < whole_range(free.chain, true) / 3.0
+    assert any(name.startswith('elbow_joint') for name in (*found.weak, *found.not_excited))
+
+
+@pytest.mark.parametrize('errors', [0.1, 1.0, 10.0])
+@pytest.mark.parametrize('seed', range(4))
+def test_the_size_of_the_errors_is_found(errors, seed):
+    true = arm(seed, errors)
+    found = identify(problem_of(true, spread(seed), seed))
+    assert found.accepted
+    for group, lengths in (('length', True), ('angle', False)):
+        offsets = [
+            true.offset(name, UR)
+            for name in found.names
+            if not UR.owns_frame(name) and name.endswith(('.a', '.d')) == lengths
+        ]
+        ratio = found.posterior.sizes[group] / np.sqrt(np.mean(np.square(offsets)))
+        assert 0.5 < ratio < 2.0
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_one_gross_offset_is_not_shrunk(seed):
+    true = arm(seed).with_offsets({'elbow_joint.theta': 17e-3})
+    found = identify(problem_of(true, spread(seed), seed))
+    parameter = next(p for p in found.parameters if p.name == 'elbow_joint.theta')
+    assert abs(parameter.offset - true.offset('elbow_joint.theta', UR)) < 4.0 * parameter.std
+    assert found.posterior.sizes['angle'] < 2e-3
+
+
+def test_one_gross_offset_is_not_shrunk_where_the_poses_hardly_determine_it():
+    """The elbow moved by 0.1 rad: a normal prior of the others' size would hold its offset."""
+    true = arm(0, 0.3).with_offsets({'shoulder_lift_joint.theta': 17e-3})
+    q = spread(0)
+    q[:, 1] = -1.0 + 0.04 * q[:, 1]
+    found = identify(problem_of(true, q))
+    parameter = next(p for p in found.parameters if p.name == 'shoulder_lift_joint.theta')
+    assert abs(parameter.offset - true.offset(parameter.name, UR)) < 4.0 * parameter.std
+    assert abs(parameter.offset) > 14e-3
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_healthy_arm_has_small_errors_and_is_not_accepted(seed):
+    found = identify(problem_of(arm(seed, 0.0), spread(seed), seed))
+    assert not found.accepted
+    assert found.posterior.sizes['length'] < 2e-5
+    assert found.posterior.sizes['angle'] < 5e-5
+
+
+def test_data_without_noise_stay_exact():
+    true = arm(0)
+    found = identify(problem_of(true, spread(0), noise=0.0))
+    q = UR.random_joints(200, np.random.default_rng(1))
+    assert np.abs((found.chain.forward(q) - true.forward(q))[:, :3, 3]).max() < 1e-9
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_effects_neither_shown_nor_possible_are_of_no_size(seed):
+    found = identify(problem_of(arm(seed), spread(seed), seed))
+    for group in ('drive', 'gravity'):
+        assert found.posterior.sizes[group] < 0.01 * TYPICAL[group]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_effects_that_the_data_cannot_show_are_of_usual_size(seed):
+    found = identify(problem_of(arm(seed), spread(seed, 0.15), seed))
+    for group in ('drive', 'gravity'):
+        assert 0.2 < found.posterior.sizes[group] / TYPICAL[group] < 2.0
+
+
+def test_effects_that_an_arm_has_are_considered_with_their_size():
+    values = np.random.default_rng(3).normal(scale=3e-4, size=len(EFFECTS)).tolist()
+    true = arm(0).with_effects(EFFECTS)
+    true = true.with_effect_values(dict(zip(EFFECTS, values, strict=True)))
+    found = identify(problem_of(true, spread(0)))
+    assert set(considered(found.chain, found.names)) == set(EFFECTS)
+    assert set(EFFECTS) < set(found.posterior.names)
+    assert 1e-4 < found.posterior.sizes['drive'] < 1e-3

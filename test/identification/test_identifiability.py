@@ -1,0 +1,456 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameError
+from calib_ros.identification.identifiability import (
+    correlated,
+    covariance,
+    independent,
+    observability,
+    structurally_independent,
+    trades,
+)
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import log_rotation
+from calib_ros.report.words import identifiability_in_words, summary, weakly_determined
+
+UR10E = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
+ALIGNED = ('shoulder_lift_joint', 'elbow_joint', 'wrist_1_joint')
+
+
+def rms(chain, true, q):
+    """Return the RMS position error [m] against the true arm."""
+    error = (chain.forward(q) - true.forward(q))[:, :3, 3]
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def assert_trades_hold(result, q, oriented=True):
+    """What is left out must be the sum of its partners alone, at the joint values given."""
+    rows = 6 if oriented else 3
+    for name, partners in result.gauges.items():
+        columns = ErrorModel(result.chain, [name, *partners]).jacobian(q)[:, :rows]
+        columns = columns.reshape(-1, 1 + len(partners))
+        shares = np.linalg.lstsq(columns[:, 1:], columns[:, 0], rcond=None)[0]
+        left = columns[:, 0] - columns[:, 1:] @ shares
+        assert np.linalg.norm(left) <= 5e-3 * np.linalg.norm(columns[:, 0])
+        assert np.abs(shares).min(initial=1.0) > 1e-6
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_trades_of_a_six_axis_arm_with_its_frames(oriented, rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE, oriented=oriented)
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    gauges = {name: set(partners) for name, partners in result.gauges.items()}
+    assert gauges['wrist_3_joint.d'] == {'tool.z'}
+    assert gauges['wrist_3_joint.a'] == {'tool.x'}
+    assert gauges['shoulder_pan_joint.d'] == {'base.x', 'base.y', 'base.z'}  # the base is turned
+    assert gauges['shoulder_pan_joint.theta'] == {'base.rx', 'base.ry', 'base.rz'}
+    assert set(result.gauges) == set(result.unidentifiable)
+    if not oriented:
+        assert gauges['tool.rx'] == gauges['tool.ry'] == gauges['tool.rz'] == set()
+    assert_trades_hold(result, UR10E.random_joints(100, rng), oriented)
+
+
+def test_an_upright_base_trades_along_one_axis_alone(rng):
+    true = replace(faulty(UR10E, Cell(), rng), base=None)
+    seen = measure(true, UR10E.random_joints(60, rng), rng)
+    gauges = identify(Problem(UR10E, seen)).gauges
+    assert gauges['shoulder_pan_joint.d'] == ['base.z']
+    assert gauges['shoulder_pan_joint.theta'] == ['base.rz']
+
+
+@pytest.mark.parametrize('exact', [True, False])
+def test_lengths_along_parallel_axes_trade_where_no_tilt_is_modelled(exact, rng):
+    nominal = replace(UR10E, parallel=())
+    true = faulty(nominal, Cell(), rng)
+    if exact:
+        true = replace(nominal, base=true.base, tool=true.tool)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    result = identify(Problem(nominal, seen, **SIGMAS))
+    assert result.rank == 28
+    for joint in ALIGNED[1:]:
+        partners = result.gauges[f'{joint}.d']
+        assert 'shoulder_lift_joint.d' in partners
+        if exact:
+            assert partners == ['shoulder_lift_joint.d']
+    assert f'{ALIGNED[0]}.d' in result.names
+    assert_trades_hold(result, UR10E.random_joints(100, rng))
+    words = ' '.join(identifiability_in_words(result))
+    assert 'wrist_3_joint.d against tool.z' in words
+    assert 'elbow_joint.d against ' in words
+
+
+def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(60, rng)
+    q[:, 2] = 0.7
+    result = identify(Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS))
+    assert 'elbow_joint.theta' in result.not_excited
+    assert set(result.not_excited) < set(result.gauges)
+    assert_trades_hold(result, q)
+
+
+def test_a_fixed_partner_makes_its_trade_identifiable(rng):
+    tool = replace(random_frame(rng, 0.2), fixed=True)
+    nominal = replace(UR10E, tool=tool)
+    true = replace(faulty(UR10E, Cell(), rng), tool=tool)
+    result = identify(Problem(nominal, measure(true, UR10E.random_joints(60, rng), rng)))
+    assert 'wrist_3_joint.d' in result.names
+    assert not {name for name in result.gauges if name.startswith('wrist_3')}
+
+
+def test_dependent_columns_by_hand():
+    """Columns of a, b, a + 2 b, nothing, c: the third trades against the first two."""
+    a, b, c = np.eye(3)
+    matrix = np.stack([a, b, a + 2.0 * b, np.zeros(3), c], axis=1)
+    factor = np.zeros((5, 5))
+    factor[:3] = matrix
+    names = ('a', 'b', 'sum', 'nothing', 'c')
+    assert independent(factor, names) == ('a', 'b', 'c')
+    assert trades(factor, names, ('a', 'b', 'c')) == {'sum': ['a', 'b'], 'nothing': []}
+    swapped = factor[:, [2, 1, 0, 3, 4]]
+    others = ('sum', 'b', 'a', 'nothing', 'c')
+    assert independent(swapped, others) == ('sum', 'b', 'c')
+    assert trades(swapped, others, ('sum', 'b', 'c'))['a'] == ['sum', 'b']
+
+
+def test_a_trade_is_named_though_a_fitted_parameter_shows_nowhere():
+    """A prior keeps a parameter that no pose depends on; its column is zero."""
+    a, b, _ = np.eye(3)
+    factor = np.stack([a, np.zeros(3), 2.0 * a], axis=1)
+    assert trades(factor, ('a', 'hidden', 'twice'), ('a', 'hidden')) == {'twice': ['a']}
+    factor = np.stack([b, np.zeros(3), 2.0 * a], axis=1)
+    assert independent(factor, ('b', 'hidden', 'a')) == ('b', 'a')
+
+
+@pytest.mark.parametrize(
+    ('diagonal', 'poses', 'o1', 'o2', 'o3', 'o4', 'o5'),
+    [
+        ((2.0, 8.0), 4, 4.0 / 2.0, 0.25, 2.0, 0.5, 1.6),
+        ((1.0, 1.0, 1.0), 1, 1.0, 1.0, 1.0, 1.0, 1.0 / 3.0),
+        ((10.0, 0.1, 1.0), 9, 1.0 / 3.0, 0.01, 0.1, 0.001, 1.0 / 11.1),
+    ],
+)
+def test_observability_indices_by_hand(diagonal, poses, o1, o2, o3, o4, o5, rng):
+    turned = np.linalg.qr(rng.normal(size=(len(diagonal),) * 2))[0]
+    for matrix in (np.diag(diagonal), turned @ np.diag(diagonal)):
+        found = observability(matrix, poses)
+        assert (found.o1, found.o2, found.o3, found.o4, found.o5) == pytest.approx(
+            (o1, o2, o3, o4, o5)
+        )
+
+
+def test_indices_of_a_problem_are_those_of_its_jacobian(rng):
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(30, rng)
+    seen = measure(true, q, rng, *NOISE)
+    result = identify(Problem(UR10E, seen, loss='none', **SIGMAS))
+    jacobian = ErrorModel(result.chain, result.names).jacobian(q)
+    jacobian = jacobian / np.repeat(NOISE, 3)[:, np.newaxis]
+    singular = np.linalg.svd(jacobian.reshape(-1, result.rank), compute_uv=False)
+    found = result.observability
+    assert found.o1 == pytest.approx(np.exp(np.log(singular).mean()) / np.sqrt(30), rel=1e-3)
+    assert found.o2 == pytest.approx(singular[-1] / singular[0], rel=1e-3)
+    assert found.o3 == pytest.approx(singular[-1], rel=1e-3)
+    assert found.o4 == pytest.approx(singular[-1] ** 2 / singular[0], rel=1e-3)
+    assert found.o5 == pytest.approx(1.0 / (1.0 / singular).sum(), rel=1e-3)
+
+
+def test_poses_in_a_corner_are_worse_by_every_index(rng):
+    true = faulty(UR10E, Cell(), rng)
+    wide = UR10E.random_joints(60, rng)
+    narrow = 0.5 + 0.05 * wide
+    first, second = (
+        identify(Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS)) for q in (wide, narrow)
+    )
+    for index in ('o1', 'o2', 'o3', 'o4', 'o5'):
+        assert getattr(second.observability, index) < getattr(first.observability, index)
+    # and so they are worse on poses elsewhere, which the names of weak parameters warn of
+    unseen = UR10E.random_joints(200, rng)
+    assert rms(second.chain, true, unseen) > 3.0 * rms(first.chain, true, unseen)
+    assert len(second.correlated(0.9)) > len(first.correlated(0.9))
+    assert not weakly_determined(first)
+
+
+def test_correlated_pairs_by_hand():
+    matrix = np.array([[4.0, 1.9, 0.0], [1.9, 1.0, -0.95], [0.0, -0.95, 1.0]])
+    names = ('a', 'b', 'c')
+    assert correlated(matrix, names, 0.9) == (
+        ('a', 'b', pytest.approx(0.95)),
+        ('b', 'c', pytest.approx(-0.95)),
+    )
+    assert correlated(matrix, names, 0.96) == ()
+
+
+def test_the_covariance_of_a_factor_by_hand():
+    factor = np.array([[2.0, 1.0], [0.0, 0.5]])
+    normal = factor.T @ factor
+    np.testing.assert_allclose(covariance(factor), np.linalg.inv(normal), rtol=1e-12)
+    # noise of double size has the middle 4 H, and four times the covariance
+    np.testing.assert_allclose(
+        covariance(factor, 4.0 * normal), 4.0 * np.linalg.inv(normal), rtol=1e-12
+    )
+
+
+@pytest.fixture(scope='module')
+def runs():
+    """Fit one arm to 80 measurements of the same 40 poses."""
+    rng = np.random.default_rng(7)
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(40, rng)
+    found = []
+    for _ in range(80):
+        seen = measure(true, q, rng, *NOISE)
+        found.append(identify(Problem(UR10E, seen, held_out=seen.select([0, 1]), **SIGMAS)))
+    return true, q, found
+
+
+def test_correlations_are_those_of_repeated_measurements(runs):
+    """Of estimates from 80 runs, with the joints' parameters in units of their deviations."""
+    _, _, found = runs
+    names = [name for name in found[0].names if not name.startswith(('base', 'tool'))]
+    index = [found[0].names.index(name) for name in names]
+    wanted = found[0].covariance[np.ix_(index, index)]
+    std = np.sqrt(np.diag(wanted))
+    estimates = np.array([[r.chain.value(name) for name in names] for r in found]) / std
+    sampled = np.corrcoef(estimates.T)
+    strongest = correlated(wanted, names, 0.5)
+    assert strongest
+    for first, second, value in strongest:
+        # a correlation r of 80 runs spreads by (1 - r^2) / sqrt(80) = 0.08 at 0.5; 4 of that
+        assert sampled[names.index(first), names.index(second)] == pytest.approx(value, abs=0.33)
+
+
+def test_predicted_uncertainty_holds_the_truth(runs):
+    """Squared distances in units of the covariance of pose and position follow chi-squared.
+
+    Errors of one run are correlated over poses, so the tolerance is from the spread over runs.
+    """
+    true, _, found = runs
+    unseen = UR10E.random_joints(60, np.random.default_rng(8))
+    truth = true.forward(unseen)
+    pose, position = [], []
+    for result in found:
+        predicted = result.chain.forward(unseen)
+        turn = log_rotation(predicted[:, :3, :3] @ np.swapaxes(truth[:, :3, :3], 1, 2))
+        error = np.concatenate([predicted[:, :3, 3] - truth[:, :3, 3], turn], axis=1)
+        matrix = result.pose_covariance(unseen)
+        pose.append(np.einsum('ni,nij,nj->n', error, np.linalg.inv(matrix), error))
+        axes = result.confidence_ellipsoid(unseen)
+        along = np.einsum('nij,nj->ni', axes, error[:, :3]) / (axes**2).sum(axis=2)
+        position.append((along**2).sum(axis=1))
+    mean = np.mean(pose, axis=1)
+    assert np.mean(mean) == pytest.approx(6.0, abs=4.0 * mean.std() / np.sqrt(len(found)))
+    assert mean.std() / np.sqrt(len(found)) < 0.3
+    inside = np.mean(np.array(position) <= 1.0, axis=1)
+    spread = inside.std() / np.sqrt(len(found))
+    assert spread < 0.015
+    assert inside.mean() == pytest.approx(0.95, abs=4.0 * spread)
+
+
+def test_the_ellipsoid_grows_with_its_level_and_is_orthogonal(runs):
+    _, _, found = runs
+    q = UR10E.random_joints(5, np.random.default_rng(9))
+    small, large = (found[0].confidence_ellipsoid(q, level) for level in (0.5, 0.99))
+    ratio = np.sqrt(stats.chi2.ppf(0.99, 3) / stats.chi2.ppf(0.5, 3))
+    np.testing.assert_allclose(
+        np.linalg.norm(large, axis=2), ratio * np.linalg.norm(small, axis=2), rtol=1e-9
+    )
+    products = large @ np.swapaxes(large, 1, 2)
+    lengths = np.einsum('nii->ni', products)
+    np.testing.assert_allclose(
+        products - lengths[:, :, None] * np.eye(3), 0.0, atol=1e-6 * lengths.max()
+    )
+
+
+def test_right_sigmas_pass_the_test_and_wrong_ones_do_not(runs):
+    true, q, found = runs
+    # each passes at 99.9 %: of 80 all but one at most
+    assert sum(result.noise.consistent for result in found) >= 79
+    assert np.mean([result.noise.position for result in found]) == pytest.approx(1.0, abs=0.02)
+    rng = np.random.default_rng(10)
+    for position, orientation in ((2.0, 1.0), (0.5, 1.0), (1.0, 2.0), (1.0, 0.5)):
+        seen = measure(true, q, rng, *NOISE)
+        result = identify(
+            Problem(
+                UR10E,
+                seen,
+                sigma_position=position * NOISE[0],
+                sigma_orientation=orientation * NOISE[1],
+            )
+        )
+        assert not result.noise.consistent
+        assert result.noise.position == pytest.approx(1.0 / position, rel=0.2)
+        assert result.noise.orientation == pytest.approx(1.0 / orientation, rel=0.2)
+
+
+def manufacture(scale=1.0):
+    """Return the tolerances by which `faulty` makes arms, for what is no gauge freedom."""
+    cell = Cell()
+    names = structurally_independent(UR10E, UR10E.parameter_names)
+    return {
+        name: scale * (cell.length_error if name.endswith(('.a', '.d')) else cell.angle_error)
+        for name in names
+        if not name.startswith(('base', 'tool'))
+    }
+
+
+@pytest.mark.parametrize(
+    ('count', 'oriented', 'gain'), [(6, True, 0.97), (8, True, 0.97), (10, False, 0.8)]
+)
+def test_priors_help_where_poses_are_few(count, oriented, gain):
+    """With a coarse device, tolerances of manufacture tell as much as eight poses do."""
+    errors = []
+    noise = (3e-4, 1.5e-3)
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(count, rng), rng, *noise, oriented=oriented)
+        unseen = UR10E.random_joints(300, rng)
+        options = {'sigma_position': noise[0], 'sigma_orientation': noise[1], 'loss': 'none'}
+        without = identify(Problem(UR10E, seen, priors={'*_joint.*': 1e6}, **options))
+        told = identify(Problem(UR10E, seen, **options))
+        helped = identify(Problem(UR10E, seen, priors=manufacture(), **options))
+        errors.append(
+            [
+                rms(c, true, unseen)
+                for c in (without.before, without.chain, helped.chain, told.chain)
+            ]
+        )
+    nominal, plain, with_priors, told_priors = np.median(errors, axis=0)
+    assert with_priors < gain * plain
+    assert told_priors < 1.1 * with_priors  # the data tell these tolerances as well
+    assert with_priors < 0.7 * nominal
+
+
+def test_priors_allow_fewer_poses_than_parameters():
+    """Four poses have 24 equations for 30 parameters."""
+    errors = []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(4, rng), rng, *NOISE)
+        with pytest.raises(TooFewObservationsError):
+            identify(Problem(UR10E, seen, **SIGMAS))
+        result = identify(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
+        assert result.rank == 30
+        unseen = UR10E.random_joints(300, rng)
+        errors.append([rms(chain, true, unseen) for chain in (result.before, result.chain)])
+    before, after = np.median(errors, axis=0)
+    assert after < 0.6 * before
+
+
+@pytest.mark.parametrize('count', [4, 6, 12])
+def test_standard_deviations_are_honest_where_errors_are_drawn_from_the_priors(count):
+    scores = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+        result = identify(
+            Problem(UR10E, seen, held_out=seen.select([0, 1]), priors=manufacture(), **SIGMAS)
+        )
+        scores += [
+            (p.value - true.value(p.name)) / p.std for p in result.parameters if p.name in prior
+        ]
+    # 25 runs of 18 parameters, correlated within a run: some 300 degrees of freedom
+    assert np.std(scores) == pytest.approx(1.0, abs=0.12)
+
+
+prior = frozenset(manufacture())
+
+
+def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    plain = identify(Problem(UR10E, seen, **SIGMAS))
+    result = identify(Problem(UR10E, seen, priors={'wrist_3_joint.d': 1e-3}, **SIGMAS))
+    row = {p.name: p for p in result.parameters}['wrist_3_joint.d']
+    assert 'wrist_3_joint.d' in plain.unidentifiable
+    assert row.status == 'fitted'
+    assert row.std == pytest.approx(1e-3, rel=1e-3)
+    assert row.offset == pytest.approx(0.0, abs=1e-6)
+    assert result.rank == plain.rank + 1
+    assert 'wrist_3_joint.d' not in result.gauges
+    # the poses do not know of it: predictions and their uncertainty stay as they are
+    unseen = UR10E.random_joints(50, rng)
+    np.testing.assert_allclose(
+        result.chain.forward(unseen), plain.chain.forward(unseen), rtol=0, atol=1e-8
+    )
+    np.testing.assert_allclose(
+        result.pose_covariance(unseen), plain.pose_covariance(unseen), rtol=0, atol=1e-13
+    )
+
+
+def test_priors_are_off_by_default_and_told_when_on(rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    without = identify(Problem(UR10E, seen, **SIGMAS))
+    assert without.priors == {}
+    assert 'prior' not in summary(without)
+    priors = {'elbow_joint.a': 1e-5, '*_joint.a': 1e-3}
+    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
+    assert result.priors == {
+        f'{name}.a': 1e-5 if name == 'elbow_joint' else 1e-3 for name in UR10E.joint_names
+    }
+    assert 'priors on 6 parameters' in summary(result)
+
+
+def test_narrow_priors_hold_and_wide_ones_let_go(rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    plain = identify(Problem(UR10E, seen, **SIGMAS))
+    narrow, wide = (
+        identify(Problem(UR10E, seen, priors=manufacture(scale), **SIGMAS))
+        for scale in (1e-6, 1e6)
+    )
+    unseen = UR10E.random_joints(100, rng)
+    np.testing.assert_allclose(
+        wide.chain.forward(unseen), plain.chain.forward(unseen), rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(narrow.chain.table, UR10E.table, rtol=0, atol=1e-6)
+    assert rms(narrow.chain, true, unseen) == pytest.approx(
+        rms(narrow.before, true, unseen), rel=0.01
+    )
+
+
+@pytest.mark.parametrize('sigma', [1e-4, 1e-3])
+def test_cross_validation_with_priors_is_that_of_separate_fits(sigma, rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(30, rng), rng, *NOISE)
+    priors = {f'{name}.*': sigma for name in UR10E.joint_names}
+    result = identify(Problem(UR10E, seen, priors=priors, loss='none', **SIGMAS))
+    folds = seen.configurations % 5
+    wanted = np.empty((30, 3))
+    for fold in range(5):
+        inside = folds == fold
+        part = Problem(
+            UR10E,
+            seen.select(~inside),
+            held_out=seen.select(inside),
+            priors=priors,
+            loss='none',
+            **SIGMAS,
+        )
+        wanted[inside] = identify(part).validation.after.position
+    np.testing.assert_allclose(result.validation.after.position, wanted, rtol=0, atol=2e-6)
+
+
+def test_priors_that_make_no_sense_are_refused(rng):
+    seen = measure(UR10E, UR10E.random_joints(20, rng), rng)
+    with pytest.raises(UnknownNameError, match=r'elbow_joint\.a'):
+        Problem(UR10E, seen, priors={'elbow.a': 1e-3})
+    for sigma in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ConfigError, match='prior'):
+            Problem(UR10E, seen, priors={'elbow_joint.a': sigma})

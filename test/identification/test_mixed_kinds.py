@@ -1,0 +1,365 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements of several kinds in one table or bag, identified together by the command line.
+
+A tracker sees the pose of one target and the position of another, a wire goes from a point of its
+own to a third, and a camera on the flange sees a board.
+"""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros.apply.simulation import Cell, drive, faulty, random_frame
+from calib_ros.cli.main import main
+from calib_ros.files.bags import replay
+from calib_ros.files.journal import Journal
+from calib_ros.identification.validation import residuals
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+UR10E = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = TYPESTORE.types
+START = 1_700_000_000_000_000_000
+
+
+class Workcell:
+    """The true chain, and the frames of all that measures and is measured."""
+
+    def __init__(self, seed):
+        rng = self.rng = np.random.default_rng(seed)
+        self.true = faulty(UR10E, Cell(), rng)
+        names = ('base_wire', 'base_board', 'tool_ball', 'tool_hook', 'tool_camera')
+        for name in names:
+            frame = random_frame(rng, 2.0 if name.startswith('base') else 0.2)
+            self.true = self.true.with_frame(name, frame)
+
+    def poses(self, joints, base='base', tool='tool', noise=NOISE):
+        """Return noisy poses (N, 4, 4) of a tool in a base."""
+        exact = self.true.forward(joints, base=base, tool=tool)
+        count = len(joints)
+        turn = se3.exp_rotation(self.rng.normal(scale=noise[1], size=(count, 3)))
+        shift = self.rng.normal(scale=noise[0], size=(count, 3))
+        return se3.transform(turn @ exact[:, :3, :3], exact[:, :3, 3] + shift)
+
+    def distances(self, joints, noise=NOISE[0]):
+        length = np.linalg.norm(
+            self.true.forward(joints, base='base_wire', tool='tool_hook')[:, :3, 3], axis=1
+        )
+        return length + self.rng.normal(scale=noise, size=len(joints))
+
+    def pictures(self, joints, noise=NOISE):
+        """Return noisy poses of the board in the camera."""
+        seen = se3.invert(self.poses(joints, 'base_board', 'tool_camera', (0.0, 0.0)))
+        turn = se3.exp_rotation(self.rng.normal(scale=noise[1], size=(len(joints), 3)))
+        shift = self.rng.normal(scale=noise[0], size=(len(joints), 3))
+        return se3.transform(turn @ seen[:, :3, :3], seen[:, :3, 3] + shift)
+
+
+@pytest.fixture
+def identified(capsys):
+    """Return a function that identifies by the command line and returns the JSON document."""
+
+    def identified(*arguments):
+        capsys.readouterr()
+        sigmas = ('--sigma-position', NOISE[0], '--sigma-orientation', NOISE[1])
+        words = ('identify', '--chain', 'ur10e', '--json', *sigmas, *arguments)
+        status = main([str(word) for word in words])
+        out, err = capsys.readouterr()
+        assert (status, err) == (0, ''), err
+        return json.loads(out)
+
+    return identified
+
+
+def corrected(document):
+    """Return the chain of a JSON document, with its frames."""
+    chain = UR10E
+    for name in {key.partition('.')[0] for key in document['parameters']}:
+        if name.startswith(('base_', 'tool_')):
+            chain = chain.with_frame(name, None)
+    return chain.with_offsets(
+        {name: entry['offset'] for name, entry in document['parameters'].items()}
+    )
+
+
+def error(chain, cell, base='base', tool='tool', true_base='base', true_tool='tool'):
+    """Return the RMS error [m] of the predicted positions at new configurations."""
+    joints = UR10E.random_joints(300, np.random.default_rng(99))
+    found = chain.forward(joints, base=base, tool=tool)
+    wanted = cell.true.forward(joints, base=true_base, tool=true_tool)
+    return np.sqrt(((found - wanted)[:, :3, 3] ** 2).sum(axis=1).mean())
+
+
+def pose_cells(pose):
+    quat = se3.to_quat(pose[:3, :3]).tolist()
+    where = dict(zip('xyz', pose[:3, 3].tolist(), strict=True))
+    return where | dict(zip(('qx', 'qy', 'qz', 'qw'), quat, strict=True))
+
+
+def rows_of(cell, counts):
+    """Return rows of all kinds, mixed."""
+    rows = []
+
+    def add(kind, joints, **more):
+        row = {f'q{k + 1}': value for k, value in enumerate(joints.tolist())}
+        rows.append(row | more | {'kind': kind})
+
+    poses, points, lengths, pictures = (UR10E.random_joints(n, cell.rng) for n in counts)
+    for joints, pose in zip(poses, cell.poses(poses), strict=True):
+        add('pose', joints, **pose_cells(pose))
+    for joints, pose in zip(points, cell.poses(points, tool='tool_ball'), strict=True):
+        add('point', joints, target='ball', **dict(zip('xyz', pose[:3, 3].tolist(), strict=True)))
+    for joints, length in zip(lengths, cell.distances(lengths), strict=True):
+        add('wire', joints, device='wire', target='hook', distance=float(length))
+    for joints, pose in zip(pictures, cell.pictures(pictures), strict=True):
+        add('camera', joints, device='camera', target='board', eye_in_hand=1, **pose_cells(pose))
+    order = np.concatenate([[0], 1 + cell.rng.permutation(len(rows) - 1)])  # the pose first
+    return [rows[k] for k in order]
+
+
+def write_csv(path, rows):
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    with path.open('w', newline='') as file:
+        writer = csv.DictWriter(file, names)
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+COUNTS = (25, 40, 60, 30)
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_all_kinds_in_one_table(identified, tmp_path, seed):
+    cell = Workcell(seed)
+    rows = rows_of(cell, COUNTS)
+    document = identified('--csv', write_csv(tmp_path / 'cell.csv', rows))
+    assert document['samples'] == {'samples': sum(COUNTS), 'held_out': 0, 'sets': 4}
+    # by poses 30, and for another target, a wire and a camera what each adds
+    assert document['rank'] == 30 + 3 + (3 + 3) + (6 + 6)
+    assert document['noise_in_sigma']['position'] == pytest.approx(1.0, abs=0.15)
+    chain = corrected(document)
+    assert set(chain.frame_names) == {
+        *('base', 'tool', 'tool_ball', 'base_wire', 'tool_hook', 'base_board', 'tool_camera')
+    }
+    together = error(chain, cell)
+    assert together < NOISE[0]
+    assert error(chain, cell, tool='tool_ball', true_tool='tool_ball') < NOISE[0]
+    camera = ('base_board', 'tool_camera')
+    # 0.2 mrad at the distance of the board are 0.4 mm
+    assert error(chain, cell, *camera, *camera) < 4.0 * NOISE[0]
+    only = [row for row in rows if row['kind'] == 'pose']
+    alone = identified('--csv', write_csv(tmp_path / 'poses.csv', only))
+    assert together < error(corrected(alone), cell)
+
+
+def test_rows_of_several_kinds_can_judge(identified, tmp_path):
+    cell = Workcell(4)
+    rows = rows_of(cell, COUNTS)
+    for kind in ('pose', 'point', 'wire'):
+        for row in [row for row in rows if row['kind'] == kind][-8:]:
+            row['split'] = 'test'
+    document = identified('--csv', write_csv(tmp_path / 'cell.csv', rows))
+    assert document['samples']['held_out'] == 24
+    assert document['validation']['after']['count'] == 24
+    assert document['validation']['after']['rms_mm'] < 2.0 * np.sqrt(3.0) * 1e3 * NOISE[0]
+
+
+# The same from a bag
+
+
+def header(stamp_ns, frame_id='tracker'):
+    time = TYPES['builtin_interfaces/msg/Time'](*divmod(int(stamp_ns), 1_000_000_000))
+    return TYPES['std_msgs/msg/Header'](time, frame_id)
+
+
+def make(kind, *parts):
+    return TYPES[kind](*parts)
+
+
+def quaternion(pose):
+    return make('geometry_msgs/msg/Quaternion', *se3.to_quat(pose[:3, :3]).tolist())
+
+
+def plain_pose(pose):
+    point = make('geometry_msgs/msg/Point', *pose[:3, 3].tolist())
+    return make('geometry_msgs/msg/Pose', point, quaternion(pose))
+
+
+def transform(stamp, pose, child):
+    shift = make('geometry_msgs/msg/Vector3', *pose[:3, 3].tolist())
+    both = make('geometry_msgs/msg/Transform', shift, quaternion(pose))
+    return make('geometry_msgs/msg/TransformStamped', header(stamp), child, both)
+
+
+def odometry(stamp, pose):
+    zero = make('geometry_msgs/msg/Vector3', 0.0, 0.0, 0.0)
+    twist = make('geometry_msgs/msg/Twist', zero, zero)
+    sigmas = np.repeat(NOISE, 3)
+    return make(
+        'nav_msgs/msg/Odometry',
+        header(stamp, 'ground'),
+        '',
+        make(
+            'geometry_msgs/msg/PoseWithCovariance',
+            plain_pose(pose),
+            np.diag(sigmas**2).ravel(),
+        ),
+        make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
+    )
+
+
+def picture(stamp, pose):
+    return make('geometry_msgs/msg/PoseStamped', header(stamp, 'camera'), plain_pose(pose))
+
+
+def length(stamp, value):
+    parts = (header(stamp, 'wire'), 0, 0.0, 0.0, 9.0, float(value), 0.0)
+    return make('sensor_msgs/msg/Range', *parts)
+
+
+SOURCES = (
+    '/markers type=TransformStamped',
+    '/wire device=wire target=hook',
+    '/odometry device=ground target=base',
+    '/camera device=camera target=board eye_in_hand=true',
+)
+
+
+def record(path, cell, count, storage='mcap'):
+    """Write the bag of an arm that stops at places, where everything is measured at once."""
+    where = UR10E.random_joints(count, cell.rng)
+    stamps, joints, _ = drive(where, Cell(move=0.3, dwell=0.5, joint_rate=50.0), START)
+    period = 0.8
+    events = []
+    for stamp, row in zip(stamps.tolist(), joints, strict=True):
+        none = np.zeros(0)
+        message = make(JOINT_STATE, header(stamp, ''), list(UR10E.joint_names), row, none, none)
+        events.append((stamp, '/joint_states', message))
+    for offset in (0.2, 0.3, 0.4):
+        at = START + np.round((period * np.arange(count) + offset) * 1e9).astype(np.int64)
+        sets = (
+            ('/markers', cell.poses(where), lambda stamp, pose: transform(stamp, pose, 'plate')),
+            (
+                '/markers',
+                cell.poses(where, tool='tool_ball'),
+                lambda stamp, pose: transform(stamp, pose, 'ball'),
+            ),
+            ('/wire', cell.distances(where), length),
+            ('/odometry', cell.poses(where, 'base_wire', 'tool_ball'), odometry),
+            ('/camera', cell.pictures(where), picture),
+        )
+        for topic, seen, of in sets:
+            for stamp, value in zip(at.tolist(), seen, strict=True):
+                events.append((stamp, topic, of(stamp, value)))
+    events.sort(key=lambda event: event[0])
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
+            for topic, kind in {topic: each.__msgtype__ for _, topic, each in events}.items()
+        }
+        for stamp, topic, message in events:
+            data = TYPESTORE.serialize_cdr(message, message.__msgtype__)
+            writer.write(connections[topic], stamp, data)
+    return path
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    cell = Workcell(6)
+    return cell, record(tmp_path_factory.mktemp('cell') / 'bag', cell, 35)
+
+
+def settings(**more):
+    return Settings(sigma_position=NOISE[0], sigma_orientation=NOISE[1], sources=SOURCES, **more)
+
+
+def test_all_sources_of_one_bag(identified, bag):
+    cell, path = bag
+    document = identified(path, *(part for text in SOURCES for part in ('--sources', text)))
+    samples = document['samples']
+    assert samples['samples'] == 5 * 35
+    assert samples['configurations'] == 35
+    assert samples['poses'] == 3 * 5 * 35
+    assert samples['dropped'] == {}
+    chain = corrected(document)
+    assert set(chain.frame_names) == {
+        *('base', 'base_ground', 'base_wire', 'base_board'),
+        *('tool', 'tool_plate', 'tool_base', 'tool_hook', 'tool_camera'),
+    }
+    # what comes first by its name, the ball, has the frames without names
+    assert error(chain, cell, true_tool='tool_ball') < NOISE[0]
+    assert error(chain, cell, tool='tool_plate') < NOISE[0]
+    ground = {'true_base': 'base_wire', 'true_tool': 'tool_ball'}
+    assert error(chain, cell, 'base_ground', 'tool_base', **ground) < NOISE[0]
+
+
+def test_the_journal_of_a_session_gives_the_same(identified, bag, tmp_path):
+    """What the node keeps can be identified by itself."""
+    _, path = bag
+    journal = Journal(tmp_path / 'journal.csv', 6)
+    session = CalibrationSession(UR10E, settings(), on_sample=journal.add)
+    replay(path, session)
+    journal.close()
+    result = session.identify()
+    document = identified('--csv', tmp_path / 'journal.csv')
+    assert document['samples']['samples'] == len(session.samples) == 5 * 35
+    assert document['rank'] == result.rank
+    for parameter in result.parameters:
+        found = document['parameters'][parameter.name]
+        assert found['value'] == pytest.approx(parameter.value, abs=1e-9)
+        assert found['status'] == parameter.status
+        if parameter.std is not None:
+            assert found['std'] == pytest.approx(parameter.std, rel=1e-6)
+
+
+def test_a_sample_that_was_taken_back_is_not_in_the_journal_either(identified, bag, tmp_path):
+    _, path = bag
+    journal = Journal(tmp_path / 'journal.csv', 6)
+    session = CalibrationSession(UR10E, settings(), on_sample=journal.add)
+    replay(path, session)
+    for _ in range(7):
+        journal.remove(session.remove_last())
+    journal.close()
+    result = session.identify()
+    document = identified('--csv', tmp_path / 'journal.csv')
+    assert document['samples']['samples'] == 5 * 35 - 7
+    for parameter in result.parameters:
+        assert document['parameters'][parameter.name]['value'] == pytest.approx(
+            parameter.value, abs=1e-9
+        )
+
+
+def test_poses_that_were_not_used_are_predicted(bag):
+    """Of each set a fifth is held out; what is left there is the noise."""
+    _, path = bag
+    session = CalibrationSession(UR10E, settings())
+    replay(path, session)
+    stops = sorted({sample.stamp_ns // 800_000_000 for sample in session.samples})
+    held_out = set(stops[::5])
+    session.samples = [
+        replace(sample, validation=sample.stamp_ns // 800_000_000 in held_out)
+        for sample in session.samples
+    ]
+    problem = session.problem()
+    result = session.identify()
+    assert result.accepted
+    for each in problem.judging:
+        left = residuals(result.chain, each).position
+        variance = NOISE[0] ** 2
+        if each.covariance is not None:  # that of the camera, which is turned round, or its own
+            variance = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2).mean() / 3.0
+        width = 1 if each.distances is not None else 3
+        rms = np.sqrt((left[:, :width] ** 2).mean())
+        assert rms < 2.0 * np.sqrt(variance / 3.0)  # three measurements a stop

@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.region import region_of_record
+from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_calibration, load_chain
+from calib_ros.report.words import as_document, calibration_yaml, summary
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+UR = load_chain('ur10e')
+HOME = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
+
+
+def arm(seed, errors=1.0):
+    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
+    return faulty(UR, cell, np.random.default_rng(seed))
+
+
+def around(seed, reach, count=60):
+    """Return joint values (count, 6) within `reach` [rad] of a posture."""
+    return HOME + np.random.default_rng(seed + 50).uniform(-reach, reach, (count, 6))
+
+
+def identified(true, q, seed=0):
+    seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
+    return identify(Problem(UR, seen))
+
+
+def rms(chain, true, q):
+    error = (chain.forward(q) - true.forward(q))[:, :3, 3]
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def with_a_still_joint(seed, reach):
+    """Return joint values (60, 6) with the elbow within `reach` [rad] of HOME."""
+    q = UR.random_joints(60, np.random.default_rng(seed))
+    q[:, 2] = HOME[2] + np.random.default_rng(seed).uniform(-reach, reach, 60)
+    return q
+
+
+@pytest.fixture(scope='module')
+def local():
+    """Return an arm whose elbow stood still."""
+    return identified(arm(0), with_a_still_joint(0, 3e-4))
+
+
+@pytest.fixture
+def folder(local, tmp_path):
+    path = tmp_path / 'out'
+    path.mkdir()
+    (path / 'calibration.yaml').write_text(calibration_yaml(local))
+    (path / 'result.json').write_text(json.dumps(as_document(local, {})))
+    return path
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
+    q = UR.random_joints(60, np.random.default_rng(seed))
+    found = identified(arm(seed), q, seed)
+    assert found.accepted
+    assert found.region.whole
+    assert found.region.covers(UR.random_joints(50, np.random.default_rng(1))).all()
+    assert 'valid over the whole joint range' in summary(found)
+    assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
+
+
+@pytest.mark.parametrize('errors', [0.1, 1.0, 10.0])
+@pytest.mark.parametrize('reach', [3e-4, 1e-3, 1e-2])
+def test_a_joint_that_hardly_moved_is_no_worse_where_it_may_be_used(reach, errors):
+    for seed in range(2):
+        true = arm(seed, errors)
+        q = with_a_still_joint(seed, reach)
+        found = identified(true, q, seed)
+        assert found.accepted or errors < 1.0
+        if not found.accepted:
+            continue
+        assert found.region.covers(q).all()
+        other = UR.random_joints(1000, np.random.default_rng(3))
+        used = other[found.region.covers(other)]
+        assert len(used)
+        assert rms(found.chain, true, used) < rms(found.before, true, used)
+
+
+def test_what_a_still_joint_leaves_open_is_not_covered(local):
+    region, q = local.region, with_a_still_joint(0, 3e-4)
+    assert not region.whole
+    away = q - np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    assert region.covers(q).all()
+    assert region.covers(away).mean() < 0.5
+    assert np.median(region.sigma(away)) > 2.0 * np.median(region.sigma(q))
+    other = region.covers(UR.random_joints(2000, np.random.default_rng(4)))
+    assert region.share == pytest.approx(other.mean(), abs=0.1)
+
+
+@pytest.mark.parametrize('group', ['eccentricity', 'gravity'])
+@pytest.mark.parametrize('seed', range(3))
+def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
+    """Measured on one side of an arm that has what the model lacks."""
+    names = effects.members(UR, group)
+    rng = np.random.default_rng(seed)
+    size = {'eccentricity': 2e-4, 'gravity': 3e-4}[group]
+    values = rng.normal(scale=size, size=len(names)).tolist()
+    true = arm(seed).with_effects(names).with_effect_values(dict(zip(names, values, strict=True)))
+    q = UR.random_joints(500, rng)
+    left = (se3.invert(true.base.matrix) @ true.forward(q))[:, 0, 3] < 0.0
+    found = identified(true, q[left][:60], seed)
+    other = q[~left]
+    axes = found.confidence_ellipsoid(other)
+    error = (found.chain.forward(other) - true.forward(other))[:, :3, 3]
+    squares = (axes**2).sum(axis=2)
+    inside = ((np.einsum('nij,nj->ni', axes, error) / squares) ** 2).sum(axis=1) <= 1.0
+    assert (inside | ~found.region.covers(other)).mean() >= 0.9
+    assert rms(found.chain, true, other) < rms(found.before, true, other)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_device_with_a_scale_does_not_calibrate_a_healthy_arm(seed):
+    q = UR.random_joints(60, np.random.default_rng(seed))
+    seen = measure(arm(seed, 0.0), q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
+    found = identify(Problem(UR, replace(seen, positions=seen.positions * (1.0 + 5e-4))))
+    assert not found.accepted
+    assert found.region is None
+    assert as_document(found, {})['region'] is None
+
+
+def test_the_region_is_kept_with_the_calibration(local, folder):
+    q = UR.random_joints(400, np.random.default_rng(3))
+    covered = local.region.covers(q)
+    assert 0.1 < covered.mean() < 0.9
+    for path in (folder, folder / 'calibration.yaml'):
+        read = CalibratedArm.read(path, UR).region
+        np.testing.assert_allclose(read.sigma(q), local.region.sigma(q), rtol=1e-6)
+        assert read.limit == local.region.limit
+        assert read.share == local.region.share
+        np.testing.assert_array_equal(read.covers(q), covered)
+        assert (read.base, read.tool) == (local.region.base, local.region.tool)
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'limit': 'wide'},
+        {'limit': -1.0},
+        {'limit': [1.0]},
+        {'share': 2.0},
+        {'share': None},
+        {'names': ['no_joint.a']},
+        {'names': None},
+        {'root': ['1.0']},
+        {'root': []},
+        {'root': 3},
+        {'root': [[1.0]]},
+        {'base': 'nowhere'},
+    ],
+)
+def test_a_damaged_region_is_refused(folder, change):
+    path = folder / 'calibration.yaml'
+    document = yaml.safe_load(path.read_text())
+    document['calibration']['region'] |= change
+    path.write_text(yaml.safe_dump(document))
+    with pytest.raises((ConfigError, UnknownNameError), match=r'calibration\.region'):
+        CalibratedArm.read(path, UR)
+
+
+@pytest.mark.parametrize('what', ['yes', 3, ['limit'], {}, {'limit': None}])
+def test_what_is_no_region_is_refused(what):
+    with pytest.raises(ConfigError, match=r'here: calibration\.region is damaged'):
+        region_of_record({'region': what}, UR, 'here')
+
+
+def test_a_calibration_without_a_region_is_still_read(folder):
+    path = folder / 'calibration.yaml'
+    document = yaml.safe_load(path.read_text())
+    del document['calibration']['region']
+    path.write_text(yaml.safe_dump(document))
+    assert CalibratedArm.read(path, UR).region is None
+
+
+def missed(command, wanted):
+    """Return the RMS distance [m] of the true arm's flange from where the nominal one would be."""
+    true = replace(arm(0), base=Frame(), tool=Frame())
+    error = (true.forward(command) - UR.forward(wanted))[:, :3, 3]
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def test_programs_are_corrected_inside_the_region_only(local, folder):
+    inside = around(2, 0.1, 15)
+    other = UR.random_joints(50, np.random.default_rng(0))
+    outside = other[~local.region.covers(other)][:5]
+    assert local.region.covers(inside).all()
+    loaded, record = load_calibration(folder, UR)
+    session = CalibrationSession(UR, Settings())
+    session.load(loaded, region=region_of_record(record, loaded, 'here'))
+    whole, alone = (CalibratedArm.read(p, UR) for p in (folder, folder / 'calibration.yaml'))
+    refused = []
+    for chain, region in (
+        (local.chain, local.region),
+        (whole.after, whole.region),
+        (alone.after, alone.region),
+        (session.calibration.chain, session.calibration.region),
+    ):
+        compensator = Compensator(UR, chain, region=region)
+        result = compensate(compensator, inside)
+        assert not result.refusals
+        assert missed(result.joints, inside) < 0.2 * missed(inside, inside)
+        result = compensate(compensator, np.concatenate([inside, outside]))
+        refused.append([each.sample for each in result.refusals if 'outside' in each.reason])
+        assert any('like 25 % of the program' in each.reason for each in result.refusals)
+    assert refused == [list(range(15, 20))] * 4

@@ -1,0 +1,348 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.errors import UnknownNameError
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.robust import LOSSES, OUTLIER
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
+
+UR10E = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+POSES = 80
+SEEDS = range(9)
+
+
+def directions(count, rng):
+    direction = rng.normal(size=(count, 3))
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def spoiled(seen, rng, share, shift=(0.0, 0.0), turn=(0.0, 0.0)):
+    """Return the observations with gross errors [m, rad] in a share, and which they are."""
+    count = round(share * len(seen))
+    index = rng.choice(len(seen), count, replace=False)
+    positions, rotations = seen.positions.copy(), seen.rotations.copy()
+    positions[index] += directions(count, rng) * rng.uniform(*shift, (count, 1))
+    turns = se3.exp_rotation(directions(count, rng) * rng.uniform(*turn, (count, 1)))
+    rotations[index] = turns @ rotations[index]
+    return replace(seen, positions=positions, rotations=rotations), set(index.tolist())
+
+
+def displaced(seen, true, rng, share, where):
+    """Return the observations with one and the same displacement in a share, and which they are.
+
+    In the world as from a tracker that was moved, in the tool's frame as from a bumped target;
+    poses are turned along by up to 50 mrad.
+    """
+    index = rng.choice(len(seen), round(share * len(seen)), replace=False)
+    shift = directions(1, rng)[0] * rng.uniform(5e-3, 50e-3)
+    turn = se3.exp_rotation(directions(1, rng) * rng.uniform(0.0, 50e-3))[0]
+    if not seen.oriented.all():
+        turn = np.eye(3)
+    positions, rotations = seen.positions.copy(), seen.rotations.copy()
+    if where == 'tool':
+        positions[index] += true.forward(seen.joints[index])[:, :3, :3] @ shift
+        rotations[index] = rotations[index] @ turn
+    else:
+        positions[index] += shift
+        rotations[index] = turn @ rotations[index]
+    return replace(seen, positions=positions, rotations=rotations), set(index.tolist())
+
+
+def cell(seed, oriented=True, count=POSES):
+    """Return a true arm, its measured poses and unseen joint values."""
+    rng = np.random.default_rng(seed)
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE, oriented=oriented)
+    return rng, true, seen, UR10E.random_joints(300, rng)
+
+
+def fit(seen, **options):
+    return identify(
+        Problem(UR10E, seen, sigma_position=NOISE[0], sigma_orientation=NOISE[1], **options)
+    )
+
+
+def rms(chain, true, unseen):
+    """Return the RMS position error [m] against the true arm."""
+    error = (chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+GROSS = {
+    'positions': {'shift': (5e-3, 50e-3)},
+    'orientations': {'turn': (0.02, 0.5)},
+    'both': {'shift': (5e-3, 50e-3), 'turn': (0.02, 0.5)},
+}
+
+
+@pytest.mark.parametrize(('share', 'limit'), [(0.1, 1.1), (0.3, 1.25)])
+@pytest.mark.parametrize(
+    ('oriented', 'kind'),
+    [(True, 'positions'), (True, 'orientations'), (True, 'both'), (False, 'positions')],
+)
+def test_gross_errors_are_named_and_hardly_harm_predictions(oriented, kind, share, limit):
+    ratios, hits, gross, false, good = [], 0, 0, 0, 0
+    for seed in SEEDS:
+        rng, true, clean, unseen = cell(seed, oriented)
+        seen, wrong = spoiled(clean, rng, share, **GROSS[kind])
+        result = fit(seen)
+        named = {outlier.sample for outlier in result.outliers}
+        hits, gross = hits + len(named & wrong), gross + len(wrong)
+        false, good = false + len(named - wrong), good + len(seen) - len(wrong)
+        rest = clean.select(np.array([k not in wrong for k in range(len(clean))]))
+        best = fit(rest, loss='none')
+        ratios.append(rms(result.chain, true, unseen) / rms(best.chain, true, unseen))
+        assert result.converged
+        assert result.accepted
+    assert hits >= 0.99 * gross
+    assert false <= 0.01 * good
+    assert np.median(ratios) < limit
+
+
+@pytest.mark.parametrize('where', ['world', 'tool'])
+@pytest.mark.parametrize(
+    ('count', 'oriented', 'share'),
+    [(80, True, 0.3), (80, False, 0.3), (30, True, 0.3), (30, False, 0.3), (60, True, 0.35)],
+)
+def test_gross_errors_that_agree_are_named_and_do_no_harm(count, oriented, share, where):
+    ratios, hits, gross, false, good = [], 0, 0, 0, 0
+    for seed in SEEDS:
+        rng, true, clean, unseen = cell(seed, oriented, count)
+        seen, wrong = displaced(clean, true, rng, share, where)
+        result = fit(seen)
+        named = {outlier.sample for outlier in result.outliers}
+        hits, gross = hits + len(named & wrong), gross + len(wrong)
+        false, good = false + len(named - wrong), good + len(seen) - len(wrong)
+        rest = clean.select(np.array([k not in wrong for k in range(count)]))
+        best = fit(rest, loss='none')
+        ratios.append(rms(result.chain, true, unseen) / rms(best.chain, true, unseen))
+        assert result.converged
+        assert result.accepted
+    assert hits >= 0.99 * gross
+    assert false <= 0.01 * good
+    assert max(ratios) < 1.25
+
+
+def test_a_target_bumped_twice_and_scattered_gross_errors():
+    for seed in SEEDS:
+        rng, true, clean, unseen = cell(seed)
+        once, first = displaced(clean, true, rng, 0.15, 'tool')
+        twice, second = displaced(once, true, rng, 0.1, 'tool')
+        seen, third = spoiled(twice, rng, 0.05, shift=(5e-3, 50e-3))
+        wrong = first | second | third
+        result = fit(seen)
+        assert {outlier.sample for outlier in result.outliers} == wrong
+        best = fit(clean.select(np.array([k not in wrong for k in range(len(clean))])))
+        assert rms(result.chain, true, unseen) < 1.1 * rms(best.chain, true, unseen)
+
+
+def test_one_of_two_sessions_was_bumped_from_some_moment_on():
+    """The sigmas given are ten times too small as well."""
+    for seed in SEEDS:
+        rng, true, clean, unseen = cell(seed)
+        true = true.with_frame('base_B', random_frame(rng, 2.0))
+        view = replace(true, base=true.frame('base_B'))
+        other = measure(view, UR10E.random_joints(60, rng), rng, *NOISE)
+        positions = other.positions.copy()
+        positions[42:] += view.forward(other.joints[42:])[:, :3, :3] @ [0.0, 8e-3, 0.0]
+        other = replace(other, positions=positions, base='base_B')
+        result = identify(
+            Problem(
+                UR10E,
+                clean,
+                more=(other,),
+                sigma_position=NOISE[0] / 10.0,
+                sigma_orientation=NOISE[1] / 10.0,
+            )
+        )
+        assert {(o.set, o.sample) for o in result.outliers} == {(1, k) for k in range(42, 60)}
+        assert rms(result.chain, true, unseen) < 1e-4
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('seed', SEEDS)
+def test_starting_values_survive_gross_errors_of_a_metre(seed, oriented):
+    """Errors as large as the arm, half of them all in the same direction; no frame is known."""
+    rng, true, clean, unseen = cell(seed, oriented)
+    nominal = replace(UR10E, base=None, tool=None)
+    seen, wrong = spoiled(clean, rng, 0.3, shift=(0.5, 1.5), turn=(0.5, 3.0))
+    one_sided = np.zeros((len(seen), 3))
+    one_sided[sorted(wrong)[::2]] = [1.0, 0.0, 0.0]
+    seen = replace(seen, positions=seen.positions + one_sided)
+    result = identify(Problem(nominal, seen))
+    assert {outlier.sample for outlier in result.outliers} == wrong
+    best = fit(clean.select(np.array([k not in wrong for k in range(len(clean))])))
+    assert rms(result.chain, true, unseen) < 1.5 * rms(best.chain, true, unseen)
+
+
+def test_a_wrong_guess_of_the_frames_and_gross_errors_together():
+    rng, true, clean, unseen = cell(0)
+    misled = replace(UR10E, base=random_frame(rng, 5.0), tool=random_frame(rng, 1.0))
+    seen, wrong = spoiled(clean, rng, 0.3, shift=(0.5, 1.5))
+    result = identify(Problem(misled, seen))
+    assert {outlier.sample for outlier in result.outliers} == wrong
+    assert rms(result.chain, true, unseen) < 1e-4
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('loss', [loss for loss in LOSSES if loss != 'none'])
+@pytest.mark.parametrize('scale', [1.0, 0.1])
+def test_clean_data_lose_nothing(loss, oriented, scale):
+    """Not even where the sigmas given are too small, so that gross errors are looked for."""
+    for seed in SEEDS:
+        *_, seen, unseen = cell(seed, oriented)
+        robust, plain = (
+            identify(
+                Problem(
+                    UR10E,
+                    seen,
+                    sigma_position=scale * NOISE[0],
+                    sigma_orientation=scale * NOISE[1],
+                    loss=each,
+                )
+            )
+            for each in (loss, 'none')
+        )
+        assert robust.outliers == plain.outliers == ()
+        np.testing.assert_array_equal(robust.chain.forward(unseen), plain.chain.forward(unseen))
+        np.testing.assert_array_equal(robust.covariance, plain.covariance)
+
+
+NO_PRIOR = {'*_joint.*': 1e6}
+"""Given, so that the data tell none, by which a fit with gross errors would be another."""
+
+
+@pytest.mark.parametrize(('share', 'limit'), [(0.1, 1.5), (0.3, 15.0)])
+def test_huber_bounds_the_harm(share, limit):
+    """Its influence stays, unlike that of the redescending loss, but does not grow."""
+    ratios, gains = [], []
+    for seed in range(3):
+        rng, true, clean, unseen = cell(seed)
+        seen, wrong = spoiled(clean, rng, share, shift=(5e-3, 50e-3))
+        huber, none = (fit(seen, loss=loss, priors=NO_PRIOR) for loss in ('huber', 'none'))
+        best = fit(clean.select(np.array([k not in wrong for k in range(len(clean))])))
+        error = rms(huber.chain, true, unseen)
+        ratios.append(error / rms(best.chain, true, unseen))
+        gains.append(rms(none.chain, true, unseen) / error)
+        assert {outlier.sample for outlier in huber.outliers} == wrong
+    assert np.median(ratios) < limit
+    assert np.median(gains) > 5.0
+
+
+def test_plain_least_squares_names_nothing():
+    rng, _, clean, _ = cell(0)
+    seen, _ = spoiled(clean, rng, 0.1, shift=(5e-3, 50e-3))
+    result = fit(seen, loss='none')
+    assert result.outliers == ()
+    assert result.fitted.outliers == result.validation.outliers == 0
+
+
+def test_outliers_carry_set_stamp_sample_and_size():
+    rng, true, clean, _ = cell(1)
+    stamps = rng.permutation(10_000)[: len(clean)] * 1_000_000 + 123
+    second = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    shifted = second.positions.copy()
+    shifted[7, 0] += 20e-3
+    positions = clean.positions.copy()
+    positions[3, 1] += 10e-3
+    positions[5, 2] -= 40e-3
+    seen = replace(clean.at(np.sort(stamps)), positions=positions)
+    result = fit(seen, more=(replace(second, positions=shifted),))
+    found = {(o.set, o.sample): o for o in result.outliers}
+    assert set(found) == {(0, 3), (0, 5), (1, 7)}
+    for (number, sample), size in {(0, 3): 10e-3, (0, 5): 40e-3, (1, 7): 20e-3}.items():
+        outlier = found[number, sample]
+        assert outlier.stamp_ns == (seen, second)[number].stamps_ns[sample]
+        assert outlier.size > OUTLIER
+        assert outlier.size == pytest.approx(size / NOISE[0], rel=0.3)
+
+
+def test_named_samples_are_left_out_of_the_figures_and_counted():
+    rng, true, seen, _ = cell(2)
+    held_out = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    held_out, wrong = spoiled(held_out, rng, 0.1, shift=(5e-3, 50e-3))
+    seen, _ = spoiled(seen, rng, 0.05, shift=(5e-3, 50e-3))
+    by_held_out = fit(seen, held_out=held_out)
+    validation = by_held_out.validation
+    assert validation.outliers == len(wrong) == 4
+    assert set(np.flatnonzero(~validation.judged).tolist()) == wrong
+    before, after = validation.figures
+    assert before.count == after.count == 36
+    assert after.max_mm < 0.5
+    assert by_held_out.accepted
+    everything = validation.figures_of_all[1]
+    assert everything.count == 40
+    assert everything.max_mm > 5.0
+    assert by_held_out.fitted.outliers == len(by_held_out.outliers) == 4
+    by_folds = fit(seen).validation
+    assert by_folds.outliers == 4
+    assert by_folds.figures[1].count == POSES - 4
+    assert by_folds.figures[1].max_mm < 0.5
+    assert by_folds.figures_of_all[1].max_mm > 5.0
+
+
+@pytest.mark.parametrize('agree', [False, True])
+@pytest.mark.parametrize('share', [0.4, 0.45])
+def test_more_outliers_than_a_third_are_not_accepted(share, agree):
+    for seed in SEEDS:
+        rng, true, clean, _ = cell(seed)
+        seen, _ = spoiled(clean, rng, share, shift=(5e-3, 50e-3))
+        if agree:
+            seen, _ = displaced(clean, true, rng, share, 'tool')
+        result = fit(seen)
+        assert not result.accepted
+        assert any('outliers' in text for text in result.refusals)
+
+
+def test_held_out_poses_that_do_not_belong_there_are_not_accepted():
+    """Most of them are another cell's: figures of the few that fit would tell nothing."""
+    rng, true, seen, _ = cell(3)
+    held_out = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    held_out, _ = spoiled(held_out, rng, 0.6, shift=(5e-3, 50e-3))
+    assert fit(seen, held_out=measure(true, UR10E.random_joints(40, rng), rng, *NOISE)).accepted
+    assert not fit(seen, held_out=held_out).accepted
+
+
+def test_the_noise_and_the_uncertainty_are_those_of_the_good_samples():
+    rng, _, clean, unseen = cell(4)
+    seen, wrong = spoiled(clean, rng, 0.2, shift=(5e-3, 50e-3))
+    best = fit(clean.select(np.array([k not in wrong for k in range(len(clean))])))
+    result = fit(seen)
+    assert result.noise.position == pytest.approx(best.noise.position, rel=0.05)
+    assert result.noise.consistent
+    ratio = result.pose_covariance(unseen) / best.pose_covariance(unseen)
+    assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_an_unknown_loss_is_named():
+    *_, seen, _ = cell(0)
+    with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
+        Problem(UR10E, seen, loss='hubert')
+    assert caught.value.alternatives == LOSSES
+
+
+def test_what_a_simpler_model_explains_is_no_gross_error_for_a_richer_one():
+    """Displaced samples keep their weight where the simpler model explains them."""
+    rng = np.random.default_rng(21)
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, 5e-5, 2e-4)
+    positions = seen.positions.copy()
+    positions[:6] += 5e-3
+    problem = Problem(UR10E, replace(seen, positions=positions), priors=NO_PRIOR)
+    result = identify(problem)
+    assert [outlier.sample for outlier in result.outliers] == list(range(6))
+    explained = replace(result, distances=(np.zeros(60),))
+    plain = identify(replace(problem, loss='none'))
+    kept = identify(problem, explained)
+    assert kept.outliers == ()
+    assert kept.fitted.figures[1].rms_mm == pytest.approx(plain.fitted.figures[1].rms_mm, rel=1e-6)
+    again = identify(problem, result)
+    assert [outlier.sample for outlier in again.outliers] == list(range(6))
+    assert again.fitted.figures[1].rms_mm == pytest.approx(result.fitted.figures[1].rms_mm)

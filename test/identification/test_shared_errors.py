@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.distance import cdist
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification import leastsquares, shared_errors
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.words import as_document, noise_in_words
+
+UR10E = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
+
+
+def along_path(count, rng, ways=12):
+    """Return joint values (count, 6) on straight lines through way-points."""
+    corners = UR10E.random_joints(ways, rng)
+    share = np.arange(count // ways)[:, np.newaxis] / (count // ways)
+    lines = np.roll(corners, -1, axis=0) - corners
+    return (corners[:, np.newaxis] + share * lines[:, np.newaxis]).reshape(count, -1)
+
+
+def fading(count, length, rng):
+    """Return (count, 3) errors of unit variance that decay over a number of poses."""
+    decay = np.exp(-1.0 / length)
+    steps = np.sqrt(1.0 - decay**2) * rng.normal(size=(count, 3))
+    steps[0] /= np.sqrt(1.0 - decay**2)
+    return lfilter([1.0], [1.0, -decay], steps, axis=0)
+
+
+def smooth(q, rng):
+    """Return (N, 3) errors of unit variance, smooth over the joint space."""
+    place = np.concatenate([np.cos(q), np.sin(q)], axis=1)
+    kernel = np.exp(-0.5 * cdist(place, place, 'sqeuclidean')) + 1e-9 * np.eye(len(q))
+    return np.linalg.cholesky(kernel) @ rng.normal(size=(len(q), 3))
+
+
+def shifted(seen, errors):
+    return replace(seen, positions=seen.positions + errors)
+
+
+def run(seed, count=60, order='path', drift=None, oriented=True, amplitude=1e-4):
+    """Return the true arm and the identification of it with a drifting tracker."""
+    rng = np.random.default_rng(seed)
+    true = faulty(UR10E, Cell(), rng)
+    q = along_path(count, rng) if order == 'path' else UR10E.random_joints(count, rng)
+    seen = measure(true, q, rng, *NOISE, oriented=oriented)
+    if drift is not None:
+        seen = shifted(seen, amplitude * fading(count, drift, rng))
+    # the verdict is not asked for, so it is judged by two poses
+    return true, identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2)), **SIGMAS))
+
+
+def hits(true, result, widened=True):
+    """Return for each parameter whether its 95 % interval holds the truth."""
+    factor = 1.0 if widened else result.noise.widened
+    return [
+        abs(p.value - true.value(p.name)) <= p.half_width() / factor
+        for p in result.parameters
+        if p.std is not None
+    ]
+
+
+@pytest.mark.parametrize('order', ['path', 'random'])
+def test_independent_errors_stay_independent(order):
+    """At 99 %: of 60 sessions with nothing shared one or two at most are said to share."""
+    found = [run(seed, 48, order)[1] for seed in range(60)]
+    assert sum(bool(result.noise.shared) for result in found) <= 3
+    # and then standard deviations are those of the Cramer-Rao bound
+    quiet = [result for result in found if not result.noise.shared and result.noise.consistent]
+    assert len(quiet) > 50
+    assert all(result.noise.widened == 1.0 for result in quiet)
+    assert all(np.isinf(p.freedom) for result in quiet for p in result.parameters if p.std)
+
+
+def test_intervals_hold_the_truth_though_the_tracker_drifts():
+    """60 sessions of 30 parameters: their coverage spreads by 0.06 a session, 0.008 in all."""
+    runs = [run(seed, drift=10.0) for seed in range(60)]
+    assert all('successive' in result.noise.shared for _, result in runs)
+    covered = np.mean([hits(*each) for each in runs])
+    alone = np.mean([hits(*each, widened=False) for each in runs])
+    assert covered == pytest.approx(0.95, abs=0.025)
+    assert alone < 0.925
+
+
+def test_errors_smooth_over_the_joint_space_are_shared_by_what_is_near():
+    """The path is measured in random order: successive configurations have nothing in common."""
+    kinds, covered, alone = [], [], []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        q = rng.permutation(along_path(180, rng))
+        seen = shifted(measure(true, q, rng, *NOISE), 1e-4 * smooth(q, rng))
+        result = identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2)), **SIGMAS))
+        kinds.append(result.noise.shared)
+        covered.append(hits(true, result))
+        alone.append(hits(true, result, widened=False))
+    assert all('near' in kind for kind in kinds)
+    assert sum('successive' in kind for kind in kinds) <= 2
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.04)
+    assert np.mean(alone) < 0.85
+
+
+def test_the_correlation_is_that_of_the_errors():
+    """The drift has 4/5 of the variance and decays by exp(-1/10) from one pose to the next."""
+    found = [run(seed, 300, 'random', drift=10.0)[1].noise for seed in range(8)]
+    expected = 0.8 * np.exp(-0.1)
+    assert np.mean([noise.successive for noise in found]) == pytest.approx(expected, abs=0.08)
+    assert np.abs(np.mean([noise.near for noise in found])) < 0.1
+
+
+def test_distances_drift_as_well():
+    rng = np.random.default_rng(4)
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(300, rng), rng)
+    length = np.linalg.norm(seen.positions, axis=1) + 5e-5 * rng.normal(size=300)
+    for drift, shared in ((0.0, ()), (2e-4, ('successive',))):
+        wire = replace(seen, distances=length + drift * fading(300, 20.0, rng)[:, 0])
+        assert identify(Problem(UR10E, wire, **SIGMAS)).noise.shared == shared
+
+
+def test_sessions_are_no_neighbours_of_each_other():
+    """The first pose of a session does not follow the last one of the session before."""
+    rng = np.random.default_rng(5)
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(40, rng)
+    offsets = 1e-3 * rng.normal(size=(5, 3))
+    sets = [
+        replace(shifted(measure(true, part, rng, *NOISE), offset), base=f'base_{k}')
+        for k, (part, offset) in enumerate(zip(np.split(q, 5), offsets, strict=True))
+    ]
+    sets[0] = replace(sets[0], base='base')
+    result = identify(Problem(UR10E, sets[0], more=sets[1:], **SIGMAS))
+    assert result.noise.shared == ()
+
+
+def test_covariances_of_the_samples_change_nothing_when_equal():
+    rng = np.random.default_rng(6)
+    true = faulty(UR10E, Cell(), rng)
+    seen = shifted(measure(true, along_path(60, rng), rng, *NOISE), 2e-4 * fading(60, 10.0, rng))
+    own = np.tile(np.diag(np.repeat(NOISE, 3) ** 2), (60, 1, 1))
+    plain, whitened = (
+        identify(Problem(UR10E, each, **SIGMAS)) for each in (seen, replace(seen, covariance=own))
+    )
+    assert plain.noise.shared == whitened.noise.shared == ('successive', 'near')
+    # whitened rows are one part: orientations count as drifting, too
+    ratio = np.diag(whitened.covariance) / np.diag(plain.covariance)
+    assert 0.5 < np.median(np.sqrt(ratio)) < 2.0
+
+
+def shifted_run(monkeypatch, count, **constants):
+    for name, value in constants.items():
+        module = leastsquares if name == 'BLOCK' else shared_errors
+        monkeypatch.setattr(module, name, value)
+    return run(7, count, drift=10.0)[1]
+
+
+def test_blocks_and_samples_of_a_stop_do_not_change_the_result(monkeypatch):
+    whole = run(7, 96, drift=10.0)[1]
+    in_blocks = shifted_run(monkeypatch, 96, BLOCK=7)
+    np.testing.assert_allclose(in_blocks.covariance, whole.covariance, rtol=1e-6, atol=1e-18)
+
+
+@pytest.mark.parametrize('block', [1, 24, 96])  # 24: the last one holds a single stop
+def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypatch, block):
+    monkeypatch.setattr(leastsquares, 'BLOCK', block)
+    rng = np.random.default_rng(11)
+    samples = leastsquares.Samples(measure(UR10E, along_path(96, rng)[:73], rng, *NOISE), *NOISE)
+    names = UR10E.parameter_names
+    system, kernels = leastsquares.System((samples,)), [(3.0, 2.0), (20.0, 0.5)]
+    apart = np.abs(np.subtract.outer(np.arange(73), np.arange(73)))
+    kernel = sum(size * np.exp(-apart / length) for length, size in kernels)
+    rows = samples.rows_of(UR10E, names)[..., :-1]
+    for part, own in enumerate((rows[:, :3], rows[:, 3:])):
+        found = shared_errors._successive(UR10E, names, system, part, kernels)
+        expected = np.einsum('ncp,nm,mcr->pr', own, kernel, own, optimize=True)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * expected.max())
+
+
+def test_a_part_of_many_stops_tells_nearly_the_same(monkeypatch):
+    whole = shifted_run(monkeypatch, 960, MOST=960)
+    part = shifted_run(monkeypatch, 960, MOST=240)
+    assert part.noise.shared == whole.noise.shared
+    ratio = np.sqrt(np.diag(part.covariance) / np.diag(whole.covariance))
+    assert 0.6 < np.median(ratio) < 1.7
+    assert whole.noise.widened > 2.0
+
+
+def test_pairs_of_a_stop_with_one_error_tell_no_more_than_one():
+    rng = np.random.default_rng(8)
+    true = faulty(UR10E, Cell(), rng)
+    once = shifted(measure(true, along_path(96, rng), rng, *NOISE), 2e-4 * fading(96, 10.0, rng))
+    thrice = once.select(np.repeat(np.arange(96), 3))
+    first, second = (
+        identify(Problem(UR10E, each, held_out=once.select(np.arange(2))))
+        for each in (once, thrice)
+    )
+    assert first.noise.shared == second.noise.shared
+    ratio = np.sqrt(np.diag(second.covariance) / np.diag(first.covariance))
+    np.testing.assert_allclose(ratio, 1.0, rtol=0.1)
+
+
+def test_the_report_says_what_is_shared_and_what_follows():
+    _, drifting = run(9, drift=10.0, amplitude=3e-4)
+    text = noise_in_words(drifting)
+    assert 'measured in succession (0.' in text
+    assert f'{drifting.noise.widened:.1f} times those of independent errors' in text
+    document = as_document(drifting, {})
+    assert document['noise_in_sigma']['shared'][0] == 'successive'
+    for parameter in document['parameters'].values():
+        if parameter['std'] is not None:
+            assert parameter['half_width_95'] > 1.95 * parameter['std']
+    _, quiet = run(9)
+    assert 'share no errors' in noise_in_words(quiet)
+
+
+@pytest.mark.parametrize('count', [2, 7, 8])
+def test_few_poses_do_no_harm(count):
+    rng = np.random.default_rng(10)
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+    priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
+    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
+    assert result.noise.shared == ()
+
+
+def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
+    """Against the same traces of whole matrices."""
+    rng = np.random.default_rng(0)
+    count, width = 20, 4
+    parts = [rng.normal(size=(width + 1, 3, count)) for _ in range(2)]
+    parts[1][:, :, ::3] = 0.0  # every third stop without orientation
+    place = rng.normal(size=(count, 2))
+    units = shared_errors._Stops(parts, np.ones(count), place, np.arange(count, dtype=float))
+    forms = shared_errors._Forms(units, np.zeros((0, width)))
+    rows = np.concatenate([part.reshape(width + 1, -1).T for part in parts])
+    basis = np.linalg.qr(rows[:, :-1])[0]
+    measured = np.concatenate([part.any(axis=0).ravel() for part in parts])
+    left = np.diag(measured.astype(float)) - basis @ basis.T
+
+    def whole(part, matrix):
+        shares = np.zeros((2, 2))
+        shares[part, part] = 1.0
+        return np.kron(shares, np.kron(np.eye(3), matrix))
+
+    kernels = [('successive', 5.0), ('near', 0.3)]
+    cases = [(part, units.kernel(*kernel)) for part in (0, 1) for kernel in kernels]
+    for first in cases:
+        for second in cases:
+            expected = np.trace(whole(*first) @ left @ whole(*second) @ left)
+            found = forms._trace(forms._form(*first), forms._form(*second))
+            assert found == pytest.approx(expected, abs=1e-9)
+    links = units.links('successive')
+    dense = whole(1, links.toarray())
+    free = left[60:, 60:]
+    ratio = np.trace(dense @ left) / np.trace(free)
+    centred = dense @ left - ratio * whole(1, np.eye(count)) @ left
+    residual = left @ rows[:, -1]
+    excess = residual @ dense @ residual - ratio * (residual[60:] ** 2).sum()
+    excess *= np.trace(free) / (residual[60:] ** 2).sum()
+    expected = excess / np.sqrt(2.0 * np.trace(centred @ centred))
+    assert forms.test(1, links)[1] == pytest.approx(expected, rel=1e-9)

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.suspicions import _common, scale_of
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.words import as_document, summary
+
+UR = load_chain('ur10e')
+GRAVITY = {
+    'shoulder_lift_joint.gravity_wrist_3_joint': 4e-4,
+    'elbow_joint.gravity_wrist_3_joint': 3e-4,
+}
+
+
+def seen_of(true, seed=0, count=60, oriented=True):
+    rng = np.random.default_rng(seed)
+    return measure(true, UR.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+
+
+def scaled(observations, ppm):
+    return replace(observations, positions=observations.positions * (1.0 + 1e-6 * ppm))
+
+
+def arm(seed=0, errors=1.0, chain=UR):
+    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
+    return faulty(chain, cell, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14'])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_the_scale_of_a_device_is_found(name, oriented):
+    chain, rng = load_chain(name), np.random.default_rng(0)
+    true = faulty(chain, Cell(length_error=0.0, angle_error=0.0), rng)
+    seen = measure(true, chain.random_joints(60, rng), rng, 5e-5, 2e-4, oriented)
+    problem = Problem(chain, scaled(seen, 3000.0))
+    result = identify(problem)
+    scale, std, freedom = scale_of(problem, result)
+    assert abs(scale - 3e-3) < 4.0 * std
+    assert std < 5e-5
+    assert freedom >= 4
+    assert not result.accepted
+    assert any('alike' in each for each in result.refusals)
+
+
+def test_growth_that_arms_have_is_said_and_not_refused():
+    """An arm 10 degrees warmer has the same 230 ppm as a device's wrong metre.
+
+    Where it has no other errors nothing is gained for sure (`region.py`).
+    """
+    result = identify(Problem(UR, scaled(seen_of(arm(errors=0.0)), 230.0)))
+    assert result.region is None
+    assert not any('alike' in each for each in result.refusals)
+    (remark,) = result.remarks
+    assert 'grow alike' in remark
+    assert remark in summary(result)
+    assert as_document(result, {})['remarks'] == [remark]
+
+
+def test_offsets_that_scatter_hide_a_scale():
+    """The scale is as uncertain as the arm's own offsets make it, and honestly so."""
+    rng, held = np.random.default_rng(0), []
+    growth = rng.uniform(0.1, 0.6, 9)
+    for _ in range(2000):
+        offsets = 1e-3 * growth + rng.normal(scale=5e-4, size=9)
+        scale, std, freedom = _common(offsets, growth, 1e-10 * np.eye(9))
+        held.append(abs(scale - 1e-3) < 2.306 * std)
+        assert freedom == 8
+    assert np.mean(held) == pytest.approx(0.95, abs=0.015)
+
+
+@pytest.mark.parametrize('errors', [0.1, 1.0, 3.0])
+def test_healthy_and_faulty_arms_are_not_suspicious(errors):
+    for seed in range(4):
+        result = identify(Problem(UR, seen_of(arm(seed, errors), seed, oriented=seed % 2 == 0)))
+        assert result.remarks == ()
+        assert result.accepted
+
+
+def test_a_sister_is_named():
+    true = arm(0, 0.2, load_chain('ur10'))
+    result = identify(Problem(UR, seen_of(true)))
+    (remark,) = result.remarks
+    assert 'nearer to the shipped ur10 (' in remark
+    assert 'is it the right chain file?' in remark
+
+
+@pytest.mark.parametrize(('gravity', 'axis'), [((9.81, 0, 0), 'x'), ((0, -9.81, 0), 'y')])
+def test_an_arm_on_a_wall_is_noticed(gravity, axis):
+    bent = arm(1).with_effects(list(GRAVITY)).with_offsets(GRAVITY)
+    seen = seen_of(replace(bent, gravity=gravity), count=120)
+    result = identify(Problem(UR, seen, effects=('gravity',)))
+    assert f'gravity along {axis} of the base explains' in ''.join(result.remarks)
+    right = Problem(replace(UR, gravity=gravity), seen, effects=('gravity',))
+    assert identify(right).remarks == ()
+
+
+def test_motor_angles_are_noticed():
+    coupled = {'wrist_3_joint.coupling_wrist_2_joint': 2e-3}
+    seen = seen_of(arm().with_effects(list(coupled)).with_offsets(coupled))
+    (remark,) = identify(Problem(UR, seen)).remarks
+    assert 'couplings of the last joints explain' in remark
+    assert (
+        identify(Problem(UR, seen, effects=('coupling',), priors={'*.coupling_*': 0.01})).remarks
+        == ()
+    )

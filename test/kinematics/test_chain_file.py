@@ -1,0 +1,561 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Frame, Joint
+from calib_ros.kinematics.chain_file import (
+    chain_document,
+    dump_chain,
+    load_calibration,
+    load_chain,
+    nominal_record,
+    parse_calibration,
+    parse_chain,
+    shipped_robots,
+)
+from calib_ros.settings import Settings
+
+GOLDEN = yaml.safe_load(Path(__file__).with_name('golden_fk.yaml').read_text())
+HALF = np.pi / 2
+
+UR = """
+name: some_ur
+convention: standard
+joints:
+- {name: joint_1, type: revolute, a: 0.0, alpha: 1.5707963268, d: 0.1273, theta: 0.0, sign: 1}
+- {name: joint_2, type: revolute, a: -0.612, alpha: 0.0, d: 0.0, theta: 0.0, sign: 1}
+- {name: joint_3, type: revolute, a: -0.5723, alpha: 0.0, d: 0.0, theta: 0.0, sign: 1}
+- {name: joint_4, type: revolute, a: 0.0, alpha: 1.5707963268, d: 0.163941, theta: 0.0, sign: 1}
+- {name: joint_5, type: revolute, a: 0.0, alpha: -1.5707963268, d: 0.1157, theta: 0.0, sign: 1}
+- {name: joint_6, type: revolute, a: 0.0, alpha: 0.0, d: 0.0922, theta: 0.0, sign: 1}
+parallel: [joint_2, joint_3]
+"""
+CRAIG = """
+name: some_panda
+convention: modified
+joints:
+- {name: joint_1, type: revolute, a: 0.0, alpha: 0.0, d: 0.333, theta: 0.0, sign: 1}
+- {name: joint_2, type: revolute, a: 0.0, alpha: -1.5707963268, d: 0.0, theta: 0.0, sign: 1}
+- {name: joint_3, type: revolute, a: 0.0, alpha: 1.5707963268, d: 0.316, theta: 0.0, sign: 1}
+- {name: joint_4, type: revolute, a: 0.0825, alpha: 1.5707963268, d: 0.0, theta: 0.0, sign: 1}
+- {name: joint_5, type: revolute, a: -0.0825, alpha: -1.5707963268, d: 0.384, theta: 0.0, sign: 1}
+- {name: joint_6, type: revolute, a: 0.0, alpha: 1.5707963268, d: 0.0, theta: 0.0, sign: 1}
+- {name: joint_7, type: revolute, a: 0.088, alpha: 1.5707963268, d: 0.107, theta: 0.0, sign: 1}
+parallel: []
+"""
+PARALLEL_FIRST = """
+name: some_iiwa
+convention: standard
+parallel: []
+joints:
+- {name: joint_1, type: revolute, a: 0, alpha: -1.5707963268, d: 0.36, theta: 0.0, sign: 1}
+- {name: joint_2, type: revolute, a: 0, alpha: 1.5707963268, d: 0, theta: 0.0, sign: -1}
+- {name: joint_3, type: revolute, a: 0, alpha: 1.5707963268, d: 0.42, theta: 0.0, sign: 1}
+"""
+POSITIONER = """
+name: some_positioner
+convention: standard
+joints:
+- {name: joint_1, type: revolute, a: 0.0, alpha: -1.5707963268, d: 0.0, theta: 0.0, sign: 1}
+- {name: joint_2, type: revolute, a: 0.0, alpha: 0.0, d: -0.475, theta: -1.5707963268, sign: 1}
+parallel: []
+"""
+GANTRY = """
+convention: modified
+joints:
+- name: rail
+  type: prismatic
+  a: 1e-3
+  alpha: 0
+  d: 0.5
+  theta: .1
+  lower: -2
+  upper: 3
+- name: turn
+  a: 2E-1
+  alpha: 1.57
+  d: -1e-1
+  theta: 0
+  beta: 1e-2
+base: {xyz: [1, 2, 3e0], quat_xyzw: [0.0, 0.6, 0.0, 0.8], fixed: true}
+tool: {xyz: [0.1, 0, 0]}
+"""
+
+
+def elementary(axis, angle=0.0, shift=0.0):
+    turn = np.eye(4)
+    turn[:3, :3] = se3.exp_rotation(angle * np.eye(3)[axis])
+    turn[axis, 3] = shift
+    return turn
+
+
+def reference_forward(document, q):
+    """Forward kinematics straight from the document, by the definition in docs and paper."""
+    pose = np.eye(4)
+    for row, value in zip(document['joints'], q, strict=True):
+        a, alpha, d, theta, beta = (
+            float(row.get(kind, 0.0)) for kind in ('a', 'alpha', 'd', 'theta', 'beta')
+        )
+        moved = row.get('sign', 1) * value
+        if row.get('type') == 'prismatic':
+            d += moved
+        else:
+            theta += moved
+        turn_z = elementary(2, theta, d)
+        if document['convention'] == 'standard':
+            pose = pose @ turn_z @ elementary(0, alpha, a) @ elementary(1, beta)
+        else:
+            pose = pose @ elementary(0, alpha, a) @ elementary(1, beta) @ turn_z
+    return pose
+
+
+def assert_same(chain, expected, tolerance=1e-12):
+    assert chain.name == expected.name
+    assert chain.convention == expected.convention
+    assert chain.joints == expected.joints
+    assert chain.parallel == expected.parallel
+    assert chain.parameter_names == expected.parameter_names
+    for key in ('base', 'tool'):
+        found, frame = getattr(chain, key), getattr(expected, key)
+        assert (found is None) == (frame is None)
+        if frame is not None:
+            assert found.fixed is frame.fixed
+            np.testing.assert_array_equal(found.matrix[:3, 3], frame.matrix[:3, 3])
+            np.testing.assert_allclose(found.matrix, frame.matrix, atol=tolerance)
+
+
+numbers = st.floats(-10.0, 10.0) | st.sampled_from([0.0, 1e-3, 1e-5, 1e-300, HALF, -0.0])
+# Names that YAML would read as something else when they are not quoted.
+names = st.sampled_from(
+    ['yes', 'null', '1', '1e3', '~', 'a: b', 'joint 2', '#3', "it's", '"q"', '[x]', 'Gelenk_ä']
+) | st.from_regex(r'[a-z][a-z0-9_]{0,12}', fullmatch=True).filter(
+    lambda name: name not in ('base', 'tool')
+)
+
+
+@st.composite
+def joints(draw, name):
+    limits = draw(st.none() | st.tuples(st.floats(-7.0, -0.1), st.floats(0.1, 7.0)))
+    return Joint(
+        name,
+        draw(st.sampled_from(['revolute', 'prismatic'])),
+        *(draw(numbers) for _ in range(5)),
+        sign=draw(st.sampled_from([1, -1])),
+        lower=limits and limits[0],
+        upper=limits and limits[1],
+    )
+
+
+@st.composite
+def frames(draw):
+    quat = np.array(draw(st.tuples(*[st.floats(-1.0, 1.0)] * 4)))
+    if np.linalg.norm(quat) < 1e-3:
+        quat = np.array([0.0, 0.0, 1.0, 0.0])
+    rotation = se3.from_quat(quat / np.linalg.norm(quat))
+    position = np.array(draw(st.tuples(numbers, numbers, numbers)))
+    return Frame(se3.transform(rotation, position), draw(st.booleans()))
+
+
+@st.composite
+def chains(draw):
+    row = [draw(joints(name)) for name in draw(st.lists(names, min_size=1, max_size=8, unique=1))]
+    parallel = st.none() | st.lists(st.sampled_from([j.name for j in row]), unique=True)
+    chosen = draw(parallel)
+    return Chain(
+        draw(names),
+        draw(st.sampled_from(['standard', 'modified'])),
+        tuple(row),
+        None if chosen is None else tuple(chosen),
+        draw(st.none() | frames()),
+        draw(st.none() | frames()),
+    )
+
+
+@given(chains(), st.integers(0, 1000))
+def test_a_dumped_chain_is_read_as_it_was(chain, seed):
+    again = parse_chain(dump_chain(chain, {'created': 'today', 'pairs': 3}))
+    assert_same(again, chain)
+    q = np.random.default_rng(seed).uniform(-3.0, 3.0, (4, len(chain.joints)))
+    np.testing.assert_allclose(again.forward(q), chain.forward(q), rtol=1e-12, atol=1e-11)
+
+
+def test_a_dumped_chain_says_where_it_comes_from():
+    text = dump_chain(parse_chain(UR), {'software': 'calib_ros', 'pairs': 3})
+    assert yaml.safe_load(text)['calibration'] == {'software': 'calib_ros', 'pairs': 3}
+    assert 'calibration' not in yaml.safe_load(dump_chain(parse_chain(UR)))
+
+
+@pytest.mark.parametrize('text', [UR, CRAIG, PARALLEL_FIRST, POSITIONER, GANTRY])
+def test_a_chain_file_means_what_is_written(text, rng):
+    document, chain = yaml.safe_load(text), parse_chain(text, 'here/cell.yaml')
+    assert chain.name == document.get('name', 'cell')
+    assert chain.joint_names == tuple(row['name'] for row in document['joints'])
+    if 'parallel' in document:
+        assert chain.parallel == tuple(document['parallel'])
+    bare = parse_chain(yaml.safe_dump({k: document[k] for k in ('convention', 'joints')}))
+    for q in rng.uniform(-3.0, 3.0, (5, len(chain.joints))):
+        expected = reference_forward(document, q)
+        np.testing.assert_allclose(bare.forward(q[None])[0], expected, atol=1e-12)
+    framed = chain.frame('base').matrix @ expected @ chain.frame('tool').matrix
+    np.testing.assert_allclose(chain.forward(q[None])[0], framed, atol=1e-12)
+
+
+def test_defaults_and_numbers_without_a_dot():
+    chain = parse_chain(GANTRY)
+    rail, turn = chain.joints
+    assert rail == Joint('rail', 'prismatic', 1e-3, 0.0, 0.5, 0.1, lower=-2.0, upper=3.0)
+    assert turn == Joint('turn', 'revolute', 0.2, 1.57, -0.1, 0.0, 0.01)
+    np.testing.assert_allclose(chain.base.matrix[:3, 3], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(
+        chain.base.matrix[:3, :3], [[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]], atol=1e-12
+    )
+    assert chain.base.fixed
+    assert not chain.tool.fixed
+
+
+def test_frames_are_unknown_unless_given():
+    assert parse_chain(UR).base is None
+    assert parse_chain(UR).tool is None
+    assert {'base', 'tool'}.isdisjoint(chain_document(parse_chain(UR)))
+
+
+BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\n'
+WRONG = [
+    ('theta: 0.0', 'theat: 0.0', 'joint 1 "theat": did you mean "theta"'),
+    ('convention:', 'konvention:', '"konvention": did you mean "convention"'),
+    ('quat_xyzw:', 'quat:', 'base "quat": did you mean "quat_xyzw"'),
+    ('convention: standard', 'convention: standart', '"standart": did you mean "standard"'),
+    ('type: revolute', 'type: revolut', '"joint_1" "revolut": did you mean "revolute"'),
+    ('a: 0.0', 'a: .nan', 'joint 1: a must be a finite number, not nan'),
+    ('a: 0.0', 'a: .inf', 'joint 1: a must be a finite number, not inf'),
+    ('d: 0.1273', 'd: twelve', "joint 1: d must be a finite number, not 'twelve'"),
+    ('d: 0.1273', 'd: "nan"', "joint 1: d must be a finite number, not 'nan'"),
+    ('d: 0.1273', 'd: [1]', 'joint 1: d must be a finite number'),
+    ('d: 0.1273', 'd: yes', 'joint 1: d must be a finite number, not True'),
+    ('d: 0.1273, ', '', 'joint 1: key "d" is missing'),
+    ('name: joint_1, ', '', 'joint 1: key "name" is missing'),
+    ('convention: standard', '', 'key "convention" is missing'),
+    ('joints:', 'calibration:', 'key "joints" is missing'),
+    ('sign: 1', 'sign: 2', 'joint 1: sign must be 1 or -1, not 2'),
+    ('sign: 1', 'lower: 2, upper: 1', 'limits of joint "joint_1"'),
+    ('name: joint_2', 'name: joint_1', 'two joints named "joint_1"'),
+    ('name: joint_2', 'name: base', 'must not be named "base"'),
+    ('name: joint_2', 'name: a.b', 'name without dots, not "a.b"'),
+    ('[joint_2, joint_3]', '[joint_2, joint3]', '"joint3": did you mean "joint_3"'),
+    ('[joint_2, joint_3]', 'joint_2', '"parallel" must be a list of joint names'),
+    ('xyz: [0, 0, 0]', 'xyz: [0, 0]', 'base.xyz must be a list of 3 numbers'),
+    ('xyz: [0, 0, 0]', 'xyz: [0, 0, .nan]', 'base.xyz must be a finite number, not nan'),
+    ('[0, 0, 0, 1]', '[0, 0, 0, 1.01]', r'base.quat_xyzw must have length 1 .* not 1.01'),
+    ('[0, 0, 0, 1]', '[0, 0, 0, 0]', 'base.quat_xyzw must have length 1'),
+    ('xyz: [0, 0, 0]', 'fixed: 1', 'base.fixed must be true or false, not 1'),
+    ('name: some_ur', 'name: [', 'not valid YAML'),
+]
+
+
+@pytest.mark.parametrize(('right', 'wrong', 'complaint'), WRONG)
+def test_a_wrong_chain_file_is_refused_with_the_place(right, wrong, complaint):
+    assert right in BASE
+    parse_chain(BASE)
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        parse_chain(BASE.replace(right, wrong, 1), 'cell.yaml')
+    assert 'cell.yaml' in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('right', 'wrong'),
+    [
+        ('convention: standard', 'convention: [standard]'),
+        ('convention: standard', 'convention: 1'),
+        ('convention: standard', 'convention:'),
+        ('type: revolute', 'type: ~'),
+        ('type: revolute', 'type: 1'),
+        ('d: 0.1273', f'd: 1{"0" * 400}'),
+        ('d: 0.1273', 'd: 2020-13-45'),
+    ],
+)
+def test_values_of_a_wrong_kind_are_refused_as_well(right, wrong):
+    with pytest.raises(ConfigError, match=r'cell\.yaml'):
+        parse_chain(BASE.replace(right, wrong, 1), 'cell.yaml')
+
+
+@pytest.mark.parametrize('text', ['', '3', '[]', 'joints', 'convention: standard\njoints: []\n'])
+def test_a_file_that_holds_no_chain_is_refused(text):
+    with pytest.raises(ConfigError, match=r'cell\.yaml'):
+        parse_chain(text, 'cell.yaml')
+
+
+def test_an_unknown_name_keeps_its_alternatives():
+    with pytest.raises(UnknownNameError) as caught:
+        parse_chain(UR.replace('joint_3]', 'joint_9]'))
+    assert caught.value.name == 'joint_9'
+    assert caught.value.alternatives == tuple(f'joint_{k}' for k in range(1, 7))
+
+
+def test_a_quaternion_that_was_rounded_is_taken_and_normalised():
+    chain = parse_chain(BASE.replace('[0, 0, 0, 1]', '[0.7071, 0, 0, 0.7071]'))
+    np.testing.assert_allclose(
+        chain.base.matrix[:3, :3] @ chain.base.matrix[:3, :3].T, np.eye(3), atol=1e-14
+    )
+
+
+def without_parallel(text):
+    return '\n'.join(line for line in text.splitlines() if not line.startswith('parallel'))
+
+
+@pytest.mark.parametrize(
+    ('text', 'parallel'),
+    [(UR, ('joint_2', 'joint_3')), (CRAIG, ()), (PARALLEL_FIRST, ()), (POSITIONER, ())],
+)
+def test_parallel_axes_are_found_from_the_table(text, parallel):
+    assert parse_chain(without_parallel(text)).parallel == parallel
+
+
+def test_an_empty_list_of_parallel_joints_is_kept():
+    chain = parse_chain(UR.replace('[joint_2, joint_3]', '[]'))
+    assert chain.parallel == ()
+    assert 'joint_2.d' in chain.parameter_names
+    assert 'joint_2.beta' not in chain.parameter_names
+    assert_same(parse_chain(dump_chain(chain)), chain)
+
+
+def row_of(alphas, convention, types='rrrrrr'):
+    kinds = {'r': 'revolute', 'p': 'prismatic'}
+    rows = [
+        Joint(f'j{k + 1}', kinds[types[k]], a=0.3, alpha=alpha) for k, alpha in enumerate(alphas)
+    ]
+    return Chain('arm', convention, tuple(rows))
+
+
+@pytest.mark.parametrize(
+    ('alphas', 'convention', 'parallel'),
+    [
+        # A row leads from its axis to the next (standard) or from the one before (modified).
+        ((HALF, 0.0, 0.0, HALF, -HALF, 0.0), 'standard', ('j2', 'j3')),
+        ((0.0, HALF, 0.0, 0.0, HALF, -HALF), 'modified', ('j3', 'j4')),
+        ((0.0, 0.0), 'standard', ('j1',)),
+        ((0.0, 0.0), 'modified', ('j2',)),
+        ((HALF, np.pi, HALF), 'standard', ('j2',)),
+        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', ('j2',)),
+        ((HALF, np.radians(-4.9), np.radians(-5.1), HALF), 'standard', ('j2',)),
+    ],
+)
+def test_parallel_by_convention_and_tilt(alphas, convention, parallel):
+    assert row_of(alphas, convention).parallel == parallel
+
+
+@pytest.mark.parametrize(
+    ('types', 'convention', 'parallel'),
+    [
+        ('rrr', 'standard', ('j1', 'j2')),
+        ('rpr', 'standard', ('j1', 'j2')),
+        ('prr', 'standard', ('j1', 'j2')),
+        ('rpp', 'standard', ('j1',)),
+        ('rpr', 'modified', ('j2', 'j3')),
+        ('rrp', 'modified', ('j2', 'j3')),
+        ('rpp', 'modified', ('j2',)),
+    ],
+)
+def test_rows_that_join_parallel_axes_are_found_unless_both_are_prismatic(
+    types, convention, parallel
+):
+    assert row_of((0.0, 0.0, 0.0), convention, types).parallel == parallel
+
+
+def test_a_nominal_beta_tilts_the_axis():
+    rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.2, 0.0]))
+    assert Chain('arm', 'standard', rows).parallel == ('j0',)
+
+
+@pytest.mark.parametrize('robot', sorted(GOLDEN))
+def test_a_shipped_robot_stands_where_another_source_says(robot):
+    golden, chain = GOLDEN[robot], load_chain(robot)
+    assert chain.name == robot
+
+    def matrix(frame):
+        return se3.transform(se3.from_quat(np.array(frame['quat_xyzw'])), np.array(frame['xyz']))
+
+    poses = chain.forward(np.array([pose['q'] for pose in golden['poses']]))
+    poses = matrix(golden['base']) @ poses @ matrix(golden['tool'])
+    expected = np.array([matrix(pose) for pose in golden['poses']])
+    distance = np.linalg.norm(poses[:, :3, 3] - expected[:, :3, 3], axis=1)
+    turn = np.linalg.norm(poses[:, :3, :3] - expected[:, :3, :3], axis=(1, 2))
+    assert distance.max() <= golden['tolerance']
+    assert turn.max() <= 1e-8
+
+
+def test_every_shipped_robot_is_read():
+    robots = shipped_robots()
+    assert robots.keys() >= GOLDEN.keys()
+    for name in robots:
+        chain = load_chain(name)
+        assert chain.name == name
+        assert all(joint.lower < joint.upper for joint in chain.joints)
+        assert_same(parse_chain(dump_chain(chain)), chain)
+
+
+@pytest.mark.parametrize('robot', ['ur5e', 'ur10', 'ur10e'])
+def test_the_parallel_axes_of_a_ur(robot):
+    assert load_chain(robot).parallel == ('shoulder_lift_joint', 'elbow_joint')
+
+
+def test_an_unknown_robot_lists_those_there_are():
+    with pytest.raises(UnknownNameError, match='"ur10x": did you mean "ur10') as caught:
+        load_chain('ur10x')
+    assert set(caught.value.alternatives) == set(shipped_robots())
+    assert all(robot in str(caught.value) for robot in GOLDEN)
+
+
+def test_a_chain_file_is_read_by_its_path(tmp_path):
+    for name in ('cell.yaml', 'ur10e'):  # a file goes before a robot of the same name
+        path = tmp_path / name
+        path.write_text(UR)
+        assert load_chain(path).name == 'some_ur'
+        assert load_chain(str(path)).name == 'some_ur'
+
+
+@pytest.mark.parametrize('content', [None, b'\xff\xfe\x00'])
+def test_a_file_that_cannot_be_read_is_named(tmp_path, content):
+    path = tmp_path / 'cell.yaml'
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r'cell\.yaml'):
+        load_chain(path)
+
+
+def test_a_folder_does_not_hide_the_robot_of_the_same_name(tmp_path, monkeypatch):
+    (tmp_path / 'ur10e').mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_chain('ur10e').name == 'ur10e'
+
+
+def test_a_path_to_nothing_is_not_taken_for_a_robot(tmp_path):
+    with pytest.raises(ConfigError, match='ur10e'):
+        load_chain(tmp_path / 'ur10e')
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('sigma_position', 0.0),
+        ('sigma_position', -1e-4),
+        ('sigma_position', np.nan),
+        ('sigma_orientation', np.inf),
+        ('max_gap', -0.1),
+        ('max_gap', np.inf),
+        ('joint_buffer', 1),
+        ('pose_buffer', 0),
+        ('folds', 1),
+    ],
+)
+def test_a_setting_out_of_range_is_refused(name, value):
+    with pytest.raises(ConfigError, match=f'{name} must be .*, not {value}'):
+        Settings(**{name: value})
+
+
+def test_settings_at_the_edge_are_taken():
+    settings = Settings(max_gap=0.0, joint_buffer=2, pose_buffer=1, folds=2, sigma_position=1e-9)
+    assert (settings.joint_buffer, settings.pose_buffer, settings.folds) == (2, 1, 2)
+
+
+def test_a_key_that_comes_twice_is_refused():
+    with pytest.raises(ConfigError, match='key "alpha" comes twice'):
+        parse_chain(BASE.replace('alpha:', 'alpha: 0.0, alpha:', 1))
+
+
+def calibrated_text(nominal, record):
+    """Return the text of a calibration of a nominal chain, with a record of its origin."""
+    return dump_chain(nominal.with_offsets({f'{nominal.joint_names[1]}.a': 1e-3}), record)
+
+
+def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
+    nominal = load_chain('ur10e')
+    record = {'accepted': True, 'nominal': nominal_record(nominal)}
+    (tmp_path / 'calibration.yaml').write_text(calibrated_text(nominal, record))
+    for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
+        found, read = load_calibration(path, nominal)
+        assert read == record
+        assert found.joints[1].a == pytest.approx(nominal.joints[1].a + 1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('nominal', 'record', 'message'),
+    [
+        ('ur10e', None, 'is a chain, but no calibration'),
+        ('ur10e', {}, 'is a chain, but no calibration'),
+        ('ur10e', {'accepted': False}, 'was not accepted'),
+        ('puma560', {'samples': 3}, 'is it the right nominal chain'),
+        ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),
+        ('ur10', {'nominal': nominal_record(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
+        ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
+        ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
+    ],
+)
+def test_what_is_no_calibration_of_a_nominal_chain_is_refused(nominal, record, message):
+    text = calibrated_text(load_chain('ur10e'), record)
+    with pytest.raises(ConfigError, match=message):
+        parse_calibration(text, 'calibration.yaml', load_chain(nominal))
+
+
+def test_a_record_in_another_convention_is_taken_as_it_is():
+    """Its numbers cannot be compared with those of the nominal chain."""
+    nominal = load_chain('ur10e')
+    record = {'nominal': nominal_record(load_chain('franka_fr3'))}
+    assert record['nominal']['convention'] == 'modified'
+    chain, found = parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    assert found == record
+    assert chain.joint_names == nominal.joint_names
+
+
+def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
+    nominal = load_chain('ur5e')
+    far = calibrated_text(nominal.with_offsets({'elbow_joint.theta': 0.2}), {'samples': 3})
+    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+        parse_calibration(far, 'c.yaml', nominal)
+    parse_calibration(far, 'c.yaml', nominal, Settings(largest_angle=0.3))
+    near = calibrated_text(nominal, {'samples': 3})
+    with pytest.raises(ConfigError, match='conventions'):
+        parse_calibration(near, 'c.yaml', replace(nominal, convention='modified'))
+
+
+def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identified():
+    nominal = load_chain('ur5e')
+    record = {'accepted': True, 'nominal': nominal_record(nominal)}
+    true = nominal.with_offsets({'elbow_joint.theta': 0.2})
+    far = dump_chain(true, record)
+    assert parse_calibration(far, 'c.yaml', nominal)[0].value('elbow_joint.theta') == (
+        pytest.approx(true.value('elbow_joint.theta'))
+    )
+    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+        parse_calibration(far, 'c.yaml', nominal, Settings())
+    elbow = nominal.joint_names.index('elbow_joint')
+    joints = list(nominal.joints)
+    joints[elbow] = replace(joints[elbow], sign=-1)
+    with pytest.raises(ConfigError, match='the sign of elbow_joint'):
+        parse_calibration(far, 'c.yaml', replace(nominal, joints=tuple(joints)))
+
+
+@pytest.mark.parametrize(
+    ('key', 'value'),
+    [
+        ('rms_mm_after', float('nan')),
+        ('rms_mm_after', 'small'),
+        ('rms_mm_after', -0.1),
+        ('world_frame', 5),
+        ('world_frame', None),
+    ],
+)
+def test_a_record_by_which_nothing_can_be_judged_is_refused(key, value):
+    nominal = load_chain('ur10e')
+    record = {'nominal': nominal_record(nominal), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
+    parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    with pytest.raises(ConfigError, match=f'c.yaml: calibration.{key} must be'):
+        parse_calibration(calibrated_text(nominal, record | {key: value}), 'c.yaml', nominal)

@@ -1,0 +1,342 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.apply.simulation import Cell, faulty, random_frame
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.kinematics.jacobian import ErrorModel
+
+NOISE = (5e-5, 2e-4)
+UR10E = load_chain('ur10e')
+GEARED = replace(
+    UR10E,
+    joints=tuple(
+        replace(joint, gear_ratio=17.0) if joint.name == 'shoulder_lift_joint' else joint
+        for joint in UR10E.joints
+    ),
+)
+
+
+def loaded(chain, rng):
+    """Return the chain with links of about 5 kg, their centres off the axes."""
+    return replace(
+        chain,
+        joints=tuple(
+            replace(
+                joint,
+                gear_ratio=17.0,
+                mass=rng.uniform(3.0, 7.0),
+                com=tuple(rng.normal(scale=0.1, size=3).tolist()),
+            )
+            for joint in chain.joints
+        ),
+    )
+
+
+def gantry(rng):
+    """Return an arm of two prismatic and four revolute joints."""
+    kinds = ['prismatic', 'prismatic', *['revolute'] * 4]
+    joints = tuple(
+        Joint(f'joint_{k}', kind, a=0.2, alpha=rng.uniform(0.5, 2.0), d=0.2, theta=rng.normal())
+        for k, kind in enumerate(kinds)
+    )
+    return Chain('gantry', 'modified', joints)
+
+
+def chains():
+    rng = np.random.default_rng(0)
+    for chain in (load_chain('ur10e'), load_chain('franka_fr3'), gantry(rng)):
+        yield chain.name, loaded(chain, rng)
+        joints = tuple(replace(joint, sign=-joint.sign) for joint in chain.joints)
+        yield f'{chain.name}, turned round', loaded(replace(chain, joints=joints), rng)
+
+
+@pytest.mark.parametrize('chain', [pytest.param(chain, id=name) for name, chain in chains()])
+def test_every_column_is_the_central_difference(chain, rng):
+    names = [name for group in effects.GROUPS for name in effects.members(chain, group)]
+    last = chain.joints[-1].name
+    names += [f'{last}.sin_7', f'{last}.cos_7']
+    values = dict(zip(names, rng.normal(scale=1e-3, size=len(names)), strict=True))
+    chain = replace(chain, base=random_frame(rng, 1.0), tool=random_frame(rng, 0.3))
+    chain = chain.with_effect_values(values)
+    q = chain.random_joints(5, rng)
+    approach = rng.choice([-1.0, 0.0, 1.0], q.shape)
+    jacobian = ErrorModel(chain, names).jacobian(q, approach)
+    for k, name in enumerate(names):
+        # phi of compliance are N m, up to some 100; values change by 1e-5 rad, as all others do
+        step = 1e-6 if name.endswith('compliance') else 1e-5
+        ahead = chain.with_offsets({name: step}).forward(q, approach)
+        behind = chain.with_offsets({name: -step}).forward(q, approach)
+        turn = se3.log_rotation(ahead[:, :3, :3] @ np.swapaxes(behind[:, :3, :3], 1, 2))
+        shift = ahead[:, :3, 3] - behind[:, :3, 3]
+        difference = np.concatenate([shift, turn], axis=1) / (2.0 * step)
+        size = max(1.0, np.abs(difference).max())
+        np.testing.assert_allclose(jacobian[:, :, k] / size, difference / size, atol=1e-7)
+
+
+@pytest.mark.parametrize('sign', [1, -1])
+@pytest.mark.parametrize('robot', ['ur10e', 'franka_fr3'])
+def test_torques_are_the_work_of_gravity(robot, sign, rng):
+    """Hold torques against the change of potential energy with the joint value reported."""
+    chain = load_chain(robot)
+    chain = loaded(
+        replace(chain, joints=tuple(replace(joint, sign=sign) for joint in chain.joints)), rng
+    )
+    chain = replace(chain, base=random_frame(rng, 1.0), gravity=(1.0, 2.0, -9.0))
+    q = chain.random_joints(7, rng)
+    down = chain.base.matrix[:3, :3] @ chain.gravity
+    count = len(chain.joints)
+
+    def ends(q):
+        """Return the poses (n, N, 4, 4) of the ends of all links."""
+        base = chain.base
+        return np.stack(
+            [
+                Chain('part', chain.convention, chain.joints[: k + 1], base=base).forward(
+                    q[:, : k + 1]
+                )
+                for k in range(count)
+            ]
+        )
+
+    def work(q):
+        """Return the work (N,) of gravity on the masses, and (n, N) on unit weights."""
+        poses = ends(q)
+        masses = 0.0
+        for joint, pose in zip(chain.joints, poses, strict=True):
+            masses = masses + joint.mass * (pose[:, :3, :3] @ joint.com + pose[:, :3, 3]) @ down
+        return masses, poses[:, :, :3, 3] @ down / np.linalg.norm(down)
+
+    for i, joint in enumerate(chain.joints):
+        move = np.zeros(count)
+        move[i] = 1e-5
+        ahead, behind = work(q + move), work(q - move)
+        names = [f'{joint.name}.compliance']
+        names += [f'{joint.name}.gravity_{other}' for other in chain.joint_names[i:]]
+        phi = effects.basis(chain, names, q.T, None)
+        np.testing.assert_allclose(phi[0], (ahead[0] - behind[0]) / 2e-5, atol=1e-5)
+        np.testing.assert_allclose(phi[1:], (ahead[1] - behind[1])[i:] / 2e-5, atol=1e-8)
+
+
+def truth(group, rng):
+    """Return the nominal chain, and the values of a group's effects in a realistic size."""
+    nominal = {'compliance': loaded(UR10E, rng), 'gear': GEARED}.get(group, UR10E)
+    names = effects.members(nominal, group)
+    size = {
+        'ratio': 1e-4,
+        'coupling': 2e-4,
+        'eccentricity': 2e-4,
+        'gravity': 1e-4,
+        'compliance': 5e-6,
+        'backlash': 2e-4,
+        'gear': 3e-4,
+    }[group]
+    signs = np.ones(len(names)) if group == 'compliance' else rng.choice([-1.0, 1.0], len(names))
+    return nominal, dict(zip(names, size * signs * rng.uniform(0.5, 1.5, len(names)), strict=True))
+
+
+def by_hand(true, values, q, approach):
+    """Return poses (N, 4, 4) with effects that are written out here, torques excepted."""
+    moved = q.copy()
+    names = list(true.joint_names)
+    for name, value in values.items():
+        joint, _, kind = name.partition('.')
+        first, _, rest = kind.partition('_')
+        i = names.index(joint)
+        moved[:, i] += (
+            value
+            * {
+                'ratio': lambda i=i: q[:, i],
+                'coupling': lambda rest=rest: q[:, names.index(rest)],
+                'sin': lambda i=i, rest=rest: np.sin(int(rest) * q[:, i]),
+                'cos': lambda i=i, rest=rest: np.cos(int(rest) * q[:, i]),
+                'backlash': lambda i=i: approach[:, i],
+                'gravity': lambda name=name: effects.basis(true, [name], q.T, None)[0],
+                'compliance': lambda name=name: effects.basis(true, [name], q.T, None)[0],
+            }[first]()
+        )
+    return true.forward(moved)
+
+
+def observed(poses, q, approach, rng):
+    positions = poses[:, :3, 3] + rng.normal(scale=NOISE[0], size=(len(q), 3))
+    turns = se3.exp_rotation(rng.normal(scale=NOISE[1], size=(len(q), 3)))
+    seen = Observations.from_arrays(q, positions, turns @ poses[:, :3, :3])
+    return replace(seen, approach=approach)
+
+
+@pytest.mark.parametrize('group', effects.GROUPS)
+def test_a_group_is_recovered_on_poses_that_were_not_fitted(group):
+    rng = np.random.default_rng(1)
+    nominal, values = truth(group, rng)
+    true = faulty(nominal, Cell(), rng)
+    q = nominal.random_joints(120, rng)
+    unseen = nominal.random_joints(500, rng)
+    came, comes = (rng.choice([-1.0, 1.0], each.shape) for each in (q, unseen))
+    noise = rng.integers(2**32)
+
+    def rms(fitted, values, named):
+        """Return the RMS error [m] on unseen poses of a fit to an arm with given effects."""
+        poses = by_hand(true, values, q, came)
+        seen = observed(poses, q, came, np.random.default_rng(noise))
+        problem = Problem(
+            fitted, seen, effects=named, sigma_position=NOISE[0], sigma_orientation=NOISE[1]
+        )
+        result = identify(problem)
+        assert result.converged
+        error = result.chain.forward(unseen, comes) - by_hand(true, values, unseen, comes)
+        return float(np.sqrt((error[:, :3, 3] ** 2).sum(axis=1).mean()))
+
+    floor = rms(nominal, {}, ())
+    geometric = rms(nominal, values, ())
+    with_group = rms(nominal, values, (group,))
+    assert with_group < 0.5 * geometric
+    assert with_group < 2.0 * floor
+
+
+@pytest.mark.parametrize('group', ['ratio', 'backlash', 'compliance'])
+def test_standard_deviations_of_effects_are_honest(group):
+    scores = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        nominal, values = truth(group, rng)
+        true = faulty(nominal, Cell(), rng)
+        q = nominal.random_joints(80, rng)
+        came = rng.choice([-1.0, 1.0], q.shape)
+        seen = observed(by_hand(true, values, q, came), q, came, rng)
+        result = identify(
+            Problem(
+                nominal,
+                seen,
+                effects=(group,),
+                held_out=seen.select(np.arange(2)),
+                sigma_position=NOISE[0],
+                sigma_orientation=NOISE[1],
+            )
+        )
+        found = {p.name: p for p in result.parameters}
+        # gravity turns no joint about a vertical axis: of its compliance only the prior is known
+        scores += [
+            (found[name].value - value) / found[name].std
+            for name, value in values.items()
+            if name != 'shoulder_pan_joint.compliance'
+        ]
+    # 60 scores or more: the spread of a standard deviation is 1 / sqrt(2 * 60) = 0.09; where the
+    # poses tell little, the prior makes errors smaller than the deviations
+    assert 0.5 < np.std(scores) < 1.25
+
+
+@pytest.mark.parametrize('ratio', [17.0, 50.5, 101.25])
+def test_gear_ratios_need_not_be_whole(ratio, rng):
+    joints = list(UR10E.joints)
+    joints[1] = replace(joints[1], gear_ratio=ratio)
+    nominal = replace(UR10E, joints=tuple(joints))
+    true = faulty(nominal, Cell(), rng)
+
+    def poses(q):
+        moved = q.copy()
+        moved[:, 1] += 3e-4 * np.sin(ratio * q[:, 1]) - 2e-4 * np.cos(2.0 * ratio * q[:, 1])
+        return true.forward(moved)
+
+    q, unseen = nominal.random_joints(100, rng), nominal.random_joints(300, rng)
+    result = identify(Problem(nominal, observed(poses(q), q, None, rng), effects=('gear',)))
+    error = (result.chain.forward(unseen) - poses(unseen))[:, :3, 3]
+    assert len(result.chain.effects) == 4
+    assert np.sqrt((error**2).sum(axis=1).mean()) < 6e-5  # 0.3 mrad are 0.3 mm at 1 m
+
+
+def test_without_signs_of_the_approach_backlash_is_refused(rng):
+    q = UR10E.random_joints(60, rng)
+    seen = observed(UR10E.forward(q), q, None, rng)
+    with pytest.raises(ConfigError, match='signs of the last moves'):
+        Problem(UR10E, seen, effects=('backlash',))
+
+
+@pytest.mark.parametrize(
+    ('name', 'alternative'),
+    [
+        ('ratios', 'ratio'),
+        ('excentricity', 'eccentricity'),
+        ('elbow_joint.ratios', 'ratio'),
+        ('elbow_jont.ratio', 'elbow_joint'),
+        ('elbow_joint.coupling_wrist', 'wrist_1_joint'),
+        ('elbow_joint.gravity_hand', 'wrist_3_joint'),
+        ('elbow_joint.sin_x', '1'),
+        ('elbow_joint.sin_nan', '1'),
+        ('elbow_joint.cos_inf', '1'),
+    ],
+)
+def test_unknown_effects_are_named_with_the_alternatives(name, alternative, rng):
+    q = UR10E.random_joints(20, rng)
+    seen = observed(UR10E.forward(q), q, None, rng)
+    with pytest.raises(UnknownNameError) as caught:
+        Problem(UR10E, seen, effects=(name,))
+    assert caught.value.name not in caught.value.alternatives
+    assert alternative in str(caught.value).partition('valid are')[2]
+
+
+def rich(rng):
+    """Return a chain with everything that a chain file can hold."""
+    chain = faulty(loaded(UR10E, rng), Cell(), rng)
+    chain = replace(chain, gravity=(0.5, -9.5, 1.0))
+    chain = chain.with_frame('base_B', random_frame(rng, 1.0))
+    chain = chain.with_frame('tool_2', replace(random_frame(rng, 0.2), fixed=True))
+    names = [name for group in effects.GROUPS for name in effects.members(chain, group)]
+    return chain.with_effect_values(
+        dict(zip(names, rng.normal(scale=1e-4, size=len(names)), strict=True))
+    )
+
+
+def test_a_chain_file_keeps_effects_frames_masses_and_gravity(rng):
+    chain = rich(rng)
+    again = parse_chain(dump_chain(chain))
+    assert dict(again.effects) == dict(chain.effects)
+    assert again.frame('tool_2').fixed
+    assert not again.frame('base_B').fixed
+    q = chain.random_joints(50, rng)
+    approach = rng.choice([-1.0, 1.0], q.shape)
+    for base in ('base', 'base_B'):
+        for tool in ('tool', 'tool_2'):
+            np.testing.assert_allclose(
+                again.forward(q, approach, base, tool),
+                chain.forward(q, approach, base, tool),
+                rtol=0,
+                atol=1e-12,
+            )
+
+
+def test_a_chain_file_keeps_gravity_and_masses_where_no_effect_is_known_yet(rng):
+    """A nominal chain whose base hangs from a wall, written and read again before a fit."""
+    chain = replace(rich(rng), effects=())
+    again = parse_chain(dump_chain(chain))
+    values = dict.fromkeys(effects.members(chain, 'compliance'), 5e-6)
+    q = chain.random_joints(20, rng)
+    np.testing.assert_allclose(
+        again.with_effect_values(values).forward(q),
+        chain.with_effect_values(values).forward(q),
+        rtol=0,
+        atol=1e-12,
+    )
+
+
+def test_effects_shift_joint_values_and_nothing_else(rng):
+    chain = faulty(UR10E, Cell(), rng)
+    _, values = truth('eccentricity', rng)
+    q = chain.random_joints(30, rng)
+    approach = np.zeros_like(q)
+    np.testing.assert_allclose(
+        chain.with_effect_values(values).forward(q),
+        by_hand(chain, values, q, approach),
+        rtol=0,
+        atol=1e-14,
+    )
+    zero = chain.with_effects(tuple(values))
+    np.testing.assert_array_equal(zero.forward(q), chain.forward(q))

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.apply import simulation
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain_file import load_chain, shipped_robots
+from calib_ros.kinematics.inverse import TOLERANCE, solve
+from calib_ros.kinematics.se3 import log_rotation
+
+
+def limits(chain):
+    return np.array(
+        [
+            (
+                -np.inf if joint.lower is None else joint.lower,
+                np.inf if joint.upper is None else joint.upper,
+            )
+            for joint in chain.joints
+        ]
+    ).T
+
+
+@pytest.mark.parametrize('robot', sorted(shipped_robots()))
+def test_poses_are_reached_from_nearby(robot, rng):
+    """Arms with faults, frames anywhere, standard and modified DH, prismatic, 4 to 7 joints."""
+    chain = simulation.faulty(load_chain(robot), simulation.Cell(), rng)
+    lower, upper = limits(chain)
+    q = chain.random_joints(300, rng)
+    start = np.clip(q + rng.normal(scale=0.05, size=q.shape), lower, upper)
+    wanted = chain.forward(q)
+    found = solve(chain, wanted, start)
+    assert found.converged.mean() > 0.97
+    poses = chain.forward(found.joints)
+    distance = np.linalg.norm(poses[:, :3, 3] - wanted[:, :3, 3], axis=1)
+    turn = log_rotation(poses[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2))
+    np.testing.assert_allclose(distance, found.position, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(turn, axis=1), found.orientation, atol=1e-7)
+    assert distance[found.converged].max() <= TOLERANCE
+    assert ((lower <= found.joints) & (found.joints <= upper)).all()
+    if len(chain.joints) < 7:
+        near = np.abs(found.joints - q).max(axis=1)[found.converged]
+        assert np.mean(near < 1e-4) > 0.9
+
+
+def test_redundant_arms_move_as_little_as_needed(rng):
+    """The step to a pose close by is orthogonal to the motion that leaves the pose alone."""
+    chain = load_chain('kuka_iiwa14')
+    q = chain.random_joints(200, rng) * 0.7
+    wanted = chain.forward(q + rng.normal(scale=1e-4, size=q.shape))
+    found = solve(chain, wanted, q)
+    step = found.joints - q
+    assert found.converged.all()
+    h = 1e-6
+    jacobian = np.empty((len(q), 6, 7))
+    for i in range(7):
+        there, back = (chain.forward(q + sign * h * np.eye(7)[i]) for sign in (1.0, -1.0))
+        jacobian[:, :3, i] = (there - back)[:, :3, 3] / (2.0 * h)
+        turn = there[:, :3, :3] @ np.swapaxes(back[:, :3, :3], 1, 2)
+        jacobian[:, 3:, i] = log_rotation(turn) / (2.0 * h)
+    free = np.linalg.svd(jacobian)[2][:, -1]
+    along = np.abs(np.einsum('ni,ni->n', step, free))
+    assert np.median(along / np.linalg.norm(step, axis=1)) < 1e-2
+
+
+def test_non_geometric_effects_are_taken_into_account(rng):
+    chain = load_chain('ur10e').with_effect_values(
+        {'elbow_joint.sin_1': 1e-3, 'shoulder_lift_joint.gravity_elbow_joint': 2e-3}
+    )
+    q = chain.random_joints(100, rng)
+    wanted = chain.forward(q)
+    found = solve(chain, wanted, q + 0.03)
+    assert found.converged.mean() > 0.97
+    np.testing.assert_allclose(
+        chain.forward(found.joints)[found.converged], wanted[found.converged], atol=5e-9
+    )
+
+
+def test_what_is_out_of_reach_is_said_to_be(rng):
+    chain = load_chain('ur5e')
+    q = chain.random_joints(50, rng)
+    wanted = chain.forward(q)
+    wanted[:, :3, 3] += (
+        5.0 * wanted[:, :3, 3] / np.linalg.norm(wanted[:, :3, 3], axis=1, keepdims=True)
+    )
+    found = solve(chain, wanted, q)
+    assert not found.converged.any()
+    assert found.position.min() > 3.0
+    assert np.isfinite(found.joints).all()
+
+
+def test_limits_hold_and_full_turns_are_taken_back():
+    chain = Chain(
+        'stand',
+        'standard',
+        (
+            Joint('turn', a=0.5, lower=-2.0, upper=2.0),
+            Joint('lift', type='prismatic', lower=0.0, upper=0.3),
+        ),
+    )
+    wanted = chain.forward(np.array([[1.9, 0.2], [1.0, 0.1]]))
+    beyond = replace(chain, joints=(replace(chain.joints[0], upper=3.0), chain.joints[1]))
+    unreachable = beyond.forward(np.array([[2.5, 0.2]]))
+    found = solve(chain, np.concatenate([wanted, unreachable]), np.full((3, 2), 0.15))
+    np.testing.assert_array_equal(found.converged, [True, True, False])
+    np.testing.assert_allclose(found.joints[:2], [[1.9, 0.2], [1.0, 0.1]], atol=1e-8)
+    assert found.joints[2, 0] == pytest.approx(2.0)
+    whole = replace(chain, joints=(replace(chain.joints[0], lower=-3.14, upper=3.14),))
+    round_ = solve(whole, whole.forward(np.array([[-3.0]])), np.array([[3.1]]))
+    assert round_.joints[0, 0] == pytest.approx(-3.0)  # 3.28 is beyond the limit
+    turned = solve(chain, wanted, np.array([[1.8 + 2.0 * np.pi, 0.1], [0.9 - 2.0 * np.pi, 0.2]]))
+    np.testing.assert_allclose(turned.joints, [[1.9, 0.2], [1.0, 0.1]], atol=1e-8)
+
+
+def test_each_pose_is_solved_as_if_alone(rng):
+    chain = load_chain('puma560')
+    q = chain.random_joints(20, rng)
+    wanted, start = chain.forward(q), chain.random_joints(20, rng)
+    together = solve(chain, wanted, start)
+    for k in range(20):
+        alone = solve(chain, wanted[k : k + 1], start[k : k + 1])
+        assert alone.converged[0] == together.converged[k]
+        if alone.converged[0]:
+            np.testing.assert_allclose(alone.joints[0], together.joints[k], atol=1e-6)

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib_ros.errors import UnknownNameError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain, Frame, Joint
+from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+
+NEAR_SINGULAR = (0.0, np.pi / 2, np.pi, 1e-9, np.pi / 2 + 1e-9)
+
+
+@st.composite
+def chains(draw):
+    """Draw a chain of any convention; many angles and lengths are (nearly) degenerate."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    joints = []
+    for k in range(draw(st.integers(1, 8))):
+        degenerate = draw(st.booleans())
+        angles = rng.choice(NEAR_SINGULAR, 3) if degenerate else rng.uniform(-np.pi, np.pi, 3)
+        lengths = rng.choice([0.0, 0.3, 1e-9], 2) if degenerate else rng.normal(size=2)
+        joints.append(
+            Joint(
+                f'joint_{k}',
+                draw(st.sampled_from(['revolute', 'prismatic'])),
+                a=lengths[0],
+                alpha=angles[0],
+                d=lengths[1],
+                theta=angles[1],
+                beta=angles[2],
+                sign=draw(st.sampled_from([1, -1])),
+            )
+        )
+    frames = [
+        Frame(se3.transform(se3.exp_rotation(rng.normal(size=3)), rng.normal(size=3)))
+        for _ in range(2)
+    ]
+    convention = draw(st.sampled_from(['standard', 'modified']))
+    chain = Chain('random', convention, tuple(joints), base=frames[0], tool=frames[1])
+    straight = draw(st.booleans())
+    q = np.zeros((3, len(joints))) if straight else rng.normal(size=(3, len(joints)))
+    return chain, q
+
+
+def all_parameters(chain):
+    names = [f'{frame}.{kind}' for frame in ('base', 'tool') for kind in FRAME_KINDS]
+    return names + [f'{joint.name}.{kind}' for joint in chain.joints for kind in DH_KINDS]
+
+
+@given(chains())
+def test_every_column_is_the_central_difference(drawn):
+    chain, q = drawn
+    names = all_parameters(chain)
+    jacobian = ErrorModel(chain, names).jacobian(q)
+    step = 1e-6
+    for k, name in enumerate(names):
+        ahead = chain.with_offsets({name: step}).forward(q)
+        behind = chain.with_offsets({name: -step}).forward(q)
+        turn = ahead[:, :3, :3] @ np.swapaxes(behind[:, :3, :3], 1, 2)
+        shift = ahead[:, :3, 3] - behind[:, :3, 3]
+        difference = np.concatenate([shift, se3.log_rotation(turn)], axis=1) / (2 * step)
+        np.testing.assert_allclose(jacobian[:, :, k], difference, rtol=0, atol=1e-7)
+
+
+@given(chains())
+def test_columns_of_the_standard_convention_are_the_papers(drawn):
+    """Hold the columns against eq. (4) of the paper and the row for beta of docs/model.md."""
+    drawn_chain, q = drawn
+    joints = tuple(j for j in drawn_chain.joints if j.type == 'revolute')[:1]
+    if not joints:
+        return
+    chain = Chain('one', 'standard', joints)
+    q = q[:, :1]
+    joint = joints[0]
+    theta = joint.theta + joint.sign * q[:, 0]
+    cos, sin = np.cos(theta), np.sin(theta)
+    cos_a, sin_a = np.cos(joint.alpha), np.sin(joint.alpha)
+    a, d, zero, one = joint.a, joint.d, np.zeros_like(cos), np.ones_like(cos)
+    twists = {
+        'theta': [zero, zero, zero, zero, zero, one],
+        'd': [zero, zero, one, zero, zero, zero],
+        'a': [cos, sin, zero, zero, zero, zero],
+        'alpha': [-d * sin, d * cos, zero, cos, sin, zero],
+        'beta': [
+            a * sin_a * sin - d * cos_a * cos,
+            -d * cos_a * sin - a * sin_a * cos,
+            a * cos_a * one,
+            -cos_a * sin,
+            cos_a * cos,
+            sin_a * one,
+        ],
+    }
+    names = [f'{joint.name}.{kind}' for kind in twists]
+    jacobian = ErrorModel(chain, names).jacobian(q)
+    position = chain.forward(q)[:, :3, 3]
+    for k, columns in enumerate(twists.values()):
+        twist = np.stack(columns, axis=1)
+        shift = twist[:, :3] + np.cross(twist[:, 3:], position)  # dA = Delta A, at its origin
+        np.testing.assert_allclose(jacobian[:, :3, k], shift, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(jacobian[:, 3:, k], twist[:, 3:], rtol=0, atol=1e-12)
+
+
+def test_an_unknown_parameter_is_named():
+    chain = Chain('one', 'standard', (Joint('joint_1', a=1.0),))
+    with pytest.raises(UnknownNameError, match=r'did you mean "joint_1.alpha"'):
+        ErrorModel(chain, ['joint_1.alpa'])
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1e-12, 1e-6, 0.1, 3.0, np.pi - 1e-7, np.pi]))
+def test_orientation_error_turns_the_model_onto_the_measurement(seed, angle):
+    rng = np.random.default_rng(seed)
+    model = se3.exp_rotation(rng.normal(size=(5, 3)))
+    axis = rng.normal(size=(5, 3))
+    vector = angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    measured = se3.exp_rotation(vector) @ model
+    columns = np.ascontiguousarray(measured.transpose(2, 1, 0))
+    found = orientation_error(columns, list(np.ascontiguousarray(model.transpose(2, 1, 0)))).T
+    np.testing.assert_allclose(se3.exp_rotation(found) @ model, measured, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), angle, rtol=1e-6, atol=1e-15)
+
+
+@given(chains(), st.integers(0, 2**32 - 1))
+def test_the_column_of_a_delay_is_the_central_difference(drawn, seed):
+    """A later device saw the target where the joints had been before."""
+    chain, q = drawn
+    velocity = np.random.default_rng(seed).normal(size=q.shape)
+    names = ['base.x', 'base.delay', f'{chain.joint_names[0]}.theta']
+    model = ErrorModel(chain, names)
+    column = model.jacobian(q, velocity=velocity)[:, :, 1]
+    step = 1e-6
+    ahead, behind = (chain.forward(q - sign * step * velocity) for sign in (1.0, -1.0))
+    turn = ahead[:, :3, :3] @ np.swapaxes(behind[:, :3, :3], 1, 2)
+    shift = ahead[:, :3, 3] - behind[:, :3, 3]
+    difference = np.concatenate([shift, se3.log_rotation(turn)], axis=1) / (2 * step)
+    np.testing.assert_allclose(column, difference, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(model.jacobian(q)[:, :, 1], 0.0)
+
+
+def test_the_delay_is_that_of_its_own_device():
+    chain = Chain('one', 'standard', (Joint('joint_1', a=1.0),))
+    chain = chain.with_frame('base_B', Frame(delay=0.1))
+    names = ['base.delay', 'base_B.delay']
+    q, velocity = np.zeros((2, 1)), np.ones((2, 1))
+    first = ErrorModel(chain, names).jacobian(q, velocity=velocity)
+    second = ErrorModel(chain, names, 'base_B').jacobian(q, velocity=velocity)
+    np.testing.assert_array_equal(first[:, :, 1], 0.0)
+    np.testing.assert_array_equal(second[:, :, 0], 0.0)
+    np.testing.assert_allclose(first[:, 1, 0], -1.0)
+    np.testing.assert_allclose(second[:, 1, 1], -1.0)

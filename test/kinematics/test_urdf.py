@@ -1,0 +1,630 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from urdfs import (
+    CONVENTIONS,
+    EXACT,
+    IIWA,
+    PANDA,
+    PI,
+    SCARA,
+    SEEDS,
+    UR10E,
+    UR10E_ORIGINS,
+    UR_JOINTS,
+    ZERO,
+    Z,
+    ends,
+    numbers,
+    place,
+    poses_of,
+    random_arm,
+    random_offsets,
+    reference_forward,
+    some_joints,
+    ur10e,
+    written,
+)
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.cli.main import main
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain
+from calib_ros.kinematics.chain_file import load_chain, parse_chain
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+
+
+@pytest.mark.parametrize('convention', CONVENTIONS)
+@settings(max_examples=200)
+@given(seed=SEEDS)
+def test_any_serial_arm_moves_as_its_urdf(convention, seed):
+    rng = np.random.default_rng(seed)
+    text = random_arm(rng)
+    chain = chain_from_urdf(text, convention=convention)
+    q = some_joints(chain, rng)
+    np.testing.assert_allclose(chain.forward(q), poses_of(text, chain, q), rtol=0.0, atol=EXACT)
+    assert chain.convention == convention
+    elements = [
+        joint
+        for joint in ET.fromstring(text)
+        if joint.tag == 'joint' and joint.get('type') != 'fixed'
+    ]
+    assert chain.joint_names == tuple(joint.get('name') for joint in elements)
+    for joint, element in zip(chain.joints, elements, strict=True):
+        kind = element.get('type')
+        assert joint.type == ('prismatic' if kind == 'prismatic' else 'revolute')
+        limit = (None, None) if kind == 'continuous' else (-3.0, 2.5)
+        assert (joint.lower, joint.upper) == limit
+
+
+@pytest.mark.parametrize('convention', CONVENTIONS)
+@pytest.mark.parametrize('text', [UR10E, PANDA, IIWA, SCARA], ids=['ur', 'panda', 'iiwa', 'scara'])
+def test_known_robots(text, convention, rng):
+    tip = 'panda_hand' if text is PANDA else None
+    chain = chain_from_urdf(text, tip_link=tip, convention=convention)
+    q = some_joints(chain, rng, 20)
+    poses = poses_of(text, chain, q, tip=tip)
+    np.testing.assert_allclose(chain.forward(q), poses, rtol=0.0, atol=EXACT)
+    revolute = sum(joint.type == 'revolute' for joint in chain.joints)
+    free = replace(chain, base=None, tool=None)
+    complete = 4 * revolute + 2 * (len(chain.joints) - revolute) + 6
+    assert len(structurally_independent(free, free.parameter_names)) == complete
+
+
+def test_ur10e_has_the_table_of_its_maker():
+    chain, shipped = chain_from_urdf(UR10E), load_chain('ur10e')
+    # the URDF has pi / 2 to nine digits, and lengths of 2e-11 that make up for them
+    np.testing.assert_allclose(chain.table, shipped.table, rtol=0.0, atol=1e-9)
+    assert chain.parallel == shipped.parallel
+    assert [(j.name, j.lower, j.upper) for j in chain.joints] == [
+        (j.name, pytest.approx(j.lower), pytest.approx(j.upper)) for j in shipped.joints
+    ]
+    np.testing.assert_allclose(chain.base.matrix, np.diag([-1, -1, 1, 1]), atol=1e-15)
+    np.testing.assert_allclose(chain.tool.matrix, np.eye(4), atol=1e-9)
+    assert chain.gravity == Chain.gravity
+
+
+def test_panda_has_the_table_of_its_maker():
+    chain = chain_from_urdf(PANDA, tip_link='panda_link8', convention='modified')
+    assert chain.joints == load_chain('franka_panda').joints
+    np.testing.assert_array_equal(chain.base.matrix, np.eye(4))
+    np.testing.assert_allclose(chain.tool.matrix, np.eye(4), atol=1e-15)
+
+
+def test_iiwa_has_the_dimensions_of_the_shipped_table():
+    chain, shipped = chain_from_urdf(IIWA), load_chain('kuka_iiwa14')
+    np.testing.assert_allclose(chain.table[:, 2], shipped.table[:, 2], atol=EXACT)
+    np.testing.assert_allclose(np.abs(chain.table[:, 1]), np.abs(shipped.table[:, 1]), atol=EXACT)
+    offsets = np.array([0.00043624, 0, 0.00043624, 0, 0, 0, 0])  # of the URDF; the arm has none
+    np.testing.assert_allclose(np.abs(chain.table[:, 0]), offsets, atol=EXACT)
+
+
+@pytest.mark.parametrize('convention', CONVENTIONS)
+@pytest.mark.parametrize('tilt', [1e-12, 1e-9, 1e-6, 1e-4, 1e-3, 1e-2])
+def test_a_calibrated_ur_has_no_absurd_lengths(convention, tilt, rng):
+    origins = [
+        (xyz + rng.normal(scale=min(tilt, 1e-3), size=3), rpy + rng.normal(scale=tilt, size=3))
+        for xyz, rpy in UR10E_ORIGINS
+    ]
+    text = ur10e(origins)
+    chain = chain_from_urdf(text, convention=convention)
+    q = some_joints(chain, rng, 20)
+    np.testing.assert_allclose(chain.forward(q), poses_of(text, chain, q), rtol=0.0, atol=EXACT)
+    assert chain.parallel == chain_from_urdf(UR10E, convention=convention).parallel
+    assert len(chain.parallel) == 2
+    nominal = chain_from_urdf(UR10E, convention=convention)
+    change = np.abs(chain.table - nominal.table)
+    assert change[:, [0, 2]].max() < 5.0 * max(tilt, 1e-9)
+    assert change[:, [1, 3, 4]].max() < 20.0 * max(tilt, 1e-9)
+
+
+@given(angle=st.floats(0.0, 0.2), heading=st.floats(-PI, PI), half=st.booleans(), seed=SEEDS)
+def test_lengths_stay_small_at_every_angle_between_axes(angle, heading, half, seed):
+    rng = np.random.default_rng(seed)
+    way = [np.sin(angle) * np.cos(heading), np.sin(angle) * np.sin(heading), np.cos(angle)]
+    text = written(
+        'two',
+        ('j1', 'revolute', 'l0', 'l1', rng.uniform(-1, 1, 3), ZERO, Z),
+        ('j2', 'revolute', 'l1', 'l2', rng.uniform(-1, 1, 3), (PI * half, 0, 0), way),
+    )
+    chain = chain_from_urdf(text)
+    assert bool(chain.parallel) == (angle < PARALLEL_TOLERANCE)
+    largest = 4.0 if angle < PARALLEL_TOLERANCE else 4.0 / np.sin(angle)
+    assert np.abs(chain.table[:, [0, 2]]).max() < largest
+
+
+@pytest.mark.parametrize('convention', CONVENTIONS)
+def test_masses_pull_at_the_joints_as_in_the_urdf(convention, rng):
+    """The torque of gravity is the slope of the potential energy of all links."""
+    text = re.sub(
+        '<joint name="j2" type="fixed"', '<joint name="j2" type="prismatic"', SIDE_BRANCH
+    )
+    chain = chain_from_urdf(text, 'l0', 'l6', convention)
+    chain = chain.with_effects([f'{name}.compliance' for name in chain.joint_names])
+    links = [
+        link
+        for link in ET.fromstring(SIDE_BRANCH).findall('link')
+        if link.find('inertial') is not None
+    ]
+    assert len(links) == 5
+    still = {'j2': 0.0}
+
+    def energy(q):
+        values = still | dict(zip(chain.joint_names, q, strict=True))
+        total = 0.0
+        for link in links:
+            inertial = link.find('inertial')
+            centre = inertial.find('origin').get('xyz').split()
+            pose = reference_forward(SIDE_BRANCH, values, 'l0', link.get('name'))
+            height = (pose @ [*map(float, centre), 1.0])[2]
+            total += float(inertial.find('mass').get('value')) * 9.81 * height
+        return total
+
+    q = rng.uniform(-2.0, 2.0, len(chain.joints))
+    names = [name for name, _ in chain.effects]
+    found = effects.basis(chain, names, q[:, np.newaxis], None)[:, 0]
+    for k in range(len(q)):
+        step = 1e-5 * np.eye(len(q))[k]
+        slope = (energy(q + step) - energy(q - step)) / 2e-5
+        assert found[k] == pytest.approx(-slope, abs=1e-7)
+    total = sum(float(link.find('inertial/mass').get('value')) for link in links)
+    assert sum(joint.mass for joint in chain.joints) == pytest.approx(total)
+
+
+def loaded(name, mass, xyz):
+    return (
+        f'<link name="{name}"><inertial><mass value="{mass}"/><origin xyz="{numbers(xyz)}" '
+        'rpy="1 2 3"/></inertial></link>'
+    )
+
+
+def with_masses(text, masses):
+    for name, (mass, xyz) in masses.items():
+        text = text.replace(f'<link name="{name}"/>', loaded(name, mass, xyz))
+    return text
+
+
+# an arm that hangs askew, with a fixed and a moving side branch
+SIDE_BRANCH = with_masses(
+    written(
+        'branched',
+        ('j0', 'fixed', 'l0', 'l1', (0.1, 0.2, 0.3), (2.0, 0.3, 0.4), ZERO),
+        ('j1', 'revolute', 'l1', 'l2', (0, 0, 0.3), (0.1, 0.2, 0.3), (0, -1, 0)),
+        ('j2', 'prismatic', 'l2', 'side', (0.3, 0.1, 0), (1, 0, 0), (1, 0, 0)),
+        ('j3', 'fixed', 'l2', 'l3', (0, 0.4, 0.1), (0.5, 0, 0), ZERO),
+        ('j4', 'continuous', 'l3', 'l4', (0.2, 0, 0), (0, 0.7, 0), (1, 2, 3)),
+        ('j5', 'floating', 'l4', 'loose', (0.1, 0.1, 0.1), (0, 0, 1), ZERO),
+        ('j6', 'revolute', 'l4', 'l6', (0.3, 0.1, 0.2), (1.57, 0, 0), (0, 0, -1)),
+    ),
+    {
+        'l2': (5.0, (0.1, 0.0, 0.2)),
+        'side': (1.5, (0.0, 0.1, 0.0)),
+        'l4': (3.0, (0.0, 0.2, 0.1)),
+        'loose': (0.25, (0.1, 0.0, 0.0)),
+        'l6': (1.0, (0.03, 0.02, 0.01)),
+    },
+)
+
+
+def test_gravity_turns_with_the_first_frame():
+    chain = chain_from_urdf(SIDE_BRANCH, 'l0', 'l6')
+    assert not np.allclose(chain.gravity, [0.0, 0.0, -9.81], atol=1.0)
+    down = chain.base.matrix[:3, :3] @ chain.gravity
+    np.testing.assert_allclose(down, [0.0, 0.0, -9.81], atol=EXACT)
+
+
+# ---- links, and what is refused
+
+
+def test_links_by_default():
+    assert chain_from_urdf(UR10E).joints == chain_from_urdf(UR10E, 'base_link', 'tool0').joints
+    bare = UR10E.replace('tool0', 'wrist_camera')
+    np.testing.assert_array_equal(
+        chain_from_urdf(bare).tool.matrix, chain_from_urdf(bare, tip_link='flange').tool.matrix
+    )
+    assert chain_from_urdf(SCARA).joint_names == ('lift', 'shoulder', 'elbow', 'wrist')
+    part = chain_from_urdf(UR10E, 'upper_arm_link', 'wrist_1_link')
+    assert part.joint_names == ('elbow_joint', 'wrist_1_joint')
+
+
+def edited(text, old, new):
+    assert old in text
+    return text.replace(old, new)
+
+
+ELBOW = '<joint name="elbow_joint" type="revolute">'
+REFUSED = {
+    'no XML': ('name: ur10e', {}, 'not valid XML'),
+    'cut off': (UR10E[:-40], {}, 'not valid XML'),
+    'no robot': ('<sdf/>', {}, 'root element <robot>, not <sdf>'),
+    'empty': ('<robot/>', {}, 'tree with one root; roots here: none'),
+    'xacro': (
+        edited(
+            UR10E, '</robot>', '<xacro:x xmlns:xacro="http://www.ros.org/wiki/xacro"/></robot>'
+        ),
+        {},
+        'run "xacro FILE > robot.urdf" first',
+    ),
+    'formula': (
+        edited(UR10E, '-0.6127', '${a}'),
+        {},
+        '"elbow_joint" is a formula',
+    ),
+    'two numbers': (
+        edited(UR10E, '-0.6127 0.0', '0'),
+        {},
+        '3 finite numbers, not "0 0.0"',
+    ),
+    'no number': (edited(UR10E, '-0.6127', 'nan'), {}, 'xyz in the origin of joint "elbow_joint"'),
+    'no axis': (
+        edited(SCARA, '<axis xyz="0.0 0.0 -1.0"/>', '<axis xyz="0 0 0"/>'),
+        {},
+        'axis of joint "elbow" has no direction',
+    ),
+    'unknown type': (
+        edited(UR10E, ELBOW, ELBOW.replace('revolute', 'hinge')),
+        {},
+        'type of joint "elbow_joint" "hinge"',
+    ),
+    'floating': (
+        edited(UR10E, ELBOW, ELBOW.replace('revolute', 'floating')),
+        {},
+        'joint "elbow_joint" is floating',
+    ),
+    'planar': (
+        edited(UR10E, ELBOW, ELBOW.replace('revolute', 'planar')),
+        {},
+        'joint "elbow_joint" is planar',
+    ),
+    'mimic': (
+        edited(UR10E, ELBOW, f'{ELBOW}<mimic joint="wrist_1_joint"/>'),
+        {},
+        'joint "elbow_joint" mimics another',
+    ),
+    'finger': (PANDA, {'tip_link': 'panda_rightfinger'}, '"panda_finger_joint2" mimics another'),
+    'limits': (
+        edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'),
+        {},
+        'limits of joint "elbow',
+    ),
+    'unknown child': (
+        edited(UR10E, '<link name="tool0"/>', ''),
+        {},
+        'link at joint "flange',
+    ),
+    'two joints': (edited(SCARA, '"lift"', '"wrist"'), {}, 'two joints are named "wrist"'),
+    'two links': (
+        edited(SCARA, '<link name="hand"/>', '<link name="hand"/>' * 2),
+        {},
+        'two links',
+    ),
+    'two parents': (
+        edited(SCARA, '<child link="hand"/>', '<child link="lower"/>'),
+        {},
+        'two joints lead to link "lower"',
+    ),
+    'two roots': (edited(SCARA, '</robot>', '<link name="x"/></robot>'), {}, 'here: base, x'),
+    'loop': (
+        edited(SCARA, '<parent link="column"/>', '<parent link="hand"/>'),
+        {},
+        'a loop among joints shoulder, elbow, wrist',
+    ),
+    'many ends': (PANDA, {}, 'ends in panda_leftfinger, panda_rightfinger: name the tip_link'),
+    'no end': (UR10E, {'base_link': 'flange'}, 'moves nothing behind "flange"'),
+    'still': (UR10E, {'base_link': 'flange', 'tip_link': 'tool0'}, 'no joint moves between'),
+    'itself': (UR10E, {'base_link': 'tool0', 'tip_link': 'tool0'}, 'no joint moves between'),
+    'aside': (UR10E, {'base_link': 'elbow_link'}, 'unknown link "elbow_link"'),
+    'behind': (
+        PANDA,
+        {'base_link': 'panda_link3', 'tip_link': 'panda_link1'},
+        'no joints lead from link "panda_link3" out to link "panda_link1"',
+    ),
+    'convention': (UR10E, {'convention': 'craig'}, 'unknown convention "craig"'),
+}
+
+
+@pytest.mark.parametrize('what', REFUSED)
+def test_what_is_no_serial_chain_is_refused(what):
+    text, arguments, words = REFUSED[what]
+    with pytest.raises(ConfigError) as caught:
+        chain_from_urdf(text, **arguments)
+    assert words in str(caught.value)
+
+
+def test_a_wrong_link_names_the_right_ones():
+    with pytest.raises(UnknownNameError) as caught:
+        chain_from_urdf(UR10E, tip_link='tool')
+    assert 'did you mean "tool0"?' in str(caught.value)
+    assert 'wrist_3_link' in caught.value.alternatives
+
+
+# ---- back into the URDF
+
+
+def stripped(text):
+    """Return a URDF without the numbers in the origins of its joints."""
+    return re.sub(r'(xyz|rpy)="[^"]*"', '', re.sub(r'\s*<origin[^>]*>', '', text))
+
+
+@pytest.mark.parametrize('convention', CONVENTIONS)
+@settings(max_examples=100)
+@given(seed=SEEDS)
+def test_a_corrected_urdf_moves_as_the_corrected_arm(convention, seed):
+    rng = np.random.default_rng(seed)
+    text = random_arm(rng)
+    nominal = chain_from_urdf(text, convention=convention)
+    assert corrected_urdf(text, nominal) == text
+    chain = nominal.with_offsets(random_offsets(nominal, rng))
+    corrected = corrected_urdf(text, chain)
+    q = some_joints(nominal, rng)
+    expected = chain.forward(q)
+    assert np.abs(expected - nominal.forward(q)).max() > 1e-5
+    np.testing.assert_allclose(poses_of(corrected, nominal, q), expected, rtol=0.0, atol=EXACT)
+    assert stripped(corrected) == stripped(text)
+
+
+@pytest.mark.parametrize('library', ['yourdfpy', 'kinpy'])
+@pytest.mark.parametrize('text', [UR10E, PANDA, IIWA, SCARA], ids=['ur', 'panda', 'iiwa', 'scara'])
+def test_public_libraries_read_it_back(text, library, rng):
+    tip = 'panda_hand' if text is PANDA else None
+    nominal = chain_from_urdf(text, tip_link=tip)
+    chain = nominal.with_offsets(random_offsets(nominal, rng))
+    corrected = corrected_urdf(text, chain, tip_link=tip)
+    q = chain.random_joints(10, rng)
+    base, end = ends(text)
+    forward = {'yourdfpy': by_yourdfpy, 'kinpy': by_kinpy}[library]
+    found = forward(corrected, chain.joint_names, q, base, tip or end)
+    np.testing.assert_allclose(found, chain.forward(q), rtol=0.0, atol=EXACT)
+
+
+def by_yourdfpy(text, names, q, base, tip):
+    import io
+
+    import yourdfpy
+
+    robot = yourdfpy.URDF.load(io.StringIO(text), load_meshes=False)
+    poses = []
+    for row in q:
+        robot.update_cfg(dict(zip(names, row, strict=True)))
+        poses.append(robot.get_transform(tip, base))
+    return np.array(poses)
+
+
+def by_kinpy(text, names, q, base, tip):
+    import kinpy
+
+    serial = kinpy.build_serial_chain_from_urdf(text, tip, base)
+    assert tuple(serial.get_joint_parameter_names()) == names
+    return np.array([serial.forward_kinematics(row).matrix() for row in q])
+
+
+HAND_WRITTEN = """<?xml version='1.0' encoding='utf-8'?>\r
+<!-- <joint name="j1"><origin xyz="9 9 9"/></joint> -->
+<robot name='hand' xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <link name="a"><visual><origin xyz="1 1 1"/></visual></link><link name="b"/>
+\t<link name="c"/><link name="d"/>
+  <joint type="continuous"
+         name="j1">
+    <!-- Größe: <origin xyz="8 8 8"/> -->
+    <parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+  </joint>
+  <joint name="j2" type='revolute'><origin
+      rpy='0 0 0'   xyz =
+      '0.10 0 0.20' ></origin>
+    <limit lower="-1" upper="1"/> <parent link="b"/>  <child link="c"/><axis xyz='0 0 1'/></joint>
+  <joint name="tip" type="fixed"><parent link="c"/><child link="d"/><origin rpy="0 1.5 0"/></joint>
+  <transmission name="t"><joint name="j1"><origin xyz="7 7 7"/></joint></transmission>
+  <gazebo><origin xyz="6 6 6"/></gazebo>
+</robot>\r
+"""
+
+
+def test_everything_else_stays_byte_for_byte(rng):
+    nominal = chain_from_urdf(HAND_WRITTEN)
+    j2_only = corrected_urdf(HAND_WRITTEN, nominal.with_offsets({'j2.theta': 0.125}))
+    assert j2_only == HAND_WRITTEN.replace("rpy='0 0 0'", "rpy='0.0 0.0 0.125'")
+    shorter = corrected_urdf(HAND_WRITTEN, nominal.with_offsets({'j1.a': 0.005}))
+    assert shorter == HAND_WRITTEN.replace("'0.10 0 0.20'", "'0.105 0.0 0.2'")
+    turned = corrected_urdf(HAND_WRITTEN, nominal.with_offsets({'j1.theta': 0.125}))
+    new = '         name="j1">\n    <origin rpy="0.0 0.0 0.125"/>\n    <!-- Größe'
+    assert turned == HAND_WRITTEN.replace('         name="j1">\n    <!-- Größe', new)
+    bent = corrected_urdf(HAND_WRITTEN, nominal.with_offsets({'j2.alpha': 0.01, 'j2.a': 0.002}))
+    assert bent.partition('<joint name="tip"')[0] == HAND_WRITTEN.partition('<joint name="tip"')[0]
+    assert '<origin xyz="0.002 0.0 0.0" rpy="' in bent
+
+
+def test_the_nominal_ends_are_kept(rng):
+    """What a calibration cannot tell, joint 1 in the base and the tip in the last link, stays."""
+    nominal = chain_from_urdf(UR10E)
+    problem = Problem(replace(nominal, base=None, tool=None), measured(nominal, rng))
+    chain = identify(problem).chain
+    corrected = corrected_urdf(UR10E, chain)
+    assert chain.table[0, 2] == nominal.table[0, 2]
+    for joint in ('base_joint', 'shoulder_pan_joint', 'wrist_3-flange', 'flange-tool0'):
+        assert origin_of(corrected, joint) == origin_of(UR10E, joint)
+    for joint in UR_JOINTS[1:]:
+        assert origin_of(corrected, joint) != origin_of(UR10E, joint)
+
+
+def origin_of(text, joint):
+    return ET.fromstring(text).find(f'joint[@name="{joint}"]/origin').attrib
+
+
+def measured(nominal, rng, count=60, noise=0.0):
+    truth = faulty(nominal, Cell(), rng)
+    return measure(truth, truth.random_joints(count, rng), rng, noise, 4.0 * noise)
+
+
+def flipped(chain, i):
+    """Return the same arm with z of frame i - 1 turned over, and the sign of joint i with it."""
+    joints = list(chain.joints)
+    before, joint = joints[i - 1], joints[i]
+    joints[i - 1] = replace(before, alpha=before.alpha + PI)
+    joints[i] = replace(
+        joint, theta=-joint.theta, d=-joint.d, alpha=joint.alpha - PI, sign=-joint.sign
+    )
+    return replace(chain, joints=tuple(joints), parallel=None)
+
+
+@pytest.mark.parametrize('turned', [None, 1, 2, 3, 4])
+def test_the_chain_may_come_from_an_equal_table(turned, rng):
+    shipped = load_chain('ur10e')
+    chain = shipped if turned is None else flipped(shipped, turned)
+    q = some_joints(chain, rng, 10)
+    np.testing.assert_allclose(chain.forward(q), shipped.forward(q), atol=1e-13)
+    chain = chain.with_offsets(random_offsets(chain, rng))
+    nominal = chain_from_urdf(UR10E)
+    expected = nominal.base.matrix @ chain.forward(q) @ nominal.tool.matrix
+    found = poses_of(corrected_urdf(UR10E, chain), chain, q)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=EXACT)
+
+
+def test_a_chain_of_another_arm_is_refused():
+    nominal = chain_from_urdf(UR10E)
+    with pytest.raises(ConfigError, match='not the arm of this URDF'):
+        corrected_urdf(UR10E, nominal.with_offsets({'elbow_joint.a': 0.5}))
+    with pytest.raises(ConfigError, match='not the arm of this URDF'):
+        corrected_urdf(UR10E, nominal.with_offsets({'wrist_3_joint.theta': 1.0}))
+    with pytest.raises(ConfigError, match=r'has the joints panda_joint1 \(revolute\), .* but the'):
+        corrected_urdf(UR10E, load_chain('franka_panda'))
+
+
+def test_effects_do_not_fit_into_a_urdf():
+    chain = chain_from_urdf(UR10E)
+    still = chain.with_effects(['elbow_joint.ratio'])
+    assert corrected_urdf(UR10E, still) == UR10E
+    with pytest.raises(ConfigError, match=r'cannot hold the effects elbow_joint\.ratio'):
+        corrected_urdf(UR10E, still.with_effect_values({'elbow_joint.ratio': 1e-3}))
+
+
+@pytest.mark.parametrize('kind', ['a', 'alpha', 'beta'])
+def test_the_last_row_needs_a_fixed_joint_behind(kind, rng):
+    chain = chain_from_urdf(UR10E, tip_link='wrist_3_link')
+    chain = chain.with_offsets({f'wrist_3_joint.{kind}': 1e-3})
+    with pytest.raises(ConfigError, match='no fixed joint behind'):
+        corrected_urdf(UR10E, chain, tip_link='wrist_3_link')
+    q = some_joints(chain, rng)
+    nominal = chain_from_urdf(UR10E)
+    chain = nominal.with_offsets({f'wrist_3_joint.{kind}': 1e-3})
+    found = poses_of(corrected_urdf(UR10E, chain), chain, q)
+    np.testing.assert_allclose(found, chain.forward(q), rtol=0.0, atol=EXACT)
+
+
+@pytest.mark.parametrize(
+    'head',
+    [
+        '<!DOCTYPE robot [<!ENTITY o "<origin xyz=\'1 0 0\'/>">]>',
+        '<?xml version="1.0"?>\n<!doctype robot>',
+        '<!DOCTYPE robot [' + '<!ELEMENT a (' * 100_000 + ']>',
+    ],
+)
+def test_a_doctype_is_refused_before_the_parser_sees_it(head):
+    with pytest.raises(ConfigError, match='DOCTYPE'):
+        chain_from_urdf(head + SCARA)
+
+
+# ---- from the URDF, by measurements, to the corrected URDF
+
+
+@pytest.mark.parametrize(('convention', 'text'), [('standard', UR10E), ('modified', IIWA)])
+@pytest.mark.parametrize(('noise', 'largest'), [(0.0, 1e-9), (5e-5, 4e-5)])
+def test_from_urdf_to_corrected_urdf(convention, text, noise, largest, tmp_path, rng):
+    """An arm with errors, seen by a tracker anywhere; judged on unseen poses.
+
+    `largest` is the RMS position error [m]; 30 and 34 parameters from 60 poses with 6 numbers each
+    leave some sqrt(30 / 360) of the noise, 0.025 mm.
+    """
+    nominal = chain_from_urdf(text, convention=convention)
+    truth = faulty(nominal, Cell(), rng)
+    joints = truth.random_joints(60, rng)
+    observations = measure(truth, joints, rng, noise, 4.0 * noise)
+    path = tmp_path / 'robot.urdf'
+    path.write_text(text)
+    out = tmp_path / 'robot.yaml'
+    assert main(['chain', str(path), '--convention', convention, '--out', str(out)]) == 0
+    result = identify(Problem(load_chain(out), observations))
+    assert result.accepted
+    corrected = corrected_urdf(text, result.chain)
+    unseen = truth.random_joints(200, rng)
+    error = aligned_error(poses_of(corrected, truth, unseen), truth.forward(unseen))
+    before = aligned_error(poses_of(text, truth, unseen), truth.forward(unseen))
+    assert error < largest
+    assert before > 1e-3
+
+
+def aligned_error(found, expected):
+    """Return the RMS distance [m] after the best rigid base and tool, fitted to half the poses."""
+
+    def aligned(poses, x):
+        base = place(x[:3], Rotation.from_rotvec(x[3:6]))
+        tool = place(x[6:9], Rotation.from_rotvec(x[9:]))
+        return start @ base @ poses @ tool @ end
+
+    # of the poses relative to their first one both rotations follow (Park and Martin 1994)
+    turns = [np.swapaxes(p[:1, :3, :3], 1, 2) @ p[1:, :3, :3] for p in (found, expected)]
+    vectors = [Rotation.from_matrix(each).as_rotvec() for each in turns]
+    end = place(np.zeros(3), Rotation.align_vectors(vectors[0], vectors[1])[0])
+    start = expected[0] @ np.linalg.inv(found[0] @ end)
+    half = len(found) // 2
+
+    def residuals(x):
+        return (aligned(found[:half], x) - expected[:half])[:, :3].ravel()
+
+    x = least_squares(residuals, np.zeros(12), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    difference = (aligned(found[half:], x) - expected[half:])[:, :3, 3]
+    return float(np.sqrt((difference**2).sum(axis=1).mean()))
+
+
+# ---- as a chain
+
+
+def test_a_urdf_is_a_chain_file_whose_frames_are_unknown(tmp_path):
+    path = tmp_path / 'arm.urdf'
+    path.write_text(UR10E)
+    chain, whole = load_chain(path), chain_from_urdf(UR10E)
+    assert chain.joints == whole.joints
+    assert chain.base is None
+    assert chain.tool is None
+    assert (chain.name, chain.gravity) == (whole.name, whole.gravity)
+    path.with_suffix('.xacro').write_text(REFUSED['xacro'][0])
+    with pytest.raises(ConfigError, match='run "xacro FILE'):
+        load_chain(path.with_suffix('.xacro'))
+    with pytest.raises(ConfigError, match='cannot read chain file'):
+        load_chain(tmp_path / 'none.urdf')
+
+
+def test_chain_command(tmp_path, capsys):
+    path = tmp_path / 'panda.urdf'
+    path.write_text(PANDA)
+    links = ['--base-link', 'panda_link0', '--tip-link', 'panda_hand']
+    assert main(['chain', str(path), *links, '--convention', 'modified']) == 0
+    printed = capsys.readouterr().out
+    whole = chain_from_urdf(PANDA, 'panda_link0', 'panda_hand', 'modified')
+    chain = parse_chain(printed)
+    assert chain.joints == whole.joints
+    assert (chain.base, chain.tool) == (None, None)
+    known = parse_chain(re.sub('^# (base|tool):', r'\1:', printed, flags=re.MULTILINE))
+    assert known.base.fixed
+    np.testing.assert_allclose(known.base.matrix, whole.base.matrix, atol=1e-15)
+    np.testing.assert_allclose(known.tool.matrix, whole.tool.matrix, atol=1e-15)
+    out = tmp_path / 'panda.yaml'
+    assert main(['chain', 'ur10e', '--out', str(out)]) == 0
+    assert load_chain(out).joints == load_chain('ur10e').joints
+    assert main(['chain', 'ur10e', '--out', str(out)]) == 1
+    assert 'exists already' in capsys.readouterr().err
+    assert main(['chain', 'ur10e', '--tip-link', 'tool0']) == 1
+    assert '--tip-link is of use with a URDF only' in capsys.readouterr().err
+    assert main(['chain', str(path)]) == 1
+    assert 'ends in panda_leftfinger, panda_rightfinger' in capsys.readouterr().err

@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An arm with errors, and tables of what was measured of it."""
+
+import csv
+
+import numpy as np
+
+from calib_ros.apply import simulation
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import to_quat
+
+UR = load_chain('ur5e')
+CELL = simulation.Cell()
+TRUE = simulation.faulty(UR, CELL, np.random.default_rng(11))
+TRAIN, TEST = 30, 10
+FIGURES = {'rms_mm', 'mean_mm', 'max_mm', 'rms_mrad'}
+
+
+def measured(chain=TRUE, count=TRAIN + TEST, seed=5, oriented=True):
+    rng = np.random.default_rng(seed)
+    joints = chain.random_joints(count, rng)
+    return simulation.measure(chain, joints, rng, 5e-5, 2e-4, oriented)
+
+
+def rows_of(observations, held_out=TEST):
+    rows = []
+    for k in range(len(observations)):
+        row = {'split': 'test' if k >= len(observations) - held_out else 'train'}
+        row |= {f'q{i + 1}': value for i, value in enumerate(observations.joints[k].tolist())}
+        row |= dict(zip('xyz', observations.positions[k].tolist(), strict=True))
+        if observations.oriented.all():
+            quat = to_quat(observations.rotations[k]).tolist()
+            row |= dict(zip(('qx', 'qy', 'qz', 'qw'), quat, strict=True))
+        rows.append(row)
+    return rows
+
+
+def write_csv(path, rows):
+    with path.open('w', newline='') as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    return path

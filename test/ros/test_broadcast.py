@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The frames found on /tf_static. tf2_msgs is not on PyPI: a class stands in for its message."""
+
+import sys
+from dataclasses import replace
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from rclpy.node import Node
+from ros_cell import LATCHED, Cell, true_arm
+from urdfs import UR10E, by_kinpy
+
+from calib_ros.apply.simulation import Cell as SimulatedCell
+from calib_ros.apply.simulation import faulty
+from calib_ros.errors import ConfigError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import dump_chain
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.ros.broadcast import Broadcast
+from calib_ros.ros.parameters import FrameNames
+
+NAMES = FrameNames('base_link', 'tool0', 'ball')
+
+
+class Published(SimpleNamespace):
+    """A TFMessage: it has one field."""
+
+
+@pytest.fixture
+def published(monkeypatch):
+    """Return the messages on /tf_static."""
+    found = []
+    package, module = ModuleType('tf2_msgs'), ModuleType('tf2_msgs.msg')
+    module.TFMessage = Published
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', package)
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', module)
+    real = Node.create_publisher
+
+    def create(node, kind, topic, qos, **options):
+        if kind is not Published:
+            return real(node, kind, topic, qos, **options)
+        assert topic == '/tf_static'
+        assert (qos.durability, qos.reliability) == (LATCHED.durability, LATCHED.reliability)
+        return SimpleNamespace(publish=found.append)
+
+    monkeypatch.setattr(Node, 'create_publisher', create)
+    return found
+
+
+def transforms(message):
+    """Return matrices by (parent, child)."""
+    found = {}
+    for each in message.transforms:
+        shift, turn = each.transform.translation, each.transform.rotation
+        rotation = se3.from_quat(np.array([turn.x, turn.y, turn.z, turn.w]))
+        matrix = se3.transform(rotation, np.array([shift.x, shift.y, shift.z]))
+        found[each.header.frame_id, each.child_frame_id] = matrix
+    return found
+
+
+def test_nothing_is_published_and_tf2_msgs_not_needed_without_names(monkeypatch):
+    for name in ('tf2_msgs', 'tf2_msgs.msg'):
+        monkeypatch.setitem(sys.modules, name, None)
+    with Cell(chain='ur10e') as cell:
+        topics = {
+            name
+            for name, _ in cell.node.get_publisher_names_and_types_by_node(
+                cell.node.get_name(), '/'
+            )
+        }
+        assert '/tf_static' not in topics
+        with pytest.raises(ConfigError, match='apt install ros-jazzy-tf2-msgs'):
+            cell.start(namespace='other', chain='ur10e', base_frame='base')
+
+
+def test_a_calibration_that_is_loaded_is_broadcast(published, tmp_path):
+    truth = true_arm()
+    path = tmp_path / 'calibration.yaml'
+    path.write_text(dump_chain(truth, {'world_frame': 'leica'}))
+    names = {f'{name}_frame': value for name, value in NAMES._asdict().items()}
+    with Cell(
+        chain='ur10e', data_dir=str(tmp_path), calibration_filename=path.name, **names
+    ) as cell:
+        (message,) = published  # at the start
+        assert cell.call('load').success
+        assert len(published) == 2
+    found = transforms(message)
+    assert set(found) == {('leica', 'base_link'), ('tool0', 'ball')}
+    for key, frame in (('leica', 'base_link'), 'base'), (('tool0', 'ball'), 'tool'):
+        np.testing.assert_allclose(found[key], truth.frame(frame).matrix, rtol=0, atol=1e-12)
+
+
+def broadcast(published, chain, world='leica', names=NAMES, in_hand=False, urdf=''):
+    published.clear()
+    with Cell() as cell:
+        Broadcast(cell.peer, names, in_hand, urdf, {}, LATCHED).publish(chain, world)
+    return transforms(published[0])
+
+
+def test_with_a_urdf_the_chain_of_frames_leads_to_the_target(published, rng):
+    """World to base_link, along the corrected URDF to tool0, and on to the target."""
+    nominal = replace(chain_from_urdf(UR10E), base=None, tool=None)
+    chain = faulty(nominal, SimulatedCell(), rng)
+    found = broadcast(published, chain, urdf=UR10E)
+    q = chain.random_joints(10, rng)
+    text = corrected_urdf(UR10E, chain)
+    arm = by_kinpy(text, chain.joint_names, q, 'base_link', 'tool0')
+    reached = found['leica', 'base_link'] @ arm @ found['tool0', 'ball']
+    np.testing.assert_allclose(reached, chain.forward(q), rtol=0, atol=1e-9)
+
+
+def test_a_camera_on_the_flange_sees_a_target_that_stands(published):
+    chain = replace(true_arm(), tool=Frame(np.eye(4)))
+    found = broadcast(published, chain, world='camera', in_hand=True)
+    assert set(found) == {('ball', 'base_link'), ('tool0', 'camera')}
+
+
+def test_frames_without_a_name_are_left_out(published):
+    chain = true_arm()
+    assert set(broadcast(published, chain, names=NAMES._replace(base=''))) == {('tool0', 'ball')}
+    assert set(broadcast(published, chain, names=NAMES._replace(flange=''))) == {
+        ('leica', 'base_link')
+    }
+    assert set(broadcast(published, chain, world='')) == {('tool0', 'ball')}

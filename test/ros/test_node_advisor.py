@@ -1,0 +1,421 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a real node offers around an identification: next pose, errors, corrected trajectories."""
+
+import threading
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
+from ros_cell import (
+    STOPS,
+    Cell,
+    Child,
+    joint_messages,
+    pose_messages,
+    shift,
+    topics,
+    true_arm,
+    values_of,
+)
+from sensor_msgs.msg import JointState, PointCloud2, Range
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.errors import InputError
+from calib_ros.files.waypoints import joints_csv
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.ros import advisor as guide_module
+
+UR = load_chain('ur10e')
+NODE = 'calibration_node'
+
+
+@pytest.fixture(scope='module')
+def truth():
+    return true_arm()
+
+
+@pytest.fixture(scope='module')
+def recording(truth):
+    return shift(truth)
+
+
+@pytest.fixture
+def cell(tmp_path):
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        yield cell
+
+
+@pytest.fixture
+def calibrated(cell, recording):
+    cell.play(topics(recording))
+    assert cell.call('identify').success
+    return cell
+
+
+def part(recording, stops):
+    """Return the messages of the first stops."""
+    poses = recording.poses.select(np.arange(4 * stops))
+    end = poses.stamps_ns[-1] + 600_000_000
+    joints = [
+        message
+        for message, stamp in zip(
+            joint_messages(recording), recording.joint_stamps_ns, strict=True
+        )
+        if stamp < end
+    ]
+    return {'joint_states': joints, 'measured_pose': pose_messages(poses)}
+
+
+# The next pose
+
+
+def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
+    early = cell.listen(JointState, f'{NODE}/next_pose')
+    diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.play(part(recording, 3))
+    cell.spin_until(lambda: early)
+    assert list(early[0].name) == list(UR.joint_names)
+    assert np.isfinite(early[0].position).all()
+    cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'False')
+    rest = topics(recording)
+    cell.play({k: v[len(part(recording, 3)[k]) :] for k, v in rest.items()})
+    cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'True')
+    assert float(values_of(diagnostics[-1])['expected [mm]']) < 0.1
+    cell.spin_until(lambda: len({tuple(message.position) for message in early}) > 1)
+    late = cell.listen(JointState, f'{NODE}/next_pose')
+    cell.spin_until(lambda: late)
+    limits = np.array([[joint.lower, joint.upper] for joint in UR.joints])
+    for message in (*early, *late):
+        assert (limits[:, 0] <= message.position).all()
+        assert (message.position <= limits[:, 1]).all()
+
+
+def test_the_next_pose_is_one_of_the_candidates_that_was_not_taken(tmp_path, recording):
+    stops = recording.poses.joints[:24:4]
+    fresh = stops[0] + 0.01
+    (tmp_path / 'poses.csv').write_text(joints_csv(np.concatenate([stops, [fresh]])))
+    names = [f'axis_{k}' for k in range(6)]
+    parameters = {'candidates': str(tmp_path / 'poses.csv'), 'joint_names': names}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **parameters) as cell:
+        heard = cell.listen(JointState, f'{NODE}/next_pose')
+        messages = topics(recording)
+        messages['joint_states'] = joint_messages(recording, names)
+        cell.play(messages)
+        session, guide = cell.node.session, cell.node._guide
+        cell.spin_until(lambda: len(guide._advised) == len(session.samples) > len(stops))
+        cell.spin_until(guide._advising.done)
+        cell.spin_until(lambda: heard and np.allclose(heard[-1].position, fresh, atol=1e-8))
+        assert list(heard[-1].name) == names
+
+
+def test_candidates_that_are_none_stop_the_start(tmp_path):
+    (tmp_path / 'poses.csv').write_text('q1,q2\n0,0\n')
+    with Cell() as cell, pytest.raises(InputError, match='has no column q3'):
+        cell.start(chain='ur10e', data_dir=str(tmp_path), candidates=str(tmp_path / 'poses.csv'))
+
+
+def test_nothing_is_planned_for_distances_or_in_motion(tmp_path, recording, truth):
+    distances = np.linalg.norm(recording.poses.positions, axis=1)
+    wire = pose_messages(recording.poses, Range, distances=distances)
+    for more, parameters in (
+        ({'measured_distance': wire}, {}),
+        ({'measured_pose': pose_messages(recording.poses)}, {'mode': 'continuous'}),
+    ):
+        with Cell(chain='ur10e', data_dir=str(tmp_path), **parameters) as cell:
+            heard = cell.listen(JointState, f'{NODE}/next_pose')
+            diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+            cell.play({'joint_states': joint_messages(recording), **more})
+            cell.node.session.finish()
+            count = len(diagnostics)
+            cell.spin_until(lambda d=diagnostics, n=count: len(d) > n + 2)
+            assert cell.node.session.samples
+            assert not heard
+
+
+# Errors over the workspace
+
+
+def test_errors_over_the_workspace_come_with_an_accepted_identification(cell, recording, truth):
+    heard = cell.listen(PointCloud2, f'{NODE}/workspace_error')
+    cell.play(topics(recording))
+    assert not heard
+    assert cell.call('identify').success
+    cell.spin_until(lambda: heard)
+    (message,) = heard
+    assert [field.name for field in message.fields] == ['x', 'y', 'z', 'error', 'sigma']
+    assert message.header.frame_id == 'tracker'
+    assert message.is_dense
+    assert (message.height, message.point_step) == (1, 20)
+    points = np.frombuffer(bytes(message.data), '<f4').reshape(message.width, 5)
+    assert len(points) == guide_module.CLOUD
+    calibration = cell.node.session.calibration
+    q = calibration.chain.random_joints(guide_module.CLOUD, np.random.default_rng(0))
+    after, before = calibration.chain.forward(q), calibration.before.forward(q)
+    np.testing.assert_allclose(points[:, :3], after[:, :3, 3], atol=1e-5)
+    removed = np.linalg.norm((after - before)[:, :3, 3], axis=1)
+    np.testing.assert_allclose(points[:, 3], removed, rtol=1e-4)
+    assert 1e-3 < points[:, 3].mean() < 5e-3
+    left = np.linalg.norm((after - truth.forward(q))[:, :3, 3], axis=1)
+    assert 0.5 < np.sqrt(np.mean(left**2) / np.mean(points[:, 4] ** 2)) < 2.0
+    late = cell.listen(PointCloud2, f'{NODE}/workspace_error')
+    cell.spin_until(lambda: late)
+
+
+# Corrected trajectories
+
+
+def path(count=50):
+    """Return a smooth path (count, 6) with its velocities and accelerations, and its times."""
+    start = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
+    reach = np.array([0.4, 0.2, -0.3, 0.3, 0.2, -0.5])
+    time = np.linspace(0.0, 2.0, count)
+    s = 0.5 - 0.5 * np.cos(np.pi * time / 2.0)
+    rate = 0.25 * np.pi * np.sin(np.pi * time / 2.0)
+    bend = 0.125 * np.pi**2 * np.cos(np.pi * time / 2.0)
+    outer = [row[:, None] * reach for row in (s, rate, bend)]
+    return start + outer[0], outer[1], outer[2], time
+
+
+def trajectory(q, velocities=None, accelerations=None, times=None, names=UR.joint_names):
+    message = JointTrajectory(joint_names=list(names))
+    message.header.frame_id = 'program'
+    for k, row in enumerate(q.tolist()):
+        point = JointTrajectoryPoint(positions=row, effort=[float(k)] * len(row))
+        if velocities is not None:
+            point.velocities = velocities[k].tolist()
+        if accelerations is not None:
+            point.accelerations = accelerations[k].tolist()
+        seconds = float(k if times is None else times[k])
+        whole = int(seconds)
+        point.time_from_start = Duration(sec=whole, nanosec=int((seconds - whole) * 1e9))
+        message.points.append(point)
+    return message
+
+
+def send(cell, message):
+    """Publish a trajectory; return what the node says of it when it has done with it."""
+    diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.node._guide._last_trajectory = ''
+    cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory').publish(message)
+    cell.spin_until(lambda: cell.node._guide._last_trajectory)
+    said = cell.node._guide._last_trajectory
+    cell.spin_until(lambda: diagnostics and values_of(diagnostics[-1])['last trajectory'] == said)
+    return said
+
+
+@pytest.fixture
+def corrected(cell):
+    heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
+    cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
+    return heard
+
+
+def test_a_trajectory_is_corrected(calibrated, corrected, truth):
+    q, velocities, accelerations, times = path()
+    message = trajectory(q, velocities, accelerations, times)
+    said = send(calibrated, message)
+    assert said.startswith('50 of 50 samples corrected')
+    assert 'sigma of the calibration at these poses: 0.0' in said
+    assert 'does not know the orientation' not in said
+    calibrated.spin_until(lambda: corrected)
+    (answer,) = corrected
+    found = np.array([point.positions for point in answer.points])
+    calibration = calibrated.node.session.calibration
+    expected = compensate(Compensator(UR, calibration.chain), q)
+    np.testing.assert_allclose(found, expected.joints, rtol=0, atol=1e-12)
+    frames = {'base': calibration.chain.base, 'tool': calibration.chain.tool}
+    meant = UR.with_frame('base', frames['base']).with_frame('tool', frames['tool']).forward(q)
+    after, before = (
+        np.linalg.norm((truth.forward(each) - meant)[:, :3, 3], axis=1) for each in (found, q)
+    )
+    assert after.max() < 2e-4 < 1e-3 < before.max()
+    assert answer.header.frame_id == 'program'
+    assert list(answer.joint_names) == list(UR.joint_names)
+    for given, point in zip(message.points, answer.points, strict=True):
+        assert given.time_from_start == point.time_from_start
+        assert given.effort == point.effort
+    # velocities are those of the corrected path, by its differences
+    step = times[1] - times[0]
+    rates = np.array([point.velocities for point in answer.points])
+    slope = (found[2:] - found[:-2]) / (2.0 * step)
+    given_slope = (q[2:] - q[:-2]) / (2.0 * step)
+    by_differences = (slope - given_slope)[1:-1]
+    np.testing.assert_allclose((rates - velocities)[2:-2], by_differences, atol=2e-5)
+    assert np.abs(by_differences).max() > 1e-4
+    bends = np.array([point.accelerations for point in answer.points])
+    assert 1e-5 < np.abs(bends - accelerations).max() < 0.05
+
+
+def test_other_joints_and_names_of_the_robot(tmp_path, recording):
+    names = [f'axis_{k}' for k in range(6)]
+    with Cell(chain='ur10e', data_dir=str(tmp_path), joint_names=names) as cell:
+        messages = topics(recording)
+        messages['joint_states'] = joint_messages(recording, names)
+        cell.play(messages)
+        assert cell.call('identify').success
+        heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
+        cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
+        q = path(5)[0]
+        wide = np.column_stack([np.arange(5.0), q[:, ::-1]])
+        send(cell, trajectory(wide, names=['gripper', *names[::-1]]))
+        cell.spin_until(lambda: heard)
+        found = np.array([point.positions for point in heard[0].points])
+        assert list(heard[0].joint_names) == ['gripper', *names[::-1]]
+        np.testing.assert_array_equal(found[:, 0], np.arange(5.0))
+        expected = compensate(Compensator(UR, cell.node.session.calibration.chain), q).joints
+        np.testing.assert_allclose(found[:, :0:-1], expected, rtol=0, atol=1e-12)
+        assert [len(point.velocities) for point in heard[0].points] == [0] * 5
+
+
+def test_nothing_is_corrected_without_a_calibration(cell, corrected):
+    said = send(cell, trajectory(path(5)[0]))
+    assert 'refused: there is no accepted calibration' in said
+    assert not corrected
+
+
+def beyond(q):
+    q[3, 2] = 4.0
+    return trajectory(q)
+
+
+def singular(q):
+    q[2, 4] = 0.0
+    return trajectory(q)
+
+
+def half_velocities(q):
+    message = trajectory(q)
+    message.points[1].velocities = [0.0] * 6
+    return message
+
+
+WRONG = {
+    'point 4: the command 4 of elbow_joint is beyond its limits': beyond,
+    'point 3: near a singularity': singular,
+    'point 1: velocities must be a list of 6 numbers': half_velocities,
+    'unknown joint in the program': lambda q: trajectory(q, names='abcdef'),
+    'positions must be a list of 5 numbers': lambda q: trajectory(q, names=UR.joint_names[:5]),
+    'must be a finite number': lambda q: trajectory(q * np.nan),
+    'has no positions': lambda q: JointTrajectory(joint_names=list(UR.joint_names)),
+    'needs velocities as well': lambda q: trajectory(q, accelerations=q),
+    '6 points, at most 5 are taken': lambda q: trajectory(np.repeat(q[:1], 6, axis=0)),
+}
+
+
+def test_trajectories_that_cannot_be_corrected_are_refused(calibrated, corrected, monkeypatch):
+    monkeypatch.setattr(guide_module, 'MOST_POINTS', 5)
+    for reason, make in WRONG.items():
+        said = send(calibrated, make(path(5)[0]))
+        assert said.startswith('refused: ')
+        assert reason in said
+    many = path(5)[0]
+    many[:, 4] = 0.0
+    said = send(calibrated, trajectory(many))
+    assert 'and 2 more' in said
+    assert not corrected
+    send(calibrated, trajectory(path(5)[0]))
+    calibrated.spin_until(lambda: corrected)
+    assert len(corrected) == 1
+
+
+@pytest.mark.parametrize(
+    ('message', 'said'),
+    [
+        (
+            JointTrajectory(points=[JointTrajectoryPoint()] * 60_000),
+            'refused: 60000 points, at most 50000 are taken',
+        ),
+        (
+            JointTrajectory(points=[JointTrajectoryPoint(effort=[0.0] * 2_600_000)]),
+            'bytes, at most 20000000 are taken',
+        ),
+        (JointTrajectory(joint_names=['j'] * 20_000), 'refused: 20000 joints, at most 1000'),
+    ],
+    ids=['points', 'bytes', 'joints'],
+)
+def test_trajectories_that_are_too_large_are_not_even_decoded(cell, monkeypatch, message, said):
+    decoded = []
+    monkeypatch.setattr(guide_module, 'deserialize_message', lambda *_: decoded.append(1))
+    cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory').publish(message)
+    cell.spin_until(lambda: cell.node._guide._last_trajectory)
+    assert said in cell.node._guide._last_trajectory
+    assert not decoded
+
+
+def test_another_calibration_corrects_otherwise(calibrated, corrected):
+    q = path(5)[0]
+    send(calibrated, trajectory(q))
+    node = calibrated.node
+    moved = node.session.calibration.chain.with_offsets({'elbow_joint.a': 1e-3})
+    node.session.load(moved)
+    send(calibrated, trajectory(q))
+    calibrated.spin_until(lambda: len(corrected) == 2)
+    first, second = (np.array([p.positions for p in each.points]) for each in corrected)
+    assert np.abs(first - second).max() > 1e-4
+
+
+@pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
+def test_messages_are_taken_while_it_computes(tmp_path, recording, executor, monkeypatch):
+    """The work waits for the messages here: it could not if they waited for the work."""
+    taken, entered = threading.Event(), threading.Event()
+    real = guide_module.compensate_program
+
+    def slow(*arguments):
+        entered.set()
+        assert taken.wait(20.0)
+        return real(*arguments)
+
+    monkeypatch.setattr(guide_module, 'compensate_program', slow)
+    with Cell(executor, chain='ur10e', data_dir=str(tmp_path)) as cell:
+        cell.node.session.load(UR.with_frame('base', Frame()))
+        heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
+        cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
+        cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory').publish(trajectory(path(5)[0]))
+        cell.spin_until(entered.is_set)
+        cell.play(topics(recording))
+        assert len(cell.node.session.samples) > STOPS // 2
+        assert not heard
+        taken.set()
+        cell.spin_until(lambda: heard)
+
+
+def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
+    begun, free = threading.Event(), threading.Event()
+
+    def stuck(*arguments):
+        begun.set()
+        free.wait(20.0)
+        raise InputError('too late')
+
+    monkeypatch.setattr(guide_module, 'compensate_program', stuck)
+    with Cell() as cell:
+        cell.node = cell.start(chain='ur10e', data_dir=str(tmp_path))
+        cell.node.session.load(UR)
+        publisher = cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory')
+        for _ in range(3):
+            publisher.publish(trajectory(path(5)[0]))
+        cell.spin_until(lambda: begun.is_set() and len(cell.node._guide._pending) == 3)
+        monkeypatch.setattr(guide_module, 'MOST_WAITING', 2)
+        publisher.publish(trajectory(path(5)[0]))
+        cell.spin_until(lambda: cell.node._guide._last_trajectory)
+        assert 'refused: 2 others wait already' in cell.node._guide._last_trajectory
+        assert not cell.node._guide.join(0.05)
+        free.set()
+        assert cell.node._guide.join(20.0)
+
+
+def test_a_node_in_a_process_of_its_own_refuses_aloud(tmp_path):
+    with (
+        Cell() as cell,
+        Child(domain=cell.domain, chain='ur10e', data_dir=str(tmp_path)) as child,
+    ):
+        child.wait_for('ready to calibrate')
+        publisher = cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory')
+        publisher.publish(trajectory(path(3)[0]))
+        child.wait_for('trajectory refused: there is no accepted calibration')

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which files of its machine the node uses for somebody else, and what it tells of them."""
+
+import os
+
+import pytest
+from ros_cell import Cell, true_arm
+
+from calib_ros.errors import InputError
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, nominal_record
+
+SECRET = 'root:$6$salt$hash:19000:0:99999:7:::'
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Return a folder that is the node's, with a calibration; a secret is beside it."""
+    data = tmp_path / 'data'
+    data.mkdir()
+    record = {'accepted': True, 'nominal': nominal_record(load_chain('ur10e'))}
+    (data / 'good.yaml').write_text(dump_chain(true_arm(), record))
+    (tmp_path / 'shadow').write_text(SECRET + '\n')
+    (tmp_path / 'secret.yaml').write_text(SECRET + '\n')
+    (tmp_path / 'more').mkdir()
+    return data
+
+
+@pytest.fixture
+def cell(data, tmp_path):
+    folders = [str(tmp_path / 'more')]
+    with Cell(chain='ur10e', data_dir=str(data), allowed_folders=folders) as cell:
+        yield cell
+
+
+def load(cell, name):
+    assert cell.set_parameters({'calibration_filename': str(name)})[0].successful
+    return cell.call('load')
+
+
+def save(cell, name):
+    assert cell.set_parameters({'target_filename': str(name)})[0].successful
+    return cell.call('save')
+
+
+def everything(folder):
+    return sorted(str(path) for path in folder.rglob('*'))
+
+
+def test_other_files_are_neither_read_nor_told_of(cell, data, tmp_path):
+    (data / 'out').symlink_to(tmp_path)
+    (data / 'link.yaml').symlink_to(tmp_path / 'secret.yaml')
+    answers = [
+        load(cell, name)
+        for name in (
+            *('/etc/shadow', '/etc/passwd', tmp_path / 'shadow', tmp_path / 'secret.yaml'),
+            *('../secret.yaml', 'out/secret.yaml', 'link.yaml', '~/none.yaml'),
+        )
+    ]
+    # There or not: the answer is the same.
+    there, missing = (load(cell, tmp_path / name) for name in ('secret.yaml', 'missing.yaml'))
+    assert there.message.replace('secret', '') == missing.message.replace('missing', '')
+    for answer in (*answers, there):
+        assert not answer.success
+        assert 'outside the folders of the node' in answer.message or 'must end in' in (
+            answer.message
+        )
+    assert not any(part in answer.message for answer in answers for part in ('$6$', '19000'))
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        *(SECRET.encode(), b'- [' + SECRET.encode(), b'\xff\xfe' + SECRET.encode()),
+        *(b'name: {%s: 1}' % SECRET.encode(), b'{%s: 1, %s: 1}' % (2 * (SECRET[:9].encode(),))),
+        *(b'name: arm\njoints: "%s"' % SECRET.encode(), b'!!python/object:%s' % SECRET.encode()),
+    ],
+)
+def test_no_content_of_a_file_is_in_an_answer(cell, data, content):
+    (data / 'wrong.yaml').write_bytes(content)
+    answer = load(cell, 'wrong.yaml')
+    assert not answer.success
+    assert answer.message == (
+        f'{data}/wrong.yaml is not a calibration: `calib_ros chain {data}/wrong.yaml` says what '
+        'is wrong with it'
+    )
+
+
+def test_a_pipe_does_not_stop_the_node(cell, data):
+    os.mkfifo(data / 'pipe.yaml')
+    assert 'there is no file' in load(cell, 'pipe.yaml').message
+    assert 'there is no file' in load(cell, 'missing.yaml').message
+
+
+def test_files_are_written_into_the_folders_only(cell, data, tmp_path):
+    assert load(cell, 'good.yaml').success
+    (data / 'out').symlink_to(tmp_path)
+    (data / 'link.yaml').symlink_to(tmp_path / 'new.yaml')
+    before = everything(tmp_path)
+    for name in (
+        *(tmp_path / 'x.yaml', '../x.yaml', 'out/x.yaml', 'sub/../../x.yaml', 'link.yaml'),
+        *('/etc/cron.d/x.yaml', 'x.csv', '.bashrc', '~/.ros/x.yaml'),
+    ):
+        answer = save(cell, name)
+        assert not answer.success, name
+    assert everything(tmp_path) == before
+    text = (data / 'good.yaml').read_text()
+    for name in ('new.yaml', 'sub/new.yaml', tmp_path / 'more' / 'sub' / 'new.yaml'):
+        answer = save(cell, name)
+        assert answer.success, answer.message
+        assert (data / name).read_text() == text
+        assert load(cell, name).success
+    assert 'exists already' in save(cell, 'new.yaml').message
+
+
+def test_the_list_of_folders_is_the_operators(cell):
+    (result,) = cell.set_parameters({'allowed_folders': ['/']})
+    assert not result.successful
+    assert not load(cell, '/etc/passwd.yaml').success
+
+
+@pytest.mark.parametrize('name', ['target_filename', 'calibration_filename'])
+def test_a_file_elsewhere_is_refused_at_the_start(data, tmp_path, name):
+    with Cell() as cell, pytest.raises(InputError, match=f'choose {name} in data_dir, or start'):
+        cell.start(chain='ur10e', data_dir=str(data), **{name: str(tmp_path / 'x.yaml')})

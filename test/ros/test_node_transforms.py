@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node that hears /tf; tf2_msgs comes with ROS, and is built for these tests without."""
+
+import itertools
+import os
+import sys
+
+import numpy as np
+import pytest
+
+if 'CI' not in os.environ:
+    pytest.importorskip('tf2_msgs.msg', reason='make test builds it')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
+from rclpy.serialization import serialize_message
+from ros_cell import (
+    LATCHED,
+    Cell,
+    assert_same,
+    direct,
+    header,
+    joint_messages,
+    shift,
+    stamp_ns,
+    true_arm,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from tf2_msgs.msg import TFMessage
+
+from calib_ros.errors import ConfigError
+from calib_ros.files.bags import replay
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.ros.inputs import Hearing, deserialised
+from calib_ros.sampling.intake import Stream, feed, measured
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import parse_sources
+from calib_ros.settings import Settings
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+SOURCE = '/tf parent=tracker child=tool'
+TRACKER = se3.transform(se3.exp_rotation(np.array([0.3, -0.2, 1.0])), np.array([2.0, 1.0, 0.5]))
+
+
+@pytest.fixture(scope='module')
+def recording():
+    return shift(true_arm())
+
+
+def link(parent, child, stamp, matrix):
+    x, y, z = matrix[:3, 3].tolist()
+    turn = dict(zip(('x', 'y', 'z', 'w'), se3.to_quat(matrix[:3, :3]).tolist(), strict=True))
+    return TransformStamped(
+        header=header(stamp, parent),
+        child_frame_id=child,
+        transform=Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(**turn)),
+    )
+
+
+def still():
+    """Return where the tracker is, and what else stands still."""
+    return TFMessage(
+        transforms=[
+            link('hall', 'tracker', 0, TRACKER),
+            link('hall', 'base_link', 0, np.eye(4)),
+        ]
+    )
+
+
+def moving(recording, parent):
+    """Return the measured poses among the frames of the robot."""
+    poses = se3.transform(recording.poses.rotations, recording.poses.positions)
+    if parent == 'hall':
+        poses = TRACKER @ poses
+    names = ['base_link', *(f'link_{k}' for k in range(1, 29))]
+    frames = [se3.transform(se3.exp_rotation(np.full(3, 0.1 * k)), np.ones(3)) for k in range(29)]
+    found = []
+    for stamp, pose in zip(recording.poses.stamps_ns.tolist(), poses, strict=True):
+        robot = [
+            link(*pair, stamp, matrix)
+            for pair, matrix in zip(itertools.pairwise(names), frames, strict=False)
+        ]
+        found.append(TFMessage(transforms=[*robot, link(parent, 'tool', stamp, pose), *robot]))
+    return found
+
+
+def serialised(recording, parent):
+    """Return topics, stamps and bytes of a recording, the frames that stand still first."""
+    found = [('/tf_static', recording.joint_stamps_ns[0], still())]
+    found += [('/tf', stamp_ns(each), each) for each in moving(recording, parent)]
+    found += [('/joint_states', stamp_ns(each), each) for each in joint_messages(recording)]
+    found.sort(key=lambda each: each[1])
+    return [(topic, int(stamp), serialize_message(message)) for topic, stamp, message in found]
+
+
+def write(path, content, storage):
+    types = {'/tf': TRANSFORMS, '/tf_static': TRANSFORMS, '/joint_states': JOINT_STATE}
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=STORE)
+            for topic, kind in types.items()
+        }
+        for topic, stamp, data in content:
+            writer.write(connections[topic], stamp, data)
+    return path
+
+
+@pytest.mark.parametrize('parent', ['tracker', 'hall'])
+@pytest.mark.parametrize(
+    ('executor', 'storage'), [(SingleThreadedExecutor, 'sqlite3'), (EventsExecutor, 'mcap')]
+)
+def test_direct_bag_and_live_give_equal_observations(
+    tmp_path, recording, parent, executor, storage
+):
+    """As of poses: one by one without ROS, through a bag, and through a running node."""
+    settings = Settings(sources=(SOURCE,))
+    content = serialised(recording, parent)
+    alone = CalibrationSession(load_chain('ur10e'), settings)
+    streams = {each.topic: each for each in measured(parse_sources([SOURCE]), {})}
+    streams['/joint_states'] = Stream('/joint_states', JOINT_STATE)
+    for topic, _, data in content:
+        assert feed(alone, [(streams[topic], data)], deserialised) == []
+    replayed = CalibrationSession(load_chain('ur10e'), settings)
+    assert replay(write(tmp_path / 'bag', content, storage), replayed).warnings == ()
+    parameters = {'chain': 'ur10e', 'sources': [SOURCE], 'data_dir': str(tmp_path)}
+    with Cell(executor, **parameters) as cell:
+        latched = cell.peer.create_publisher(TFMessage, '/tf_static', LATCHED)
+        latched.publish(still())
+        cell.play({'/tf': moving(recording, parent), 'joint_states': joint_messages(recording)})
+        live = cell.node.session
+        expected = alone.problem().observations
+        assert_same(expected, replayed.problem().observations)
+        assert_same(expected, live.problem().observations)
+        assert live.account() == alone.account() == replayed.account()
+    of_poses = direct(recording).problem().observations
+    np.testing.assert_array_equal(expected.stamps_ns, of_poses.stamps_ns)
+    np.testing.assert_allclose(expected.positions, of_poses.positions, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(expected.rotations, of_poses.rotations, rtol=0, atol=1e-12)
+
+
+def test_the_diagnostics_tell_which_frames_are_there(tmp_path, recording):
+    source = '/tf parent=tracker child=tol'
+    with Cell(chain='ur10e', sources=[source], data_dir=str(tmp_path)) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(TFMessage, '/tf')
+        for message in moving(recording, 'tracker')[:5]:
+            publisher.publish(message)
+        cell.spin_until(lambda: any('nothing links' in m.status[0].message for m in heard))
+        words = heard[-1].status[0].message
+        assert 'nothing links frame "tol" to "tracker" on /tf' in words
+        assert 'parent=tracker child=tool"' in words
+
+
+def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    monkeypatch.setenv('ROS_DISTRO', 'jazzy')
+    with (
+        pytest.raises(
+            ConfigError, match='tf2_msgs cannot be imported, install ros-jazzy-tf2-msgs'
+        ),
+        Cell(chain='ur10e', sources=[SOURCE], data_dir=str(tmp_path)),
+    ):
+        pass
+
+
+@pytest.mark.parametrize('latched', [False, True])
+def test_frames_that_stand_still_may_be_silent(latched):
+    assert Hearing(last=-100.0, latched=latched).silent is not latched

@@ -1,0 +1,153 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Every measurement that came is in a sample, waits, or is counted with a cause: none is lost."""
+
+import numpy as np
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+from streams import (
+    MS,
+    POSE,
+    RANGE,
+    START,
+    TRANSFORM,
+    distance,
+    joint_state,
+    pose,
+    stops,
+    transform,
+)
+
+from calib_ros.errors import InputError
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import Source
+from calib_ros.settings import MODES, Settings
+
+ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4), Joint('c')))
+SOURCES = (
+    (Source('pose'), POSE, lambda stamp, where: pose(stamp, where)),
+    (Source('judge', validation=True), POSE, lambda stamp, where: pose(stamp, where)),
+    (Source('marker'), TRANSFORM, lambda stamp, where: transform(stamp, where, 'ball')),
+    (Source('wire', device='wire'), RANGE, lambda stamp, where: distance(stamp, where[0])),
+)
+PARTS = (
+    (('a', 'b', 'c'),),
+    (('a',), ('b', 'c')),
+    (('c', 'b', 'a'), ('b',)),
+    (('a', 'b'), ('b', 'c')),
+    (('a', 'b'),),
+)
+CALLS = ('flush', 'capture', 'finish', 'remove', 'pause', 'judge', 'status')
+
+
+def balance(session):
+    """Return how many measurements came, and how many are accounted for."""
+    account = session.account()
+    lost = sum(
+        count
+        for counts in (account.unused, account.dropped)
+        for cause, count in counts.items()
+        if cause.startswith('poses')
+    )
+    return account.poses, sum(s.count for s in session.samples) + account.waiting + lost
+
+
+def call(session, name):
+    try:
+        if name == 'flush':
+            session.problem()
+        elif name == 'capture':
+            session.capture()
+        elif name == 'finish':
+            session.finish()
+        elif name == 'remove':
+            session.remove_last()
+        elif name == 'pause':
+            session.recording = not session.recording
+        elif name == 'judge':
+            session.validate()
+        else:
+            session.status()
+    except InputError:
+        pass
+
+
+plans = st.fixed_dictionaries(
+    {
+        'mode': st.sampled_from(MODES),
+        'lateness': st.sampled_from([0.0, 0.05, 0.4, 1.0]),
+        'settle': st.sampled_from([0.0, 0.1]),
+        'shortest_stop': st.sampled_from([0.0, 0.2, 1.0]),
+        'longest_stop': st.sampled_from([0.3, 5.0]),
+        'joint_buffer': st.sampled_from([2, 3, 10, 60, 10_000]),
+        'pose_buffer': st.sampled_from([1, 5, 10_000]),
+        'delay': st.sampled_from([0.0, 0.1, -0.1]),
+    }
+).filter(lambda plan: plan['shortest_stop'] < plan['longest_stop'])
+traffic = st.fixed_dictionaries(
+    {
+        'seed': st.integers(0, 2**32 - 1),
+        'parts': st.sampled_from(PARTS),
+        'dies': st.sampled_from([3.0, 9.0]),  # all publishers of joints but the first
+        'joint_period': st.sampled_from([0.01, 0.037]),
+        'sources': st.lists(st.sampled_from(range(len(SOURCES))), min_size=1, max_size=3),
+        'period': st.sampled_from([0.03, 0.11]),
+        'stand': st.sampled_from([0.3, 1.0]),
+        'latest': st.sampled_from([0.0, 0.02, 0.3, 3.0]),
+        'wild': st.sampled_from([0.0, 0.02]),  # share of stamps that are wrong, and of repeats
+        'calls': st.lists(st.sampled_from(CALLS), max_size=6),
+        'again': st.booleans(),  # the bag is played in a loop
+    }
+)
+
+
+def happening(seed, parts, dies, joint_period, sources, period, stand, latest, wild, calls, again):
+    """Return messages and calls in the order of their arrival."""
+    rng = np.random.default_rng(seed)
+    joints = stops(rng.uniform(-3.5, 3.5, (5, 3)), move=0.4, stand=stand)
+    events = []
+
+    def add(stamp_s, name, *values):
+        stamp_ns = START + round(stamp_s * 1e9)
+        if rng.random() < wild:
+            stamp_ns += int(rng.choice([-30_000, -500, 500, 30_000])) * MS
+        late = rng.exponential(latest) if latest else 0.0
+        repeats = 1 + (rng.random() < wild)
+        events.extend([(stamp_s + late, (name, stamp_ns, *values))] * repeats)
+
+    for k, names in enumerate(parts):
+        for stamp_s in np.arange(0.0, min(6.0, dies if k else 9.0), joint_period):
+            if wild and 2.0 < stamp_s < 2.3:
+                continue  # a hole
+            values = (joints([stamp_s])[0] + np.pi) % (2.0 * np.pi) - np.pi
+            add(stamp_s, 'joints', names, values[[ARM.joint_names.index(n) for n in names]])
+    for source in sources:
+        for stamp_s in np.arange(0.005, 6.2, period):
+            where = rng.normal(scale=1e-4, size=3) + [1.0, 2.0, 3.0] + joints([stamp_s])[0]
+            add(stamp_s, 'measured', source, np.abs(where))
+    events.extend((rng.uniform(0.0, 6.0), (name,)) for name in calls)
+    events.sort(key=lambda event: event[0])
+    return [what for _, what in events] * (1 + again)
+
+
+@settings(max_examples=100, phases=[Phase.generate])  # to shrink takes minutes
+@given(plans, traffic)
+def test_every_measurement_is_accounted_for(plan, traffic):
+    session = CalibrationSession(ARM, Settings(**plan))
+    for k, (name, *values) in enumerate(happening(**traffic)):
+        if name == 'joints':
+            session.take_joints(joint_state(*values))
+        elif name == 'measured':
+            stamp_ns, number, where = values
+            source, kind, make = SOURCES[number]
+            session.take(source, kind, make(stamp_ns, where))
+        else:
+            call(session, name)
+        if k % 40 == 0 or name in CALLS:
+            came, found = balance(session)
+            assert came == found, f'after {name}, message {k}'
+    session.finish()
+    came, found = balance(session)
+    assert came == found
+    assert session.account().waiting == 0

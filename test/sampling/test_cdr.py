@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros.sampling import messages
+from calib_ros.sampling.cdr import decode, readings, trajectory_size
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
+NUMBERS = st.floats(-1e6, 1e6)
+SECONDS, NANOSECONDS = st.integers(0, 2**31 - 1), st.integers(0, 999_999_999)
+
+
+def header(seconds, nanoseconds, frame_id):
+    time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
+    return TYPES['std_msgs/msg/Header'](time, frame_id)
+
+
+def pose(numbers):
+    point = TYPES['geometry_msgs/msg/Point'](*numbers[:3])
+    return TYPES['geometry_msgs/msg/Pose'](
+        point, TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
+    )
+
+
+def message(kind, head, child, numbers):
+    cls = TYPES[kind]
+    covariance = np.arange(36.0) + numbers[0]
+    if kind == 'geometry_msgs/msg/PoseStamped':
+        return cls(head, pose(numbers))
+    if kind == 'geometry_msgs/msg/PointStamped':
+        return cls(head, TYPES['geometry_msgs/msg/Point'](*numbers[:3]))
+    if kind == 'sensor_msgs/msg/Range':
+        return cls(head, 0, *np.float32(numbers[:5]))
+    if kind == 'geometry_msgs/msg/TransformStamped':
+        shift = TYPES['geometry_msgs/msg/Vector3'](*numbers[:3])
+        turn = TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
+        return cls(head, child, TYPES['geometry_msgs/msg/Transform'](shift, turn))
+    with_covariance = TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(numbers), covariance)
+    if kind == 'nav_msgs/msg/Odometry':
+        zero = TYPES['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
+        twist = TYPES['geometry_msgs/msg/Twist'](zero, zero)
+        return cls(
+            head,
+            child,
+            with_covariance,
+            TYPES['geometry_msgs/msg/TwistWithCovariance'](twist, covariance),
+        )
+    return cls(head, with_covariance)
+
+
+@given(
+    st.sampled_from(sorted(DECODERS)),
+    NAMES,
+    NAMES,
+    st.lists(
+        st.tuples(SECONDS, NANOSECONDS, st.lists(NUMBERS, min_size=7, max_size=7)),
+        min_size=1,
+        max_size=5,
+    ),
+)
+def test_measurements_are_decoded_as_by_rosbags(kind, frame_id, child, rows):
+    given_ = [message(kind, header(s, ns, frame_id), child, n) for s, ns, n in rows]
+    blobs = [bytes(STORE.serialize_cdr(each, kind)) for each in given_]
+    batch = decode(kind, blobs)
+    assert batch.strings[0] == frame_id
+    if len(batch.strings) > 1:
+        assert batch.strings[1] == child
+    for k, ((seconds, nanoseconds, numbers), stamp) in enumerate(
+        zip(rows, batch.stamps_ns, strict=True)
+    ):
+        assert stamp == seconds * 1_000_000_000 + nanoseconds
+        found = batch.numbers[k]
+        if kind.endswith('Range'):
+            numbers = np.float32(numbers[:4])
+        np.testing.assert_array_equal(found[:7], numbers[: len(found)])
+        if len(found) == 43:
+            np.testing.assert_array_equal(found[7:], np.arange(36.0) + numbers[0])
+
+
+@given(
+    NAMES,
+    st.lists(NAMES, max_size=8),
+    st.lists(st.tuples(SECONDS, NANOSECONDS, NUMBERS), min_size=1, max_size=5),
+)
+def test_joint_states_are_decoded_as_by_rosbags(frame_id, names, rows):
+    empty = np.zeros(0)
+    blobs = []
+    for seconds, nanoseconds, value in rows:
+        positions = value + np.arange(float(len(names)))
+        head = header(seconds, nanoseconds, frame_id)
+        given_ = TYPES[JOINT_STATE](head, names, positions, positions, empty)
+        blobs.append(bytes(STORE.serialize_cdr(given_, JOINT_STATE)))
+    batch = decode(JOINT_STATE, blobs)
+    assert batch.strings == (frame_id, *names)
+    for k, blob in enumerate(blobs):
+        expected = STORE.deserialize_cdr(blob, JOINT_STATE)
+        np.testing.assert_array_equal(batch.numbers[k], expected.position)
+        if rows[k][0] + rows[k][1]:
+            assert batch.stamps_ns[k] == messages.joint_state(expected).stamp_ns
+
+
+def joint_blob(names, positions, frame_id=''):
+    empty = np.zeros(0)
+    given_ = TYPES[JOINT_STATE](header(1, 0, frame_id), names, np.array(positions), empty, empty)
+    return bytes(STORE.serialize_cdr(given_, JOINT_STATE))
+
+
+def test_messages_of_different_layout_are_left_to_others():
+    one, other = joint_blob(['a', 'b'], [1.0, 2.0]), joint_blob(['b', 'a'], [1.0, 2.0])
+    assert decode(JOINT_STATE, [one, one]) is not None
+    assert decode(JOINT_STATE, [one, other]) is None
+    assert decode(JOINT_STATE, [one, joint_blob(['a'], [1.0])]) is None
+    assert decode(JOINT_STATE, [one, joint_blob(['a', 'b'], [1.0, 2.0], 'x')]) is None
+
+
+@pytest.mark.parametrize('cut', [3, 9, 14, 30, -9, -1])
+def test_broken_messages_are_left_to_others(cut):
+    blob = joint_blob(['a', 'b'], [1.0, 2.0])
+    decoded = decode(JOINT_STATE, [blob[:cut]])
+    assert decoded is None or decoded.numbers.shape == (1, 2)
+    assert decode(JOINT_STATE, [b'\x00\x00' + blob[2:]]) is None  # big-endian
+
+
+VALID = [1.0, -2.0, 0.5, 0.6, 0.0, -0.8, 0.0]
+
+
+def read(kind, blobs):
+    given_ = [STORE.deserialize_cdr(blob, kind) for blob in blobs]
+    decoder = messages.joint_state if kind == JOINT_STATE else DECODERS[kind]
+    return [decoder(each) for each in given_]
+
+
+def blob_of(kind, numbers, child='hand', seconds=5):
+    head = header(seconds, 7, 'tracker')
+    made = message(kind, head, child, numbers)
+    if hasattr(getattr(made, 'pose', None), 'covariance'):
+        made.pose.covariance[:] = np.diag(np.arange(1.0, 7.0)).ravel()
+    return bytes(STORE.serialize_cdr(made, kind))
+
+
+@pytest.mark.parametrize('kind', sorted(DECODERS))
+def test_batches_are_read_as_single_messages_are(kind):
+    blobs = [blob_of(kind, VALID, seconds=s) for s in (5, 6, 7)]
+    expected = read(kind, blobs)
+    batch, good = readings(kind, blobs)
+    assert good.all()
+    for k, single in enumerate(expected):
+        found = batch.row(k)
+        assert found[:4] == single[:4]
+        assert found.covariance == single.covariance
+        assert found.distance == pytest.approx(single.distance)
+        assert found.child == single.child
+
+
+def test_batches_of_joint_states_are_read_as_single_messages_are():
+    blobs = [joint_blob(['a', 'b'], [value, 2.0]) for value in (0.0, 1.0)]
+    batch, good = readings(JOINT_STATE, blobs)
+    assert good.all()
+    for k, single in enumerate(read(JOINT_STATE, blobs)):
+        found = batch.row(k)
+        assert found.stamp_ns == single.stamp_ns
+        assert list(found.names) == list(single.names)
+        assert list(found.values) == list(single.values)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'numbers', 'child', 'seconds'),
+    [
+        ('geometry_msgs/msg/PoseStamped', [np.nan, *VALID[1:]], 'hand', 5),
+        ('geometry_msgs/msg/PoseStamped', [*VALID[:6], 1.0], 'hand', 5),
+        ('geometry_msgs/msg/PointStamped', [np.inf, *VALID[1:]], 'hand', 5),
+        ('geometry_msgs/msg/TransformStamped', VALID, 'ha\nnd', 5),
+        ('sensor_msgs/msg/Range', [0.0] * 7, 'hand', 5),
+    ],
+)
+def test_what_a_decoder_refuses_is_left_to_it(kind, numbers, child, seconds):
+    blob, bad = blob_of(kind, VALID), blob_of(kind, numbers, child, seconds)
+    found = readings(kind, [blob, bad, blob])
+    if found is None:
+        assert readings(kind, [blob]) is not None
+    else:
+        batch, good = found
+        assert good.tolist() == [True, False, True]
+        assert batch.row(1) == read(kind, [blob])[0]
+    with pytest.raises(messages.MessageError):
+        read(kind, [bad])
+
+
+def trajectory(frame_id, names, points):
+    duration = TYPES['builtin_interfaces/msg/Duration'](0, 0)
+    row, none = np.zeros(len(names)), np.zeros(0)
+    point = TYPES['trajectory_msgs/msg/JointTrajectoryPoint'](row, none, none, none, duration)
+    kind = 'trajectory_msgs/msg/JointTrajectory'
+    message = TYPES[kind](header(1, 2, frame_id), names, [point] * points)
+    return [bytes(STORE.serialize_cdr(message, kind, little_endian=e)) for e in (True, False)]
+
+
+@given(NAMES, st.lists(NAMES, max_size=8), st.integers(0, 20))
+def test_the_size_of_a_trajectory_is_known_without_decoding_it(frame_id, names, points):
+    for data in trajectory(frame_id, names, points):
+        assert trajectory_size(data) == (len(names), points)
+        for end in range(len(data)):
+            found = trajectory_size(data[:end])
+            assert found[0] in (0, len(names))
+            assert found[1] in (0, points)
+
+
+def test_a_trajectory_that_names_joints_without_end_is_not_gone_through():
+    little, _ = trajectory('', [''] * 20_000, 3)
+    assert trajectory_size(little) == (20_000, 0)

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A cell measured in motion by a device whose clock or transport is late."""
+
+import re
+
+import numpy as np
+import pytest
+from streams import POINT, POSE, START, TRACKER, joint_state, point, pose, stamps, stops, sweep
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.delay import LEAST_MOTION, find_delay
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+UR10E = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+SECONDS = 40.0
+
+
+def true_cell(seed):
+    rng = np.random.default_rng(seed)
+    return faulty(UR10E, Cell(), rng), sweep(6, rng, reach=2.0), rng
+
+
+def recorded(lag, seed=0, oriented=True, seconds=SECONDS, motion=None, **settings):
+    """Return a session that has heard a moving arm, its true chain and its motion."""
+    true, moving, rng = true_cell(seed)
+    motion = motion or moving
+    session = CalibrationSession(UR10E, Settings(**{'mode': 'continuous'} | settings))
+    joint_times = np.arange(0.0, seconds, 0.005)
+    times = np.arange(0.05, seconds - 0.3, 0.02)
+    seen = measure(true, motion(times), rng, *NOISE, oriented)
+    late = stamps(times + lag)
+    events = []
+    for time, stamp, row in zip(
+        joint_times, stamps(joint_times).tolist(), motion(joint_times), strict=True
+    ):
+        message = joint_state(stamp, UR10E.joint_names, row.tolist())
+        events.append((time, lambda message=message: session.take_joints(message)))
+    for k, time in enumerate(times):
+        stamp, where = int(late[k]), seen.positions[k]
+        message = pose(stamp, where, seen.rotations[k]) if oriented else point(stamp, where)
+        kind = POSE if oriented else POINT
+        events.append(
+            (
+                time + max(lag, 0.0) + 0.005,
+                lambda message=message, kind=kind: session.take(TRACKER, kind, message),
+            )
+        )
+    for _, happens in sorted(events, key=lambda event: event[0]):
+        happens()
+    session.finish()
+    return session, true, motion
+
+
+def error(chain, true, motion):
+    """Return the RMS error [m] along the motion, at times in between."""
+    joints = motion(np.linspace(1.0, SECONDS - 1.0, 777))
+    apart = (chain.forward(joints) - true.forward(joints))[:, :3, 3]
+    return np.sqrt((apart**2).sum(axis=1).mean())
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('delay', [0.035, 0.2, -0.05])
+def test_a_delay_is_found_and_costs_nothing(delay, oriented):
+    session, true, motion = recorded(delay, oriented=oriented)
+    # by positions alone the speeds compared are those of two points, the flange and the target
+    assert session.delay.seconds == pytest.approx(delay, abs=5e-3 if oriented else 3e-2)
+    result = session.identify()
+    (found,) = (p for p in result.parameters if p.name == 'base.delay')
+    assert found.value == pytest.approx(delay, abs=5e-5)
+    assert result.accepted
+    known, *_ = recorded(0.0, oriented=oriented, delay=1e-12)
+    best = error(known.identify().chain, true, motion)
+    assert best < NOISE[0]
+    assert error(result.chain, true, motion) < 1.2 * best
+
+
+def test_the_delay_is_fitted_where_it_was_given_wrong():
+    """5 ms at up to 1 m/s are millimetres; the fit takes what is left."""
+    session, true, motion = recorded(0.030, delay=0.025)
+    assert session.delay is None
+    result = session.identify()
+    (found,) = (p for p in result.parameters if p.name == 'base.delay')
+    assert found.value == pytest.approx(0.030, abs=1e-4)
+    assert error(result.chain, true, motion) < NOISE[0]
+
+
+def test_without_motion_there_is_no_delay():
+    still, *_ = recorded(0.1, seconds=10.0, motion=stops(np.array([[0, -1.2, 1.2, -1, 1, 0.0]])))
+    assert still.delay is None
+    account = still.account()
+    assert account.samples > 400
+    assert account.waiting == 0
+
+
+@pytest.mark.parametrize(
+    ('lag', 'settings', 'said'),
+    [
+        (0.09, {}, None),  # within settle
+        (0.15, {}, '0.150 s later .* set delay to 0.150'),
+        (0.15, {'settle': 0.2}, None),
+        (0.15, {'delay': 0.15}, None),
+        (-0.01, {}, None),
+        (-0.09, {}, '0.090 s earlier .* set delay to -0.090'),  # nothing settles as it leaves
+        (-0.09, {'delay': -0.09}, None),
+    ],
+)
+def test_stops_spoilt_by_a_delay_are_told(lag, settings, said):
+    """Where nothing is told the mean of a stop is as good as without a delay, or nearly."""
+    motion = stops(UR10E.random_joints(25, np.random.default_rng(1)) * 0.5, 0.5, 0.5)
+    session, true, _ = recorded(lag, motion=motion, seconds=24.0, mode='dwell', **settings)
+    assert session.delay.seconds == pytest.approx(lag, abs=5e-3)
+    if said:
+        (warning,) = session.warnings
+        assert re.search(said.replace('0.150', '0.1[45].').replace('0.090', '0.0[89].'), warning)
+        assert f'set delay to {session.delay.seconds:.3f}' in warning
+        assert f'stamps disagree: set delay to {session.delay.seconds:.3f}' in session.status()
+        return
+    assert session.warnings == ()
+    assert len(session.samples) >= 23
+    joints = np.array([each.joints for each in session.samples])
+    found = np.array([each.position for each in session.samples])
+    errors = found - true.forward(joints)[:, :3, 3]
+    expected = NOISE[0] / np.sqrt(np.mean([each.count for each in session.samples]))
+    early = lag < settings.get('delay', 0.0)  # the first of the motion is no spike yet
+    assert np.sqrt((errors**2).mean()) < (0.5 * NOISE[0] if early else 1.3 * expected)
+
+
+def speeds(delay, seconds, rng, motion):
+    joint_times, times = np.arange(0.0, seconds, 0.01), np.arange(0.0, seconds, 0.02)
+    seen = measure(faulty(UR10E, Cell(), rng), motion(times), rng, *NOISE)
+    joints = motion(joint_times)
+    return (
+        *(UR10E, stamps(joint_times), joints, stamps(times + delay)),
+        *(seen.positions, seen.rotations),
+    )
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.9, -0.9])
+def test_find_delay_looks_up_to_a_second_to_both_sides(rng, delay):
+    _, motion, _ = true_cell(3)
+    found = find_delay(*speeds(delay, 30.0, rng, motion))
+    assert found.seconds == pytest.approx(delay, abs=3e-3)
+    assert found.correlation > 0.95
+
+
+def test_find_delay_names_none_where_none_shows(rng):
+    _, motion, _ = true_cell(3)
+    _, other, _ = true_cell(4)
+    assert find_delay(*speeds(1.5, 30.0, rng, motion)) is None  # further than it looks
+    assert find_delay(*speeds(0.0, LEAST_MOTION - 0.5, rng, motion)) is None
+    arguments = list(speeds(0.0, 30.0, rng, motion))
+    arguments[2] = other((arguments[1] - START) * 1e-9)
+    assert find_delay(*arguments) is None  # another arm
+    nothing = [UR10E, *(each[:0] for each in arguments[1:])]
+    assert find_delay(*nothing) is None
+
+
+def test_find_delay_goes_by_positions_where_there_are_no_orientations(rng):
+    _, motion, _ = true_cell(3)
+    *arguments, _ = speeds(0.123, 30.0, rng, motion)
+    assert find_delay(*arguments, None).seconds == pytest.approx(0.123, abs=3e-2)
+
+
+def test_a_far_stamp_costs_no_time_and_no_memory(rng, monkeypatch):
+    """Of one in both streams the speeds would be looked at every 5 ms up to it."""
+    _, motion, _ = true_cell(3)
+    chain, *arrays = speeds(0.1, 30.0, rng, motion)
+    looked_at = []
+    arange = np.arange
+
+    def counting(*arguments):
+        found = arange(*arguments)
+        looked_at.append(len(found))
+        return found
+
+    for k in (0, 2):
+        arrays[k] = np.append(arrays[k], START + 10_000_000 * 10**9)
+    for k in (1, 3, 4):
+        arrays[k] = np.concatenate([arrays[k], arrays[k][:1]])
+    monkeypatch.setattr(np, 'arange', counting)
+    assert find_delay(chain, *arrays) is None
+    assert looked_at
+    assert max(looked_at) <= 100_000

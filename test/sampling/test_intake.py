@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Messages taken by the batch, as if each were taken by itself."""
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros.apply.simulation import Cell, drive, faulty, measure
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import to_quat
+from calib_ros.sampling.intake import Stream, feed
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import Source
+from calib_ros.settings import Settings
+
+ARM = load_chain('ur10e')
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = STORE.types
+POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'
+JOINTS = Stream('joints', JOINT_STATE)
+GRIPPER = Stream('gripper', JOINT_STATE)
+TRACKER = Stream('tracker', POSE, Source('tracker', POSE))
+CAMERA = Stream('camera', POINT, Source('camera', POINT, device='camera'))
+START = 1_700_000_000_000_000_000
+RARE = 0.002
+
+
+def header(stamp_ns, frame_id=''):
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
+    return TYPES['std_msgs/msg/Header'](time, frame_id)
+
+
+def joints(stream, stamp_ns, names, values):
+    none = np.zeros(0)
+    message = TYPES[JOINT_STATE](header(stamp_ns), list(names), np.array(values), none, none)
+    return stream, bytes(STORE.serialize_cdr(message, JOINT_STATE))
+
+
+def pose(stamp_ns, position, quat, frame_id='world'):
+    point = TYPES['geometry_msgs/msg/Point'](*position)
+    turn = TYPES['geometry_msgs/msg/Quaternion'](*quat)
+    message = TYPES[POSE](header(stamp_ns, frame_id), TYPES['geometry_msgs/msg/Pose'](point, turn))
+    return TRACKER, bytes(STORE.serialize_cdr(message, POSE))
+
+
+def point(stamp_ns, position):
+    message = TYPES[POINT](header(stamp_ns, 'lens'), TYPES['geometry_msgs/msg/Point'](*position))
+    return CAMERA, bytes(STORE.serialize_cdr(message, POINT))
+
+
+def shift(rng, stops=14):
+    """Return messages of a shift with what may go wrong, in the order in which they come."""
+    cell = Cell(joint_rate=100.0, move=0.7, dwell=0.6)
+    true = faulty(ARM, Cell(), rng)
+    stamps, values, _ = drive(ARM.random_joints(stops, rng), cell, START)
+    seen = measure(true, values, rng, 5e-5, 2e-4)
+    quats = to_quat(seen.rotations)
+    found = []
+
+    def stray(stamp_ns):
+        return stamp_ns + (int(rng.choice([-(10**13), -(10**10), 10**10, 10**13])))
+
+    def come(stamp_ns, message):
+        late = rng.exponential(0.05) + (rng.random() < 0.02) * rng.uniform(0.0, 3.0)
+        found.append((stamp_ns * 1e-9 + late, message))
+
+    for k, stamp in enumerate(stamps.tolist()):
+        row = values[k].copy()
+        row[2] = np.nan if rng.random() < RARE else row[2]
+        given = 0 if rng.random() < RARE else stamp
+        given = stray(given) if rng.random() < RARE else given
+        order = rng.permutation(6) if rng.random() < RARE else np.arange(6)
+        come(stamp, joints(JOINTS, given, [ARM.joint_names[i] for i in order], row[order]))
+        if k % 3 == 0:
+            come(stamp, joints(GRIPPER, stamp, ['finger'], [0.1]))
+        frame_id = 'elsewhere' if rng.random() < RARE else 'world'
+        place = seen.positions[k] * (np.nan if rng.random() < RARE else 1.0)
+        given = stray(stamp) if rng.random() < RARE else stamp
+        come(stamp, pose(given + 300_000, place, quats[k], frame_id))
+        if k % 2 == 0:
+            come(stamp, point(stamp, seen.positions[k]))
+    found.sort(key=lambda item: item[0])
+    return [message for _, message in found]
+
+
+def outcome(session):
+    """Return all that a session has made of its messages, as plain values."""
+    account = session.account()
+    samples = [
+        (s.stamp_ns, s.device, s.count, s.joints.tolist(), s.approach.tolist(), s.spread)
+        for s in session.samples
+    ]
+    stamp_ns, values = session.latest or (0, ())
+    return account, samples, stamp_ns, list(values), session.delay, session.status()
+
+
+@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
+    rng = np.random.default_rng(seed)
+    if seed == 4:  # the first stream that comes when none is in use takes the only place
+        monkeypatch.setattr('calib_ros.sampling.collector.MOST_STREAMS', 1)
+    first, second = shift(rng), shift(rng)
+    # The clock jumps back when the recording begins again.
+    messages = first + (second if seed % 2 else [])
+    limits = {'joint_buffer': 150, 'pose_buffer': 40} if seed % 3 == 0 else {}
+    settings = Settings(mode=mode, frame_id='' if seed % 3 == 1 else 'world', **limits)
+    one, many = CalibrationSession(ARM, settings), CalibrationSession(ARM, settings)
+    begin = 0
+    while begin < len(messages):
+        end = begin + int(rng.choice([1, 10, 100, 400, 3000]))
+        one.recording = many.recording = bool(rng.random() < 0.8)
+        assert feed(many, messages[begin:end], STORE.deserialize_cdr) == []
+        for stream, data in messages[begin:end]:
+            message = STORE.deserialize_cdr(data, stream.type)
+            if stream.source is None:
+                one.take_joints(message)
+            else:
+                one.take(stream.source, stream.type, message)
+        assert outcome(one) == outcome(many)
+        begin = end
+    one.finish()
+    many.finish()
+    assert outcome(one) == outcome(many)
+    assert one.samples
+
+
+@pytest.mark.parametrize('off', [10_000, 10_000_000])
+def test_two_stray_stamps_in_a_batch_cost_two_messages(rng, off):
+    stamps, values, _ = drive(ARM.random_joints(10, rng), Cell(joint_rate=100.0), START)
+    seen = measure(ARM, values, rng, 5e-5, 2e-4)
+    quats = to_quat(seen.rotations)
+    sane = []
+    for k, stamp in enumerate(stamps.tolist()):
+        sane.append(joints(JOINTS, stamp, ARM.joint_names, values[k]))
+        sane.append(pose(stamp, seen.positions[k], quats[k]))
+    far = int(stamps[len(stamps) // 2]) + off * 1_000_000_000
+    stray = [joints(JOINTS, far, ARM.joint_names, values[0]), pose(far, np.zeros(3), quats[0])]
+    half = len(sane) // 2
+    sessions = CalibrationSession(ARM), CalibrationSession(ARM)
+    for session, messages in zip(
+        sessions, (sane, [*sane[:half], *stray, *sane[half:]]), strict=True
+    ):
+        assert feed(session, messages, STORE.deserialize_cdr) == []
+        session.finish()
+    expected, found = map(outcome, sessions)
+    assert found[1:] == expected[1:]
+    cause = 'stamp far from those before and after'
+    more = {f'joints: {cause}': 1, f'poses: {cause}': 1}
+    assert found[0].dropped == expected[0].dropped | more
+    assert found[0].samples == 10
+
+
+def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
+    monkeypatch.setattr('calib_ros.sampling.collector.MOST_STREAMS', 1)
+    quat = [0.0, 0.0, 0.0, 1.0]
+    messages = [pose(START, [np.nan, 0.0, 0.0], quat)]
+    for k in range(1, 5):
+        messages += [point(START + k, np.zeros(3)), pose(START + k, np.zeros(3), quat)]
+    session = CalibrationSession(ARM)
+    assert feed(session, messages, STORE.deserialize_cdr) == []
+    assert session.account().waiting == 4
+    assert [key.device for key in session._collector._waiting] == ['camera']
+
+
+def test_a_damaged_message_is_told_and_the_others_are_taken():
+    stamps = [START + k * 10_000_000 for k in range(20)]
+    messages = [joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)) for stamp in stamps]
+    messages[7] = (JOINTS, messages[7][1][:40])
+    session = CalibrationSession(ARM)
+    (problem,) = feed(session, messages, STORE.deserialize_cdr)
+    assert problem.startswith('a message on joints cannot be decoded')
+    assert session.received['joints'] == 19
+
+
+@pytest.mark.parametrize('value', [1.79e308, 3.4e38, -1e7])
+@pytest.mark.parametrize('together', [True, False])
+def test_numbers_that_stand_for_nothing_are_dropped(value, together):
+    """Some devices send the largest number that there is while they see no target."""
+    messages = []
+    for k in range(600):
+        stamp = START + k * 10_000_000
+        lost = k % 5 == 0
+        values = np.full(6, value if k % 50 == 1 else 0.3 * np.sin(0.01 * k))
+        messages.append(joints(JOINTS, stamp, ARM.joint_names, values))
+        place = (0.5, value if lost else 0.4, 0.1)
+        messages.append(pose(stamp + 300_000, place, (0.0, 0.0, 0.0, 1.0)))
+    session = CalibrationSession(ARM, Settings(mode='continuous', delay=1e-3))
+    for begin in range(0, 1200, 1200 if together else 1):
+        part = messages[begin : begin + (1200 if together else 1)]
+        assert feed(session, part, STORE.deserialize_cdr) == []
+    session.finish()
+    dropped = session.account().dropped
+    assert dropped['poses: position beyond 1000 km'] == 120
+    assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 12
+    assert 'samples' in session.status()
+
+
+def test_streams_of_the_same_joints_share_a_buffer():
+    """Two drivers name the joints in another order: their samples are kept together."""
+    order = list(reversed(ARM.joint_names))
+    messages = [
+        joints(stream, START + k * 1_000_000, names, np.zeros(6))
+        for k in range(200)
+        for stream, names in ((JOINTS, ARM.joint_names), (GRIPPER, order))
+    ]
+    session = CalibrationSession(ARM, Settings(joint_buffer=150))
+    assert feed(session, messages[:2], STORE.deserialize_cdr) == []
+    assert feed(session, messages[2:], STORE.deserialize_cdr) == []
+    assert session.received['joints'] == 400
+
+
+def test_an_error_in_a_batch_costs_no_other_message():
+    stamps = [START + k * 10_000_000 for k in range(2000)]
+    messages = [
+        message
+        for stamp in stamps
+        for message in (
+            joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)),
+            pose(stamp, (0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)),
+        )
+    ]
+
+    def fail(sample):
+        raise RuntimeError('no room for a sample')
+
+    session = CalibrationSession(ARM, on_sample=fail)
+    (problem,) = feed(session, messages, STORE.deserialize_cdr)
+    assert 'no room for a sample' in problem
+    assert session.received == {'joints': 2000, 'poses': 2000}

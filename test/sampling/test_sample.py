@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib_ros.sampling.sample import Frames, Sample, collect
+
+SIGMAS = (1e-4, 3e-4)
+PLAIN = Sample(1, np.zeros(2), position=np.ones(3), rotation=np.eye(3))
+names = st.sampled_from(['', 'A', 'B', 'a.b', 'a-b', '2', 'A_B'])
+labels = st.lists(st.tuples(names, names, names, st.booleans()), max_size=12)
+
+
+def labelled(session, device, target, eye):
+    return replace(PLAIN, session=session, device=device, target=target, eye_in_hand=eye)
+
+
+def test_the_first_that_comes_needs_no_name():
+    frames = Frames()
+    assert frames.of(labelled('s', 'tracker', 'ball', False)) == ('base', 'tool')
+    assert frames.of(labelled('s', 'tracker', 'plate', False)) == ('base', 'tool_plate')
+    assert frames.of(labelled('s', 'other', 'ball', False)) == ('base_other', 'tool')
+    assert frames.of(labelled('t', 'tracker', 'ball', False)) == ('base_t', 'tool_t')
+    assert frames.of(labelled('t', 'other', 'ball', False)) == ('base_t_other', 'tool_t')
+    assert frames.of(labelled('s', 'camera', 'board', True)) == ('base_board', 'tool_camera')
+    assert frames.of(labelled('s', '', '', False)) == ('base_4', 'tool_4')
+
+
+@given(labels)
+def test_frames_are_shared_by_those_that_share_them_and_by_no_others(many):
+    """Whatever the names: a session may be called like a device."""
+    frames = Frames()
+    owners = {}
+    for session, device, target, eye in many:
+        base, tool = frames.of(labelled(session, device, target, eye))
+        ends = (target, device) if eye else (device, target)
+        for side, name, end in zip(('base', 'tool'), (base, tool), ends, strict=True):
+            assert name.startswith(side)
+            assert '.' not in name
+            assert owners.setdefault(name, (session, eye, end)) == (session, eye, end)
+    assert len(owners) == len({(name[:4], *owner) for name, owner in owners.items()})
+
+
+@given(labels)
+def test_every_sample_is_in_one_set(many):
+    samples = [
+        replace(labelled(*label), stamp_ns=k + 1, validation=k % 3 == 0)
+        for k, label in enumerate(many)
+    ]
+    fitted, held_out = collect(samples, SIGMAS)
+    found = [int(stamp) for each in (*fitted, *held_out) for stamp in each.stamps_ns]
+    assert sorted(found) == [sample.stamp_ns for sample in samples]
+    judging = {int(stamp) for each in held_out for stamp in each.stamps_ns}
+    assert judging == {sample.stamp_ns for sample in samples if sample.validation}
+
+
+def test_what_only_some_samples_have_is_zero_or_blank():
+    """As after a restart in another mode: samples of stops among those of a motion."""
+    covariance = np.eye(6)
+    speed = np.ones(2)
+    mixed = [
+        replace(PLAIN, covariance=covariance, velocity=speed, approach=speed),
+        replace(PLAIN, stamp_ns=2, rotation=None, approach=-speed),
+    ]
+    ((both,), _) = collect(mixed, SIGMAS)
+    assert both.oriented.tolist() == [True, False]
+    np.testing.assert_array_equal(both.covariance[0], covariance)
+    assert np.isnan(both.covariance[1]).all()
+    np.testing.assert_array_equal(both.velocity, [speed, 0.0 * speed])
+    assert both.acceleration is None
+    np.testing.assert_array_equal(both.approach, [speed, -speed])

@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.sampling.messages import DECODERS
+from calib_ros.sampling.sources import DISTANCE, STANDARD, Source, parse_source, parse_sources
+
+
+def test_a_topic_alone_is_a_source():
+    assert parse_source('/tracker/pose') == Source('/tracker/pose')
+
+
+def test_keys_in_any_order():
+    source = parse_source(
+        '/cam  target=board eye_in_hand=true type=PoseStamped device=left validation=true'
+    )
+    kind = 'geometry_msgs/msg/PoseStamped'
+    assert source == Source('/cam', kind, 'left', 'board', eye_in_hand=True, validation=True)
+
+
+@pytest.mark.parametrize('kind', sorted(DECODERS))
+def test_a_short_type_will_do(kind):
+    short = kind.rpartition('/')[2]
+    assert parse_source(f'/x type={short}') == parse_source(f'/x type={kind}')
+    assert parse_source(f'/x type={kind}').type == kind
+
+
+@pytest.mark.parametrize(
+    ('text', 'judges'),
+    [
+        ('validation_pose', True),
+        ('/cell/validation_2', True),
+        ('/validation_cell/pose', False),
+        ('/pose_validation_', False),
+        ('/validation_pose validation=false', False),
+        ('/pose validation=true', True),
+    ],
+)
+def test_the_last_name_of_the_topic_tells_what_judges_unless_it_is_said(text, judges):
+    assert parse_source(text).validation is judges
+
+
+def test_a_distance_has_an_origin_of_its_own():
+    assert parse_source('/wire type=Range').device == DISTANCE
+    assert parse_source('/wire type=Range device=left').device == 'left'
+
+
+@pytest.mark.parametrize('text', ['', '   ', 'device=left', 'type=PoseStamped /pose'])
+def test_a_source_begins_with_its_topic(text):
+    with pytest.raises(ConfigError, match='must begin with its topic'):
+        parse_source(text)
+
+
+@pytest.mark.parametrize('text', ['/x devise=left', '/x left', '/x =left'])
+def test_an_unknown_key_is_named(text):
+    with pytest.raises(UnknownNameError, match='key of source'):
+        parse_source(text)
+
+
+def test_a_misspelt_key_or_type_is_suggested():
+    with pytest.raises(UnknownNameError, match='did you mean "device"'):
+        parse_source('/x devise=left')
+    with pytest.raises(UnknownNameError, match='type of source "/x"'):
+        parse_source('/x type=Pose')
+
+
+@pytest.mark.parametrize('key', ['eye_in_hand', 'validation'])
+@pytest.mark.parametrize('value', ['', '1', 'True', 'yes'])
+def test_a_flag_is_true_or_false(key, value):
+    with pytest.raises(ConfigError, match=f'{key} .* must be true or false'):
+        parse_source(f'/x {key}={value}')
+
+
+@pytest.mark.parametrize('key', ['device', 'target'])
+@pytest.mark.parametrize('name', ['a.b', 'a,b'])
+def test_names_that_parameters_could_not_have_are_refused(key, name):
+    with pytest.raises(ConfigError, match=r'without \. and ,'):
+        parse_source(f'/x {key}={name}')
+
+
+def test_a_topic_is_named_once():
+    assert parse_sources(['/a', '/b']) == (Source('/a'), Source('/b'))
+    with pytest.raises(ConfigError, match='"/a" is named twice'):
+        parse_sources(['/a', '/b', '/a device=left'])
+
+
+def test_the_standard_sources_can_be_written_down():
+    """What the node listens to by itself is what these lines say."""
+    for source in STANDARD:
+        assert parse_source(f'{source.topic} type={source.type}') == source

@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Stray stamps told from a clock that was moved."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from streams import START, TRACKER, S, joint_state, pose, stops
+
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.strays import JOINTS, JUMP, POSES, Gate
+from calib_ros.settings import Settings
+
+ARM = load_chain('ur5e')
+
+
+def through(messages, far=1.0):
+    """Return what passes of messages (kind, time [s]), in its order, and the gate."""
+    gate, passed = Gate(far), []
+    for message in messages:
+        kind, time = message
+        if gate.passes(kind, round(time * S)):
+            passed.append(message)
+        else:
+            passed += [each.item for each in gate.admit(kind, round(time * S), message)[0]]
+    return passed, gate
+
+
+def both(times):
+    return [(kind, time) for time in times for kind in (JOINTS, POSES)]
+
+
+def count(gate):
+    return gate.held(JOINTS) + gate.held(POSES) + sum(gate.dropped.values())
+
+
+@pytest.mark.parametrize('off', [-1e7, -1e4, -5.0, 5.0, 1e4, 1e7])
+def test_a_stray_stamp_of_each_is_dropped(off):
+    sane = both(np.arange(100.0, 110.0, 0.1))
+    stray = [(JOINTS, 105.0 + off), (POSES, 105.0 + off)]
+    passed, gate = through([*sane[:100], *stray, *sane[100:]])
+    assert passed == sane
+    assert gate.dropped == {JOINTS: 1, POSES: 1}
+
+
+@pytest.mark.parametrize('off', [-1e7, -30.0, 30.0, 1e7])
+@pytest.mark.parametrize('rate', [2.0, 10.0, 1000.0])
+def test_a_clock_that_was_moved_is_followed(off, rate):
+    before = both(100.0 + np.arange(50) * 0.1)
+    after = both(100.0 + off + np.arange(50) / rate)
+    passed, gate = through([*before, *after])
+    assert passed + [each.item for each in gate.release()] == before + after
+    assert not gate.dropped
+
+
+def test_a_stray_stamp_among_those_that_were_moved_holds_nothing_up():
+    before, after = both(np.arange(100.0, 105.0, 0.1)), both(np.arange(500.0, 510.0, 0.1))
+    passed, gate = through([*before, (JOINTS, 1e6), *after])
+    assert [each for each in passed if each != (JOINTS, 1e6)] == before + after
+    assert gate.held(JOINTS) == gate.held(POSES) == 0
+
+
+def test_one_stop_in_minutes_is_measured_at_once():
+    """What is far from its own neighbours may be near to those of the other stream."""
+    joints = [(JOINTS, time) for time in np.arange(0.0, 900.0, 0.5)]
+    poses = [(POSES, time) for time in (10.0, 310.0, 610.0, 890.0)]
+    given = sorted([*joints, *poses], key=lambda each: each[1])
+    assert through(given)[0] == given
+
+
+def test_measurements_may_come_long_before_their_joint_states():
+    poses = [(POSES, time) for time in (0.0, 5.0, 10.0)]
+    joints = [(JOINTS, time) for time in np.arange(0.0, 12.0, 0.1)]
+    passed, gate = through([*poses, *joints])
+    assert sorted(passed) == sorted([*poses, *joints])
+    assert not gate.dropped
+    for message in poses[1:]:  # each as soon as the joints are near
+        following = passed[passed.index(message) + 1 :]
+        assert min(time for _, time in following) == pytest.approx(message[1] - 0.9, abs=0.11)
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([JOINTS, POSES]), st.sampled_from([0.0, 0.5, 30.0, 31.0, -70.0, 1e6])
+        ),
+        max_size=200,
+    )
+)
+def test_every_message_passes_is_held_back_or_is_counted(messages):
+    passed, gate = through(messages)
+    assert len(passed) + count(gate) == len(messages)
+    assert max(gate.held(JOINTS), gate.held(POSES)) < JUMP
+
+
+@given(
+    st.lists(st.sampled_from([0.01, 0.9, 1.1, -0.9, -1.1, 50.0]), max_size=60),
+    st.lists(st.integers(0, 60), max_size=3),
+)
+def test_what_is_quiet_passes(steps, holding):
+    """Messages that are taken by the batch would pass one by one, and free nothing."""
+    gate = Gate(1.0)
+    for kind in (JOINTS, POSES):
+        gate.passes(kind, 100 * S)
+    for where in holding:
+        gate.admit(POSES, (200 + where) * S, None)
+    held = gate.held(POSES)
+    times = 100 * S + np.cumsum(np.array([round(step * S) for step in steps], dtype=np.int64))
+    quiet = gate.quiet(JOINTS, times)
+    until = len(quiet) if quiet.all() else int(np.argmin(quiet))
+    for time in times[:until].tolist():
+        passed = gate.passes(JOINTS, time) or len(gate.admit(JOINTS, time, None)[0]) == 1
+        assert passed
+    assert gate.held(POSES) == held
+
+
+# In a session
+
+
+def messages(rng, count=12):
+    """Return the messages of a shift, of 20 Hz and 100 Hz, in the order of their stamps."""
+    configurations = ARM.random_joints(count, rng)
+    times = np.arange(0.0, 1.6 * count, 0.01)
+    joints = stops(configurations, move=0.8, stand=0.8)(times)
+    where = ARM.forward(joints)
+    found = []
+    for k, time in enumerate(times):
+        stamp_ns = START + round(time * 1e9)
+        found.append(joint_state(stamp_ns, ARM.joint_names, joints[k].tolist()))
+        if k % 5 == 0:
+            found.append(pose(stamp_ns, where[k, :3, 3], where[k, :3, :3]))
+    return found
+
+
+def session_of(given, **settings):
+    session = CalibrationSession(ARM, Settings(**settings))
+    for message in given:
+        if hasattr(message, 'position'):
+            session.take_joints(message)
+        else:
+            session.take(TRACKER, 'geometry_msgs/msg/PoseStamped', message)
+    session.finish()
+    return session
+
+
+def shifted(message, seconds):
+    """Return a message with another stamp."""
+    copy = type(message)(**vars(message))
+    copy.header = type(message.header)(**vars(message.header))
+    copy.header.stamp = type(message.header.stamp)(**vars(message.header.stamp))
+    copy.header.stamp.sec += seconds
+    return copy
+
+
+def assert_same_samples(first, second):
+    assert len(first.samples) == len(second.samples) > 5
+    for one, other in zip(first.samples, second.samples, strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        assert one.count == other.count
+        np.testing.assert_array_equal(one.joints, other.joints)
+        np.testing.assert_array_equal(one.position, other.position)
+
+
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+@pytest.mark.parametrize('off', [-10_000, 3, 10_000, 10_000_000])
+def test_two_stray_stamps_cost_two_messages(rng, mode, off):
+    given = messages(rng)
+    stray = [shifted(given[k], off) for k in (960, 961)]
+    expected = session_of(given, mode=mode)
+    found = session_of([*given[:962], *stray, *given[962:]], mode=mode)
+    assert_same_samples(expected, found)
+    cause = 'stamp far from those before and after'
+    kinds = {f'{"joints" if hasattr(each, "position") else "poses"}: {cause}' for each in stray}
+    assert {key for key in found.account().dropped if cause in key} == kinds
+    others = {key: n for key, n in found.account().dropped.items() if cause not in key}
+    assert others == expected.account().dropped
+    assert found.account().notes == expected.account().notes
+    assert found.delay == expected.delay
+
+
+@pytest.mark.parametrize('off', [10_000, -10_000])
+def test_the_first_messages_may_be_the_stray_ones(rng, off):
+    given = messages(rng)
+    stray = [shifted(message, off) for message in given[:2]]
+    assert_same_samples(session_of(given), session_of([*stray, *given]))
+
+
+@pytest.mark.parametrize('off', [-10_000, 10_000])
+def test_a_recording_that_is_played_again_later_or_earlier_gives_its_samples_twice(rng, off):
+    given = messages(rng)
+    again = [shifted(message, off) for message in given]
+    alone, found = session_of(given), session_of([*given, *again])
+    stamps = [sample.stamp_ns for sample in alone.samples]
+    later = [stamp + off * S for stamp in stamps]
+    assert [sample.stamp_ns for sample in found.samples] == stamps + later
+    assert not any('far from' in cause for cause in found.account().dropped)
+
+
+def test_what_is_held_back_is_in_the_account(rng):
+    given = messages(rng)[:200]
+    session = CalibrationSession(ARM, Settings(lateness=0.5))
+    for message in given:
+        if hasattr(message, 'position'):
+            session.take_joints(message)
+    session.take(TRACKER, 'geometry_msgs/msg/PoseStamped', shifted(given[1], 500))
+    account = session.account()
+    assert (account.poses, account.waiting) == (1, 1)
+    assert account.dropped == {}

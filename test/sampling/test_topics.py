@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which topics of a recording are read, where it holds more than measurements."""
+
+import numpy as np
+import pytest
+from recorded import (
+    MS,
+    STORAGES,
+    TYPES,
+    joint_state,
+    observations_of,
+    pose_stamped,
+    record,
+    session_of,
+    standing,
+    text_message,
+)
+
+from calib_ros.errors import InputError
+
+storages = pytest.mark.parametrize('storage', sorted(STORAGES))
+
+
+def table():
+    layout = TYPES['std_msgs/msg/MultiArrayLayout']([], 0)
+    return TYPES['std_msgs/msg/Float64MultiArray'](layout, np.zeros(15))
+
+
+def outputs(node='/calibration_node'):
+    """Return what a node publishes, as `ros2 bag record -a` records it."""
+    poses = [(f'{node}/corrected_pose', pose_stamped(k * 100 * MS, (9, 9, 9))) for k in range(9)]
+    targets = [
+        (f'{node}/next_pose', joint_state(k * 300 * MS + 5 * MS, (9, 9, 9))) for k in (1, 2)
+    ]
+    return [
+        (f'{node}/status', text_message('3 samples')),
+        (f'{node}/calibration', text_message('name: arm')),
+        (f'{node}/dh_parameters', table()),
+        *poses,
+        *targets,
+    ]
+
+
+def measured():
+    return standing([pose_stamped((100 * k + 5) * MS, (k, 2, 3)) for k in range(1, 9)], '/tracker')
+
+
+@storages
+@pytest.mark.parametrize('node', ['/calibration_node', '/cell_1/left/calibration', '/c'])
+def test_what_a_node_publishes_is_neither_measured_nor_a_joint_state(tmp_path, storage, node):
+    plain = observations_of(record(tmp_path / 'plain', measured(), storage))
+    path = record(tmp_path / 'all', [*outputs(node), *measured()], storage)
+    mixed = observations_of(path)
+    assert mixed.positions.tolist() == plain.positions.tolist()
+    assert mixed.joints.tolist() == plain.joints.tolist()
+    assert len(mixed) == 8
+
+
+def test_two_nodes_are_both_left_out(tmp_path):
+    events = [*outputs('/left/calibration_node'), *outputs('/right/calib'), *measured()]
+    assert len(observations_of(record(tmp_path / 'bag', events))) == 8
+
+
+def test_topics_of_another_node_with_a_status_are_read(tmp_path):
+    events = standing([pose_stamped(105 * MS)], '/tracker/pose')
+    events += [('/tracker/status', text_message()), ('/tracker/calibration', text_message())]
+    assert len(observations_of(record(tmp_path / 'bag', events))) == 1
+
+
+def test_outputs_that_are_all_there_is_are_told(tmp_path):
+    events = [each for each in outputs() if 'corrected' in each[0] or 'next' not in each[0]]
+    path = record(tmp_path / 'bag', [*events, *standing([])])
+    with pytest.raises(InputError, match='has no pose topic') as caught:
+        session_of(path)
+    assert '/calibration_node/corrected_pose (own output)' in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    'settings',
+    [
+        {'sources': ('/calibration_node/corrected_pose',)},
+        {'joint_topics': ('/calibration_node/next_pose',)},
+    ],
+)
+def test_outputs_are_refused_by_name_too(tmp_path, settings):
+    path = record(tmp_path / 'bag', [*outputs(), *measured()])
+    with pytest.raises(InputError, match='is published by the calibration node itself'):
+        session_of(path, **settings)
+
+
+def desired(offset, topic='/controller/desired', names=('c', 'b', 'a')):
+    """Return joint states of the arm beside those of `standing`, away from them by an offset."""
+    values = np.array([0.3, 0.2, 0.1])[: len(names)] + offset
+    return [(topic, joint_state((10 * k + 5) * MS, values, names)) for k in range(1, 100)]
+
+
+@storages
+def test_a_second_topic_of_the_same_joints_is_named(tmp_path, storage):
+    path = record(tmp_path / 'bag', [*measured(), *desired(0.25)], storage)
+    with pytest.raises(InputError) as caught:
+        session_of(path)
+    text = str(caught.value)
+    assert 'joints a, b, c come on several topics' in text
+    assert '/controller/desired and /joint_states differ by up to 0.25 ' in text
+    assert '--joint-topics' in text
+    for topic, expected in (('/joint_states', 0.1), ('/controller/desired', 0.35)):
+        joints = observations_of(path, joint_topics=(topic,)).joints
+        np.testing.assert_allclose(joints[:, 0], expected, atol=1e-12)
+    both = observations_of(path, joint_topics=('/joint_states', '/controller/desired'))
+    assert len(both) == 8
+
+
+def test_a_copy_of_the_joint_states_is_named_as_well(tmp_path):
+    path = record(tmp_path / 'bag', [*measured(), *desired(0.0)])
+    with pytest.raises(InputError, match='/controller/desired and /joint_states are the same'):
+        session_of(path)
+
+
+def test_joints_that_come_twice_in_part_are_named(tmp_path):
+    path = record(tmp_path / 'bag', [*measured(), *desired(0.1, names=('c',))])
+    with pytest.raises(InputError, match='joints c come on several topics'):
+        session_of(path)
+
+
+def test_topics_that_never_overlap_in_time_are_named_without_a_difference(tmp_path):
+    later = [('/desired', joint_state((5000 + k) * MS, (9, 9, 9))) for k in range(5)]
+    path = record(tmp_path / 'bag', [*measured(), *later])
+    with pytest.raises(InputError, match='/desired and /joint_states never come at the same time'):
+        session_of(path)
+
+
+def test_a_gripper_is_no_second_arm(tmp_path):
+    gripper = [('/gripper', joint_state(k * 10 * MS, (0.5,), ('finger',))) for k in range(1, 100)]
+    assert len(observations_of(record(tmp_path / 'bag', [*measured(), *gripper]))) == 8
+
+
+def test_a_remapped_next_pose_is_named(tmp_path):
+    events = [*measured(), ('/goal', joint_state(205 * MS, (9, 9, 9)))]
+    with pytest.raises(InputError, match='/goal and /joint_states differ by up to'):
+        session_of(record(tmp_path / 'bag', events))
+
+
+def test_a_damaged_recording_is_held_to_the_same(tmp_path):
+    path = record(tmp_path / 'bag', [*outputs(), *measured(), *desired(0.25)])
+    (path / 'metadata.yaml').unlink()
+    (file,) = path.iterdir()
+    file.write_bytes(file.read_bytes()[:-400])
+    with pytest.raises(InputError, match='joints a, b, c come on several topics'):
+        session_of(path)
+    assert len(observations_of(path, joint_topics=('/joint_states',))) > 0

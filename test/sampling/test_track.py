@@ -1,0 +1,499 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib_ros.sampling.track import CAUSES, LAGS, MOVED, Rows, Track
+
+MS = 1_000_000
+MAX_GAP = 0.1
+BOTH = (0, 1)
+
+
+def track(revolute=(True, True), capacity=1000):
+    return Track(revolute, MAX_GAP, capacity)
+
+
+def filled(samples, columns=BOTH, **options):
+    """Return a track of samples (stamp [ms], values)."""
+    made = track(**options)
+    for ms, values in samples:
+        made.add(columns, round(ms * MS), np.array(values, dtype=float))
+    made.sort()
+    return made
+
+
+def at(made, *ms):
+    return made.at(np.array([round(each * MS) for each in ms], dtype=np.int64))
+
+
+def words(motion):
+    return [CAUSES[cause] for cause in motion.cause]
+
+
+# Interpolation
+
+
+def test_between_two_samples_values_are_interpolated():
+    motion = at(filled([(100, (0.0, 1.0)), (140, (0.4, 3.0))]), 110)
+    np.testing.assert_allclose(motion.joints, [[0.1, 1.5]], atol=1e-15)
+    np.testing.assert_allclose(motion.velocity, [[10.0, 50.0]], atol=1e-12)
+    assert words(motion) == ['']
+
+
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_a_cubic_motion_is_met_exactly(seed, even):
+    rng = np.random.default_rng(seed)
+    times = np.arange(40) * 0.01
+    if not even:
+        times = times + rng.uniform(-0.002, 0.002, len(times))
+    stamps = np.round(times * 1e9).astype(np.int64) + 10**9
+    cubic = [np.polynomial.Polynomial(rng.normal(size=4)) for _ in BOTH]
+
+    def values(stamps_ns, order=0):
+        seconds = (stamps_ns - 10**9) * 1e-9
+        return np.stack([(each.deriv(order) if order else each)(seconds) for each in cubic], 1)
+
+    made = track(revolute=(False, True))
+    for stamp_ns, row in zip(stamps.tolist(), values(stamps), strict=True):
+        made.add(BOTH, stamp_ns, row)
+    made.sort()
+    wanted = np.sort(rng.integers(stamps[1], stamps[-2], 200))
+    motion = made.at(wanted)
+    assert not motion.cause.any()
+    np.testing.assert_allclose(motion.joints, values(wanted), atol=1e-12)
+    np.testing.assert_allclose(motion.velocity, values(wanted, 1), atol=1e-9)
+    np.testing.assert_allclose(motion.acceleration, values(wanted, 2), atol=1e-6)
+
+
+def test_a_fast_motion_is_met_better_than_by_straight_lines():
+    """At 100 Hz, 1 rad and 1 Hz straight lines are off by 0.5 mrad."""
+    times = np.arange(200) * 10.0
+    made = filled([(ms, (np.sin(2e-3 * np.pi * ms), 0.0)) for ms in times])
+    between = np.arange(15.0, 1900.0, 10.0)
+    error = at(made, *between).joints[:, 0] - np.sin(2e-3 * np.pi * between)
+    assert np.abs(error).max() < 1e-6
+
+
+def test_a_cubic_does_not_reach_over_a_pause_in_the_samples():
+    """A joint that was at rest, a hole, and another rest: nothing beyond the two is made up."""
+    made = filled([(0, (0, 0)), (2, (0, 0)), (4, (0, 0)), (90, (1, 1)), (92, (1, 1))])
+    motion = at(made, *range(4, 91))
+    assert motion.joints.min() >= 0.0
+    assert motion.joints.max() <= 1.0
+
+
+def test_stamps_of_today_are_interpolated_to_the_nanosecond():
+    start = 1_717_171_717_000_000_001  # beyond what a float64 holds exactly
+    made = track()
+    for k in (0, 10):
+        made.add(BOTH, start + k, np.array([0.1 * k, 0.2 * k]))
+    made.sort()
+    np.testing.assert_allclose(made.at(np.array([start + 3])).joints, [[0.3, 0.6]], atol=1e-15)
+
+
+@pytest.mark.parametrize('hit', [100, 120, 140])
+def test_a_sample_at_the_very_stamp_is_taken_as_it_is(hit):
+    samples = {100: (0.1, 0.7), 120: (0.3, -0.3), 140: (0.9, 0.1)}
+    motion = at(filled(samples.items()), hit)
+    np.testing.assert_array_equal(motion.joints, [samples[hit]])
+    assert words(motion) == ['']
+
+
+def test_an_exact_hit_needs_no_neighbour_and_knows_no_gap():
+    assert words(at(filled([(100, (0.1, 0.2))]), 100)) == ['']
+    motion = at(filled([(100, (0.1, 0.2)), (900, (0.5, 0.6))]), 900)
+    np.testing.assert_array_equal(motion.joints, [(0.5, 0.6)])
+    assert words(motion) == ['']
+
+
+@pytest.mark.parametrize(('gap_ns', 'why'), [(100 * MS, ''), (100 * MS + 1, CAUSES[3])])
+def test_samples_further_apart_than_max_gap_are_not_joined(gap_ns, why):
+    made = track()
+    for stamp_ns in (200 * MS, 200 * MS + gap_ns):
+        made.add(BOTH, stamp_ns, np.zeros(2))
+    assert words(at(made, 201)) == [why]
+
+
+def test_nothing_is_extrapolated():
+    made = filled([(100, (0.0, 0.0)), (110, (0.0, 0.0))])
+    assert words(at(made, 99, 100, 105, 110, 111)) == [CAUSES[1], '', '', '', CAUSES[2]]
+    assert words(at(track(), 99)) == [CAUSES[1]]
+
+
+@pytest.mark.parametrize(('first', 'second'), [(3.1, -3.1), (-3.1, 3.1)])
+def test_only_revolute_joints_wrap_at_half_a_turn(first, second):
+    made = filled([(100, (first, first)), (104, (second, second))], revolute=(True, False))
+    motion = at(made, 101)
+    gap = 2.0 * (np.pi - 3.1)
+    assert motion.joints[0, 0] == pytest.approx(first + np.sign(first) * 0.25 * gap, abs=1e-12)
+    assert motion.joints[0, 1] == pytest.approx(0.5 * first, abs=1e-12)
+    assert motion.velocity[0, 0] == pytest.approx(np.sign(first) * gap / 4e-3)
+
+
+def test_a_joint_that_counts_turns_is_left_alone():
+    motion = at(filled([(100, (6.2, -9.0)), (104, (6.4, -9.4))]), 102)
+    np.testing.assert_allclose(motion.joints, [[6.3, -9.2]], atol=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_angles_within_one_turn_are_as_good_as_those_that_count(seed):
+    """Everything but the values themselves is the same, and those are by whole turns."""
+    rng = np.random.default_rng(seed)
+    count = 200
+    moving = np.repeat(rng.random(count // 20) < 0.5, 20)
+    path = np.cumsum(moving[:, np.newaxis] * rng.uniform(-0.2, 0.2, (count, 2)), axis=0) + np.pi
+    within = (path + np.pi) % (2.0 * np.pi) - np.pi
+    first, second = (
+        filled(enumerate(values.tolist()), revolute=(True, True)) for values in (path, within)
+    )
+    for made in (first, second):
+        made.release(30 * MS)
+    assert first.standing(1e-3, 0.008).tolist() == second.standing(1e-3, 0.008).tolist()
+    stamps = rng.uniform(35, count - 1, 50)
+    one, other = at(first, *stamps), at(second, *stamps)
+    turns = (one.joints - other.joints) / (2.0 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+    np.testing.assert_allclose(one.velocity, other.velocity, atol=1e-6)
+    np.testing.assert_array_equal(one.approach, other.approach)
+
+
+# Order of arrival
+
+
+# Few distinct stamps and values, so that equal stamps, hits and gaps are frequent.
+ticks = st.integers(1, 12).map(lambda k: 50 * k)
+numbers = st.sampled_from([-3.1, -1.0, 0.0, 0.5, 3.1])
+samples = st.lists(
+    st.one_of(
+        st.tuples(st.just((0, 1)), ticks, st.tuples(numbers, numbers)),
+        st.tuples(st.just((0,)), ticks, st.tuples(numbers)),
+        st.tuples(st.just((1,)), ticks, st.tuples(numbers)),
+    ),
+    max_size=40,
+)
+instants = st.lists(ticks | st.integers(1, 800), max_size=20)
+
+
+def of_parts(events, capacity=1000):
+    made = track(capacity=capacity)
+    for columns, ms, values in events:
+        made.add(columns, ms * MS, np.array(values))
+    return made
+
+
+@given(samples, instants, st.randoms(use_true_random=False))
+def test_the_order_of_arrival_does_not_matter(events, when, shuffle):
+    shuffled = list(events)
+    shuffle.shuffle(shuffled)
+    first, second = of_parts(events), of_parts(shuffled)
+    assert first.sort() == second.sort()
+    assert first.newest_ns == second.newest_ns
+    assert first.standing(0.1, 0.1).tolist() == second.standing(0.1, 0.1).tolist()
+    one, other = at(first, *when), at(second, *when)
+    np.testing.assert_array_equal(one.cause, other.cause)
+    good = one.cause == 0
+    for name in ('joints', 'velocity', 'acceleration', 'approach'):
+        np.testing.assert_array_equal(getattr(one, name)[good], getattr(other, name)[good])
+
+
+@given(samples, instants)
+def test_values_are_there_where_every_joint_is_bracketed(events, when):
+    """By a search through all samples of each publisher that names the joint."""
+    made = of_parts(events)
+    made.sort()
+
+    def bracketed(joint, ms):
+        for part in {columns for columns, *_ in events if joint in columns}:
+            known = [stamp for columns, stamp, _ in events if columns == part]
+            before = [stamp for stamp in known if stamp <= ms]
+            after = [stamp for stamp in known if stamp >= ms]
+            if before and after and min(after) - max(before) <= 1e3 * MAX_GAP:
+                return True
+        return False
+
+    found = at(made, *when).cause == 0
+    assert found.tolist() == [all(bracketed(j, ms) for j in BOTH) for ms in when]
+    stamps = np.array(when, dtype=np.int64) * MS
+    np.testing.assert_array_equal(made.causes(stamps), at(made, *when).cause)
+
+
+def test_of_equal_stamps_one_sample_is_kept_and_not_by_arrival():
+    both = [(100, (0.1, 0.4)), (100, (0.1, 0.3))]
+    for order in (1, -1):
+        made = track()
+        for ms, values in both[::order]:
+            made.add(BOTH, ms * MS, np.array(values))
+        assert made.sort() == 1
+        assert made.sort() == 0
+        np.testing.assert_array_equal(at(made, 100).joints, [(0.1, 0.3)])
+
+
+# Several publishers
+
+
+def test_publishers_of_parts_make_one_arm():
+    """Each is interpolated on its own, at its own rate and stamps."""
+    made = track((True, True, False))
+    for ms in range(0, 500, 5):
+        made.add((0, 2), ms * MS, np.array([1e-3 * ms, 1.0 - 1e-3 * ms]))
+    for ms in range(3, 500, 20):
+        made.add((1,), ms * MS, np.array([-2e-3 * ms]))
+    made.sort()
+    motion = at(made, 77, 201)
+    np.testing.assert_allclose(
+        motion.joints, [[0.077, -0.154, 0.923], [0.201, -0.402, 0.799]], atol=1e-12
+    )
+    np.testing.assert_allclose(motion.velocity, [[1.0, -2.0, -1.0]] * 2, atol=1e-9)
+    assert made.newest_ns == 483 * MS
+    assert made.missing == ()
+    assert words(at(made, 2, 484)) == [CAUSES[1], CAUSES[2]]
+
+
+def test_a_joint_that_nobody_names_is_missing():
+    made = filled([(0, (0.0,)), (10, (0.0,))], columns=(1,))
+    assert made.missing == (0,)
+    assert words(at(made, 5)) == [CAUSES[1]]
+    assert made.samples()[0].tolist() == []
+
+
+def test_of_two_publishers_of_a_joint_the_one_that_names_more_counts():
+    made = track()
+    for ms in range(0, 100, 10):
+        made.add((1,), ms * MS, np.array([9.0]))
+        made.add(BOTH, ms * MS, np.array([1.0, 2.0]))
+    made.sort()
+    np.testing.assert_allclose(at(made, 55).joints, [[1.0, 2.0]])
+
+
+def test_a_publisher_that_falls_silent_holds_nothing_up_while_others_name_its_joints():
+    """As a driver that publishes the gripper's and one joint of the arm once, at the start."""
+    made = track()
+    made.add((1,), 10 * MS, np.array([0.0]))
+    for ms in range(10, 1000, 10):
+        made.add(BOTH, ms * MS, np.array([0.0, 0.0]))
+    made.sort()
+    assert made.newest_ns == 990 * MS
+    made.release(500 * MS)
+    assert made.standing(1e-3, 0.1).tolist() == [[500 * MS, 990 * MS]]
+
+
+def test_a_publisher_that_falls_silent_stops_everything_where_nobody_else_names_its_joints():
+    made = track()
+    for ms in range(0, 1000, 10):
+        made.add((0,), ms * MS, np.array([0.0]))
+        if ms <= 300:
+            made.add((1,), ms * MS, np.array([0.0]))
+    made.sort()
+    assert made.newest_ns == 300 * MS
+    made.release(500 * MS)
+    assert made.newest_ns == 300 * MS
+    assert made.missing == ()
+
+
+# Standing
+
+
+def brute_standing(stamps, values, still, window, max_gap):
+    """Return the intervals by the definition, sample by sample, and the samples that stood."""
+    quiet, begins, intervals = [], [], []
+    start = 0
+    for k in range(len(stamps)):
+        if k and stamps[k] - stamps[k - 1] > max_gap:
+            start = k
+        calm, back = True, k
+        for lag in range(1, LAGS + 1):
+            wanted = stamps[k] - window * lag // LAGS
+            back = next(i for i in range(len(stamps)) if stamps[i] >= wanted)
+            back = max(min(back, k - 1), start)
+            calm = calm and np.abs(values[k] - values[back]).max() <= still
+        quiet.append(calm)
+        begins.append(stamps[back])
+        if calm and (k == start or not quiet[k - 1]):
+            begin = begins[k]
+            if intervals:
+                begin = max(begin, intervals[-1][1])
+            intervals.append([begin, stamps[k]])
+        elif calm:
+            intervals[-1][1] = stamps[k]
+    return [[begin, end] for begin, end in intervals if begin < end]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_standing_is_what_its_definition_says(seed):
+    rng = np.random.default_rng(seed)
+    count = 120
+    stamps = np.cumsum(
+        rng.choice([5, 10, 10, 10, 15, 250], count, p=[0.2, 0.5, 0.1, 0.1, 0.08, 0.02])
+    )
+    moving = np.repeat(rng.random(count // 10) < 0.4, 10)
+    steps = moving[:, np.newaxis] * rng.normal(scale=2e-3, size=(count, 2))
+    values = np.cumsum(steps, axis=0) + rng.normal(scale=1e-4, size=(count, 2))
+    made = filled(zip(stamps.tolist(), values.tolist(), strict=True))
+    expected = brute_standing((stamps * MS).tolist(), values, 5e-4, 100 * MS, 100 * MS)
+    assert made.standing(5e-4, 0.1).tolist() == expected
+
+
+def test_a_stop_begins_when_the_joints_do_not_move_any_longer():
+    ramp = [(ms, (1e-3 * max(0, 300 - ms), 0.0)) for ms in range(0, 300, 2)]
+    stand = [(ms, (0.0, 0.0)) for ms in range(300, 800, 2)]
+    leave = [(ms, (0.0, 1e-3 * (ms - 800))) for ms in range(800, 1000, 2)]
+    ((begin, end),) = filled([*ramp, *stand, *leave]).standing(5e-4, 0.1).tolist()
+    assert abs(begin - 300 * MS) <= 4 * MS
+    assert abs(end - 800 * MS) <= 4 * MS
+
+
+def test_all_publishers_must_stand():
+    made = track()
+    for ms in range(0, 1000, 10):
+        made.add((0,), ms * MS, np.array([max(0.0, 0.3 - 1e-3 * ms)]))
+        made.add((1,), ms * MS, np.array([max(0.0, 1e-3 * ms - 0.7)]))
+    made.sort()
+    ((begin, end),) = made.standing(1e-3, 0.1).tolist()
+    assert abs(begin - 300 * MS) <= 20 * MS
+    assert abs(end - 700 * MS) <= 20 * MS
+
+
+@pytest.mark.parametrize('times', [[300], [100, 700], range(0, 1000, 250), range(300, 340, 10)])
+def test_a_publisher_that_is_heard_now_and_then_does_not_part_a_stop(times):
+    made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
+    for ms in times:
+        made.add((1,), ms * MS, np.array([0.0]))
+    made.sort()
+    assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
+
+
+def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
+    """As one that repeats what others published, some time later."""
+    made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
+    for ms in range(200, 800, 10):
+        made.add((1,), ms * MS, np.array([max(0.0, 1e-4 * (ms - 500))]))
+    made.sort()
+    (begin, first), (second, end) = (np.array(made.standing(5e-4, 0.1)) // MS).tolist()
+    assert (begin, end) == (0, 990)
+    assert 500 <= first <= 510
+    assert 780 <= second <= 790
+
+
+def test_a_joint_that_nobody_shows_to_stand_does_not():
+    made = filled([(0, (0.0, 0.0)), (500, (0.0, 0.0))])
+    made.add((1,), 250 * MS, np.array([0.0]))
+    for ms in range(0, 600, 10):
+        made.add((0,), ms * MS, np.array([0.0]))
+    made.sort()
+    assert made.standing(5e-4, 0.1).tolist() == []
+
+
+def test_a_joint_that_stands_at_half_a_turn_stands(rng):
+    """A driver that counts within one turn reports it now as pi, now as -pi."""
+    angles = np.pi + rng.normal(scale=1e-5, size=100)
+    angles = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    assert np.ptp(angles) > 6.0
+    made = filled([(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)])
+    assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
+    assert filled(
+        [(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)], revolute=(False, True)
+    ).standing(5e-4, 0.1).tolist() != [[0, 990 * MS]]
+
+
+# Signs of the last moves
+
+
+def brute_approach(stamps, values, when, before):
+    signs = []
+    now = np.array([np.interp(when, stamps, column) for column in values.T])
+    for j, value in enumerate(now):
+        past = values[stamps <= when, j]
+        far = np.flatnonzero(np.abs(value - past) > MOVED)
+        signs.append(np.sign(value - past[far[-1]]) if len(far) else before[j])
+    return signs
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0, 37, 80]))
+def test_the_sign_is_that_of_the_last_move(seed, released):
+    """By a search back through all samples, those let go included."""
+    rng = np.random.default_rng(seed)
+    count = 150
+    moving = np.repeat(rng.random((count // 5, 2)) < 0.3, 5, axis=0)
+    speed = np.repeat(rng.choice([-0.02, 0.003, 0.02], (count // 5, 2)), 5, axis=0)
+    values = np.cumsum(moving * speed, axis=0) + rng.normal(scale=5e-5, size=(count, 2))
+    stamps = 10 * np.arange(count)
+    made = filled(zip(stamps.tolist(), values.tolist(), strict=True))
+    made.release(10 * released * MS)
+    when = np.arange(10 * released, 10 * count - 10, 10)
+    found = at(made, *when).approach
+    before = np.zeros(2)
+    if released:
+        before = brute_approach(stamps, values, 10 * released, before)
+    expected = [
+        brute_approach(stamps[released:], values[released:], ms, before) for ms in when.tolist()
+    ]
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_an_overshoot_long_ago_is_still_known():
+    """Past the goal and back, then a long stand: the last move was the short one back."""
+    goal = [*np.linspace(0.0, 1.2, 60), *np.linspace(1.2, 1.0, 20), *([1.0] * 700)]
+    made = filled([(10 * k, (value, -value)) for k, value in enumerate(goal)])
+    motion = at(made, 900, 7500)
+    np.testing.assert_array_equal(motion.approach, [[-1.0, 1.0]] * 2)
+
+
+# Buffers
+
+
+def test_release_keeps_the_last_sample_and_the_signs():
+    made = filled([(k * 10, (0.01 * k, -0.01 * k)) for k in range(10)])
+    assert made.release(1000 * MS) == 9
+    assert made.newest_ns == 90 * MS
+    assert made.horizon_ns == 1000 * MS
+    np.testing.assert_array_equal(at(made, 90).approach, [[1.0, -1.0]])
+    made.release(500 * MS)
+    assert made.horizon_ns == 1000 * MS
+
+
+@pytest.mark.parametrize('capacity', [1, 2, 3, 4, 5, 100])
+def test_a_full_track_is_halved(capacity):
+    made = track(capacity=capacity)
+    taken = gone = 0
+    for k in range(500):
+        if not made.room(BOTH):
+            made.sort()
+            gone += made.halve()
+        assert made.room(BOTH) or capacity == 1
+        if made.room(BOTH):
+            made.add(BOTH, k * MS, np.zeros(2))
+            taken += 1
+    made.sort()
+    held, _ = made.samples()
+    assert len(held) == taken - gone
+    assert held.tolist() == [k * MS for k in range(500 - len(held), 500)] or capacity == 1
+    if capacity > 3:
+        assert capacity // 2 <= len(held) <= capacity
+
+
+def test_clear_forgets_everything():
+    made = filled([(k * 10, (0.01 * k, -0.01 * k)) for k in range(10)])
+    made.release(50 * MS)
+    made.clear()
+    assert (made.newest_ns, made.horizon_ns, made.missing) == (0, 0, (0, 1))
+    made.add(BOTH, 10 * MS, np.zeros(2))
+    np.testing.assert_array_equal(at(made, 10).approach, [[0.0, 0.0]])
+
+
+def test_rows_grow_beyond_their_first_block_and_keep_their_order():
+    count = 3000
+    rows = Rows(1, count)
+    order = list(range(count))
+    random.Random(1).shuffle(order)
+    for k in order:
+        assert not rows.full
+        rows.append(k, [0.5 * k])
+    assert rows.full
+    assert rows.sort() == 0
+    np.testing.assert_array_equal(rows.stamps, np.arange(count))
+    np.testing.assert_array_equal(rows.values[:, 0], 0.5 * np.arange(count))

@@ -1,0 +1,371 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements out of /tf and /tf_static."""
+
+import itertools
+
+import numpy as np
+import pytest
+from recorded import (
+    ARM,
+    MS,
+    STORAGES,
+    TYPES,
+    TYPESTORE,
+    pose_stamped,
+    record,
+    session_of,
+    standing,
+    transform_stamped,
+)
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.kinematics import se3
+from calib_ros.sampling.cdr import transforms
+from calib_ros.sampling.intake import Stream, feed, measured
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import Source, parse_source, parse_sources
+from calib_ros.settings import Settings
+
+storages = pytest.mark.parametrize('storage', sorted(STORAGES))
+PLAIN = '/tf parent=world child=tool'
+TIMES = [105, 205, 333, 601]
+
+
+def tf(*links):
+    return TYPES[TRANSFORMS](list(links))
+
+
+def link(parent, child, stamp_ns=0, matrix=None):
+    matrix = np.eye(4) if matrix is None else matrix
+    quat = se3.to_quat(matrix[:3, :3])
+    message = transform_stamped(stamp_ns, matrix[:3, 3].tolist(), quat.tolist(), child)
+    message.header.frame_id = parent
+    return message
+
+
+def frame(rng):
+    return se3.transform(se3.exp_rotation(rng.normal(size=3)), rng.normal(size=3))
+
+
+def robot(stamp_ns, rng):
+    """Return what robot_state_publisher sends: six moving links and two that hang on them."""
+    names = ['base_link', *(f'link_{k}' for k in range(1, 7))]
+    return tf(*(link(*pair, stamp_ns, frame(rng)) for pair in itertools.pairwise(names)))
+
+
+def fixed_robot(rng):
+    return tf(
+        link('world', 'base_link', 0, frame(rng)),
+        link('link_6', 'flange', 0, frame(rng)),
+        link('flange', 'tool0', 0, frame(rng)),
+    )
+
+
+def events(rng, moving, still=(), with_robot=True):
+    """Return a bag: the robot's own frames, and those of a tracker."""
+    found = standing([])
+    if with_robot:
+        found.insert(0, ('/tf_static', fixed_robot(rng)))
+        found += [('/tf', robot(ms * MS, rng)) for ms in range(10, 1000, 20)]
+    found = [*(('/tf_static', each) for each in still), *found]
+    return [*found, *(('/tf', each) for each in moving)]
+
+
+def poses_of(path, *sources):
+    session, _ = session_of(path, sources=sources or (PLAIN,))
+    observations = session.problem().observations
+    return se3.transform(observations.rotations, observations.positions), session
+
+
+@storages
+@pytest.mark.parametrize('with_robot', [False, True])
+def test_a_link_between_two_frames_is_a_measurement(tmp_path, rng, storage, with_robot):
+    expected = [frame(rng) for _ in TIMES]
+    moving = [tf(link('world', 'tool', ms * MS, t)) for ms, t in zip(TIMES, expected, strict=True)]
+    path = record(tmp_path / 'bag', events(rng, moving, with_robot=with_robot), storage)
+    found, session = poses_of(path)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    (sample, *_) = session.samples
+    assert (sample.frame_id, sample.target) == ('world', 'tool')
+    assert session.account().poses == len(TIMES)
+    assert session.account().dropped == session.account().unused == {}
+
+
+def test_a_link_is_worth_a_pose_of_its_own_to_the_last_digit(tmp_path, rng):
+    matrices = [frame(rng) for _ in TIMES]
+    poses = [
+        pose_stamped(ms * MS, t[:3, 3].tolist(), se3.to_quat(t[:3, :3]).tolist(), 'world')
+        for ms, t in zip(TIMES, matrices, strict=True)
+    ]
+    plain, _ = session_of(record(tmp_path / 'plain', standing(poses)))
+    moving = [tf(link('world', 'tool', ms * MS, t)) for ms, t in zip(TIMES, matrices, strict=True)]
+    _, session = poses_of(record(tmp_path / 'bag', events(rng, moving)))
+    for name in ('stamps_ns', 'joints', 'positions', 'rotations'):
+        np.testing.assert_array_equal(
+            getattr(session.problem().observations, name),
+            getattr(plain.problem().observations, name),
+        )
+
+
+CHAINS = {
+    'direct': ([], [('world', 'tool')]),
+    'turned round': ([], [('tool', 'world')]),
+    'before': ([('world', 'tracker')], [('tracker', 'tool')]),
+    'behind': ([('marker', 'tool')], [('world', 'marker')]),
+    'on both sides': (
+        [('world', 'hall'), ('hall', 'tracker'), ('marker', 'plate'), ('plate', 'tool')],
+        [('tracker', 'marker')],
+    ),
+    'beside': ([('world', 'tracker')], [('world', 'tool')]),
+    'from a sister': ([('hall', 'world'), ('hall', 'tracker')], [('tracker', 'tool')]),
+    'turned round between': ([('tracker', 'world'), ('tool', 'reflector')], [('tracker', 'tool')]),
+    'of the measured side': ([('world', 'camera')], [('tool', 'world')]),
+}
+
+
+@pytest.mark.parametrize('late', [False, True])
+@pytest.mark.parametrize('name', CHAINS)
+def test_links_that_stand_still_are_composed(tmp_path, rng, name, late):
+    still, (pair,) = CHAINS[name]
+    known = {each: frame(rng) for each in still}
+    numbers = [frame(rng) for _ in TIMES]
+    moving = [tf(link(*pair, ms * MS, t)) for ms, t in zip(TIMES, numbers, strict=True)]
+    fixed = [tf(link(*each, 0, matrix)) for each, matrix in known.items()]
+    content = events(rng, moving, fixed, with_robot=False)
+    if late:
+        content = [*content[len(fixed) :], *content[: len(fixed)]]
+    ends = {'from a sister': 'world', 'turned round between': 'world'}
+    child = 'reflector' if name == 'turned round between' else 'tool'
+    parent = ends.get(name, 'world')
+    found, _ = poses_of(record(tmp_path / 'bag', content), f'/tf parent={parent} child={child}')
+    for pose, number in zip(found, numbers, strict=True):
+        frames = {'world': np.eye(4)}
+        links = known | {pair: number}
+        for _ in range(8):
+            for (a, b), matrix in links.items():
+                if a in frames:
+                    frames[b] = frames[a] @ matrix
+                elif b in frames:
+                    frames[a] = frames[b] @ se3.invert(matrix)
+        np.testing.assert_allclose(pose, frames[child], rtol=0, atol=1e-12)
+
+
+def test_names_with_a_slash_before_them_are_the_same(tmp_path, rng):
+    moving = [tf(link('/world', '/tool', 105 * MS, frame(rng)))]
+    found, _ = poses_of(
+        record(tmp_path / 'bag', events(rng, moving)), '/tf parent=/world child=tool'
+    )
+    assert len(found) == 1
+
+
+def test_several_targets_on_one_topic(tmp_path, rng):
+    both = [
+        tf(link('world', 'a', ms * MS, frame(rng)), link('world', 'b', ms * MS, frame(rng)))
+        for ms in TIMES
+    ]
+    path = record(tmp_path / 'bag', events(rng, both))
+    session, _ = session_of(
+        path, sources=('/tf parent=world child=a', '/tf parent=world child=b validation=true')
+    )
+    fitted, judging = (
+        [each.target for each in session.samples if each.validation is held]
+        for held in (False, True)
+    )
+    assert (fitted, judging) == (['a'] * 4, ['b'] * 4)
+
+
+def refusal(path, *sources):
+    with pytest.raises(InputError) as caught:
+        session_of(path, sources=sources or (PLAIN,))
+    return str(caught.value)
+
+
+def test_the_joints_of_the_robot_are_no_measurement(tmp_path, rng):
+    path = record(tmp_path / 'bag', events(rng, []))
+    text = refusal(path, '/tf parent=world child=tool0')
+    assert text.startswith('6 links move from world to tool0 (base_link to link_1, ')
+
+
+def test_frames_that_nothing_links_list_what_moves(tmp_path, rng):
+    moving = [tf(link('world', 'marker', ms * MS, frame(rng))) for ms in range(10, 1000, 5)]
+    text = refusal(record(tmp_path / 'bag', events(rng, moving)))
+    assert text.startswith('nothing links frame "tool" to "world" on /tf; what moves on /tf: ')
+    assert 'world to marker at 200 Hz, base_link to link_1 at 50 Hz, ' in text
+    assert '"/tf parent=world child=marker"' in text
+
+
+@storages
+def test_a_bag_without_named_sources_lists_the_frames(tmp_path, rng, storage):
+    moving = [tf(link('world', 'marker', ms * MS, frame(rng))) for ms in range(10, 1000, 5)]
+    path = record(tmp_path / 'bag', events(rng, moving), storage)
+    with pytest.raises(InputError, match='has no pose topic') as caught:
+        session_of(path)
+    assert 'world to marker at 200 Hz' in str(caught.value)
+    assert '--sources "/tf parent=world child=marker"' in str(caught.value)
+    assert len(poses_of(path, '/tf parent=world child=marker')[0]) == 198
+
+
+def test_frames_that_stand_still_measure_nothing(tmp_path, rng):
+    path = record(tmp_path / 'bag', events(rng, []))
+    assert 'nothing moves from world to base_link' in refusal(
+        path, '/tf parent=world child=base_link'
+    )
+
+
+def test_a_frame_with_two_parents_is_refused(tmp_path, rng):
+    still = [tf(link('world', 'tracker')), tf(link('tool0', 'tool'))]
+    moving = [tf(link('tracker', 'tool', 105 * MS, frame(rng)))]
+    path = record(tmp_path / 'bag', events(rng, moving, still))
+    assert 'frame "tool" has several parents, tool0 and tracker' in refusal(path)
+    assert len(poses_of(path, '/tf parent=tracker child=tool')[0]) == 1
+
+
+def test_frames_in_a_circle_are_refused(tmp_path, rng):
+    moving = [tf(link('a', 'tool', 105 * MS, frame(rng)), link('tool', 'a', 105 * MS, frame(rng)))]
+    path = record(tmp_path / 'bag', events(rng, moving))
+    assert 'is above itself' in refusal(path)
+
+
+def test_a_link_that_moves_and_stands_still_is_refused(tmp_path, rng):
+    still = [tf(link('world', 'tool', 0, frame(rng)))]
+    moving = [tf(link('world', 'tool', 105 * MS, frame(rng)))]
+    path = record(tmp_path / 'bag', events(rng, moving, still))
+    assert 'world to tool comes on both /tf and /tf_static' in refusal(path)
+
+
+def test_a_link_that_has_changed_is_refused(tmp_path, rng):
+    first = frame(rng)
+    moved = first.copy()
+    moved[0, 3] += 1e-4
+    moving = [tf(link('tracker', 'tool', ms * MS, frame(rng))) for ms in TIMES]
+    still = tf(link('world', 'tracker', 0, first))
+    content = events(rng, moving, [still, still])
+    assert len(poses_of(record(tmp_path / 'same', content))[0]) == 4
+    content.append(('/tf_static', tf(link('world', 'tracker', 0, moved))))
+    text = refusal(record(tmp_path / 'bag', content))
+    assert 'world to tracker has changed on /tf_static' in text
+
+
+def test_a_pair_that_repeats_is_one_measurement(tmp_path, rng):
+    same = link('world', 'tool', 105 * MS, frame(rng))
+    moving = [tf(same, same), tf(same), tf(link('world', 'tool', 205 * MS), same)]
+    found, session = poses_of(record(tmp_path / 'bag', events(rng, moving)))
+    assert len(found) == 2
+    assert session.account().poses == 5
+    assert session.account().dropped == {'poses: same stamp twice': 3}
+
+
+@pytest.mark.parametrize('big_endian', [False, True])
+@pytest.mark.parametrize(
+    ('change', 'cause'),
+    [
+        (
+            lambda bad: setattr(bad.transform.translation, 'x', np.nan),
+            'NaN or infinite position',
+        ),
+        (lambda bad: setattr(bad.transform.rotation, 'w', 3.0), 'quaternion not of length 1'),
+        (lambda bad: setattr(bad.header.stamp, 'sec', -1), 'zero stamp'),
+    ],
+)
+def test_bad_transforms_are_counted_if_they_are_of_the_pair(rng, change, cause, big_endian):
+    good, bad, foreign = (
+        link(*pair, 105 * MS, frame(rng))
+        for pair in (('world', 'tool'), ('world', 'tool'), ('base_link', 'link_1'))
+    )
+    change(bad)
+    change(foreign)
+    session = session_fed([tf(foreign, good), tf(bad, foreign), tf(foreign)], not big_endian)
+    account = session.account()
+    assert account.poses == 2
+    assert account.dropped == {f'poses: {cause}': 1}
+
+
+def session_fed(come, little_endian=True, at_once=True):
+    """Return a session that has taken joint states and then transforms."""
+    settings = Settings(mode='continuous', delay=1e-12, sources=(PLAIN,))
+    session = CalibrationSession(ARM, settings)
+    streams = {each.topic: each for each in measured(parse_sources([PLAIN]), {})}
+    streams['/joint_states'] = Stream('/joint_states', JOINT_STATE)
+    batch = []
+    for each in (*standing([]), *come):
+        topic, message = each if isinstance(each, tuple) else ('/tf', each)
+        kind = streams[topic].type
+        data = TYPESTORE.serialize_cdr(message, kind, little_endian=little_endian)
+        batch.append((streams[topic], bytes(data)))
+    for some in [batch] if at_once else [[each] for each in batch]:
+        assert feed(session, some, TYPESTORE.deserialize_cdr) == []
+    session.finish()
+    return session
+
+
+@pytest.mark.parametrize('little_endian', [False, True])
+def test_one_by_one_is_as_good_as_by_the_batch(rng, little_endian):
+    still = tf(link('world', 'tracker', 1, frame(rng)))
+    come = [
+        message
+        for ms in TIMES
+        for message in (robot(ms * MS, rng), tf(link('tracker', 'tool', ms * MS, frame(rng))))
+    ]
+    come.insert(5, ('/tf_static', still))
+    expected = session_fed(come)
+    found = session_fed(come, little_endian, at_once=False)
+    assert found.account().samples == expected.account().samples == 4
+    for a, b in zip(found.samples, expected.samples, strict=True):
+        np.testing.assert_allclose(a.position, b.position, rtol=0, atol=1e-14)
+        assert a.stamp_ns == b.stamp_ns
+
+
+def test_messages_are_read_whatever_stands_between_their_names(rng):
+    """Serialisers leave bytes of any kind where numbers are aligned."""
+    message = tf(link('world', 'tool', 105 * MS, frame(rng)), link('a', 'bc', 7, frame(rng)))
+    data = bytes(TYPESTORE.serialize_cdr(message, TRANSFORMS))
+    (alike,) = transforms([data], {})
+    assert alike.layout.links == (('world', 'tool'), ('a', 'bc'))
+    other = bytearray(data)
+    gap = data.index(b'world\0') + 6
+    other[gap : gap + 2] = b'\xff\xff'
+    (both,) = transforms([data, bytes(other)], {})
+    assert both.which.tolist() == [0, 1]
+    stamps, numbers, good = both.of(1)
+    assert stamps.tolist() == [7, 7]
+    assert good.all()
+    np.testing.assert_array_equal(numbers[0], numbers[1])
+
+
+@pytest.mark.parametrize('cut', range(4, 130, 7))
+def test_messages_that_are_cut_off_are_not_read(rng, cut):
+    data = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
+    assert transforms([data[:cut]], {}) == [] or cut >= len(data)
+
+
+def test_a_name_of_absurd_length_is_not_read():
+    data = bytearray(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
+    data[16:20] = b'\xff\xff\xff\xff'
+    assert transforms([bytes(data)], {}) == []
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '/tf',
+        '/tf parent=world',
+        '/tf child=tool',
+        '/tf parent=tool child=/tool',
+        '/x type=TFMessage',
+        '/x type=PoseStamped parent=world child=tool',
+    ],
+)
+def test_both_frames_are_needed_and_only_there(text):
+    with pytest.raises(ConfigError, match='needs parent=FRAME child=FRAME'):
+        parse_source(text)
+
+
+def test_sources_of_one_topic_name_different_frames():
+    texts = ['/tf parent=world child=a', '/tf parent=world child=b']
+    a, b = parse_sources(texts)
+    assert a == Source('/tf', TRANSFORMS, parent='world', child='a')
+    assert b.child == 'b'
+    with pytest.raises(ConfigError, match='"/tf world a" is named twice'):
+        parse_sources([*texts, texts[0]])
