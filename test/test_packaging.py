@@ -78,7 +78,7 @@ def test_package_xml_names_everything_that_is_imported():
     declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
     keys = {'yaml': 'python3-yaml'}
     keys |= {name: f'python3-{name}' for name in ('numpy', 'scipy', 'matplotlib')}
-    sources = [*(ROOT / 'calib_ros').glob('*.py'), *(ROOT / 'launch').glob('*.py')]
+    sources = [*(ROOT / 'calib_ros').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
     for source in sources:
         for node in ast.walk(ast.parse(source.read_text())):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -124,8 +124,8 @@ def test_rviz_shows_what_the_node_publishes():
     content = yaml.safe_load((ROOT / 'config/calibration.rviz').read_text())
     manager = content['Visualization Manager']
     topics = {d['Class']: d['Topic'] for d in manager['Displays'] if 'Topic' in d}
-    rooms = ('node', 'guide', 'keeper')
-    node = ''.join((ROOT / f'calib_ros/{name}.py').read_text() for name in rooms)
+    rooms = ('node', 'advisor', 'outputs')
+    node = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in rooms)
     for topic in topics.values():
         assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in node
     # These are published once: a display that comes later must ask for the last ones.
