@@ -29,6 +29,7 @@ from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.following import Follower
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 EXACT, COMPROMISE = 1e-6, 0.02
 """Orientation errors [rad] tolerated of arms that can reach every orientation, and of others."""
@@ -44,8 +45,8 @@ POSITIVE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Compensator:
+@dataclass(frozen=True, eq=False, repr=False)
+class Compensator(Shown):
     """What the controller believes, what the arm is, and how far a correction may go.
 
     Parameters
@@ -127,8 +128,8 @@ class Refusal:
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class Compensation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Compensation(Shown):
     """Corrected joint commands, with what they leave and what was refused.
 
     Attributes
@@ -171,8 +172,8 @@ class Compensation:
         return self.joints - self.command
 
 
-@dataclass(frozen=True, eq=False)
-class Program:
+@dataclass(frozen=True, eq=False, repr=False)
+class Program(Shown):
     """A robot's program as joint values by name.
 
     Attributes

@@ -24,6 +24,7 @@ from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import Estimate
+from calib_ros.shown import Shown
 
 ASSUMED_TOOL = (0.1, 0.1, 0.1)
 """Where the target is taken to be [m] in the flange's frame when nothing is known about it."""
@@ -32,8 +33,8 @@ UNDETERMINED = 1e-7
 determined."""
 
 
-@dataclass(frozen=True, eq=False)
-class Design:
+@dataclass(frozen=True, eq=False, repr=False)
+class Design(Shown):
     """What is to be identified, how it will be measured, and what is known about it already.
 
     Parameters

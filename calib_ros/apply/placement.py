@@ -22,6 +22,7 @@ from calib_ros.apply.workspace import CalibratedArm, Model, in_base
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 Aim: TypeAlias = Literal['mean', 'worst']
 AIMS: tuple[Aim, ...] = get_args(Aim)
@@ -40,8 +41,8 @@ def task_of(poses: FloatArray) -> FloatArray:
     return task
 
 
-@dataclass(frozen=True, eq=False)
-class Placements:
+@dataclass(frozen=True, eq=False, repr=False)
+class Placements(Shown):
     """Where a task's frame may be placed, and the error expected there.
 
     Attributes

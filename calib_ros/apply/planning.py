@@ -29,6 +29,7 @@ from calib_ros.apply.design import Candidates, Design, accuracy, information_of,
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.observations import STILL
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
 CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
@@ -267,8 +268,8 @@ def next_pose(
     return Suggestion(candidates[index[0]], now, then, now <= wanted)
 
 
-@dataclass(frozen=True, eq=False)
-class Plan:
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(Shown):
     """Poses to measure, and what they promise.
 
     Attributes

@@ -49,6 +49,7 @@ from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import FRAME_KINDS, Chain
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
 LEAST = 5
@@ -71,8 +72,8 @@ MOVED = 0.3
 """Share of the error that is left without one common motion, below which that is suspected."""
 
 
-@dataclass(frozen=True, eq=False)
-class Verification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Verification(Shown):
     """Errors before and after a correction, and the verdict.
 
     Attributes

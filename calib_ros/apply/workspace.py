@@ -32,6 +32,7 @@ from calib_ros.kinematics.chain import FRAME_KINDS, Chain
 from calib_ros.kinematics.chain_file import load_calibration
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 from calib_ros.texts import read_text
 
 Model: TypeAlias = Literal['corrected', 'nominal']
@@ -43,8 +44,8 @@ LEAST_SHARE = 0.005
 """Share of all poses that a region must hold to be named."""
 
 
-@dataclass(frozen=True, eq=False)
-class CalibratedArm:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibratedArm(Shown):
     """An arm before and after its calibration, and how well that is known.
 
     Attributes
@@ -207,8 +208,8 @@ def _in_frames_of(nominal: Chain, after: Chain) -> Chain:
     return minimise(start, independent, System((Samples(wanted, 1e-4, 1e-4 / 0.3),))).chain
 
 
-@dataclass(frozen=True, eq=False)
-class Survey:
+@dataclass(frozen=True, eq=False, repr=False)
+class Survey(Shown):
     """Errors at configurations all over the workspace.
 
     Attributes

@@ -23,6 +23,7 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
+from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, Row, decoded, read_bytes, read_rows
 from calib_ros.values import (
     LARGEST,
@@ -46,8 +47,8 @@ MOST_FRAMES = 100
 """Sessions, devices and targets of a table."""
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(Shown):
     """Samples, and the sets to fit and held out that they make, each with frames of its own.
 
     `pairs` names the frames of the two sockets of each location.

@@ -39,6 +39,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 BENDING = ('gravity', 'compliance', 'backlash')
 TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, **dict.fromkeys(BENDING, 3e-4)}
@@ -77,8 +78,8 @@ def group_of(chain: Chain, name: str) -> str | None:
     return group if group in BENDING else 'drive'
 
 
-@dataclass(frozen=True, eq=False)
-class Posterior:
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Shown):
     """What the data and the sizes of the errors tell about an arm that was fitted.
 
     Attributes

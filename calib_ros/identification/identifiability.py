@@ -17,6 +17,7 @@ from scipy import linalg
 from calib_ros.kinematics.chain import FRAME_KINDS, Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 RANK_TOLERANCE = 1e-8
 """A column is dependent when less than this share of it is left after the columns before it."""
@@ -165,8 +166,8 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     return np.asarray(root @ root.T)
 
 
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
+@dataclass(frozen=True, eq=False, repr=False)
+class Uncertainty(Shown):
     """Covariance of the fitted parameters, by source of error.
 
     Attributes

@@ -43,6 +43,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import FRAME_KINDS, Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.shown import Shown
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
@@ -64,8 +65,8 @@ class Outlier:
     size: float
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Shown):
     """The result; a poor fit is data in it, not an error.
 
     Attributes

@@ -28,6 +28,7 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 BLOCK = 1024
 STEP_TOLERANCE = 1e-6
@@ -271,8 +272,8 @@ class Prior:
         return inverse, -offsets * inverse
 
 
-@dataclass(frozen=True, eq=False)
-class System:
+@dataclass(frozen=True, eq=False, repr=False)
+class System(Shown):
     """What is fitted: sets of samples, and priors if there are any."""
 
     sets: tuple[Samples, ...]
@@ -386,8 +387,8 @@ def triangular_factor(
     return factor
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit(Shown):
     """The chain at the minimum of the weighted squares, and the last normal equations there."""
 
     chain: Chain

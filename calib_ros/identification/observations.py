@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 _OPTIONAL = ('covariance', 'approach', 'distances', 'velocity', 'acceleration', 'delay')
 TURN = 2.0 * np.pi
@@ -34,8 +35,8 @@ NEIGHBOURS = 8
 """Nearest values among which visits are looked for."""
 
 
-@dataclass(frozen=True, eq=False)
-class Observations:
+@dataclass(frozen=True, eq=False, repr=False)
+class Observations(Shown):
     """N matched pairs of joint values and measured poses, in the order of their stamps.
 
     Parameters

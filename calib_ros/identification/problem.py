@@ -19,6 +19,7 @@ from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.robust import LOSSES
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain, is_length
+from calib_ros.shown import Shown
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,8 @@ class Learned:
     noise: float = 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
     """What is known before an identification.
 
     Parameters

@@ -30,6 +30,7 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 RISK = 0.01
 """Probability at which a calibration may make the arm worse over the poses of a shell."""
@@ -43,8 +44,8 @@ SHELL = 10
 """Random configurations of a shell."""
 
 
-@dataclass(frozen=True, eq=False)
-class Region:
+@dataclass(frozen=True, eq=False, repr=False)
+class Region(Shown):
     """The joint values at which a calibration may be used.
 
     Attributes

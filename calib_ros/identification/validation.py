@@ -19,6 +19,7 @@ from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weigh
 from calib_ros.identification.steps import Step
 from calib_ros.kinematics.chain import DH_KINDS, Chain, is_length
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
@@ -94,8 +95,8 @@ class Residuals:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Shown):
     """Residuals of the same poses before and after.
 
     Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's

@@ -32,6 +32,7 @@ import numpy as np
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 Convention: TypeAlias = Literal['standard', 'modified']
 JointType: TypeAlias = Literal['revolute', 'prismatic']
@@ -143,8 +144,8 @@ class Frame:
         return np.concatenate([self.matrix[:3, 3] - start[:3, 3], turn])
 
 
-@dataclass(frozen=True, eq=False)
-class Chain:
+@dataclass(frozen=True, eq=False, repr=False)
+class Chain(Shown):
     """A serial chain; immutable, offsets make a new one.
 
     Parameters

@@ -15,10 +15,11 @@ import numpy as np
 
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
 
 
-@dataclass(frozen=True, eq=False)
-class Sample:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sample(Shown):
     """One measurement with the joint values that belong to it.
 
     Attributes

@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Values on a screen: what they hold, in a few lines."""
+
+from __future__ import annotations
+
+import html
+import textwrap
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+LONGEST = 60
+"""Characters of a field's value; longer ones are told by their kind and size."""
+
+
+class Shown:
+    """A dataclass whose fields are shown in brief: arrays by shape, long values by their size."""
+
+    def __repr__(self) -> str:
+        """Return the fields in brief, on as few lines as they need."""
+        text = ', '.join(f'{name}={value}' for name, value in _briefly(self))
+        return textwrap.fill(f'{type(self).__name__}({text})', 99, subsequent_indent='    ')
+
+    def _repr_html_(self) -> str:
+        """Return the fields in brief as a table, for notebooks."""
+        rows = (
+            f'<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>'
+            for name, value in _briefly(self)
+        )
+        return f'<table><caption>{type(self).__name__}</caption>{"".join(rows)}</table>'
+
+
+def _briefly(value: Any) -> list[tuple[str, str]]:
+    return [(each.name, _brief(getattr(value, each.name))) for each in fields(value)]
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f'{value.dtype}{list(value.shape)}'
+    if isinstance(value, Shown):
+        name = getattr(value, 'name', '')
+        return f'<{type(value).__name__}{" " + name if isinstance(name, str) and name else ""}>'
+    if isinstance(value, float):
+        return f'{value:.6g}'
+    if isinstance(value, tuple | list | Mapping) and any(
+        isinstance(each, np.ndarray | Shown) for each in value
+    ):
+        return f'<{len(value)} in a {type(value).__name__}>'
+    text = repr(value)
+    if len(text) <= LONGEST:
+        return text
+    if isinstance(value, tuple | list | Mapping):
+        return f'<{len(value)} in a {type(value).__name__}>'
+    return text[: LONGEST - 3] + '...'
