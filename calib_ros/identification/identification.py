@@ -239,6 +239,10 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         few = problem.system([_some(each) for each in problem.sets])
         rough = minimise(start, names, few, tolerance=1e-2).chain
     fitted = _fit(problem, rough, names, simpler)
+    guarded = _guarded(problem, names, fitted.factor, simpler)
+    if guarded is not problem:  # without its outliers a session tells less
+        problem = guarded
+        fitted = _fit(problem, rough, names, simpler)
     whole = fitted.noise.size
     size = _told_by(fitted.noise, simpler)
     told = _posterior(problem, fitted, names, size)
@@ -380,8 +384,9 @@ def _guarded(
 ) -> Problem:
     """Return the problem with priors that keep a first fit from going astray.
 
-    `factor` (P, P) is that of some samples at the start. DH parameters that they tell no better
-    than common sense does get a third of what no faulty robot exceeds as a prior.
+    `factor` (P, P) is that of some samples at the start, or of what a robust fit has left. DH
+    parameters that they tell no better than common sense does get a third of what no faulty robot
+    exceeds as a prior.
     """
     known = problem.prior_sigmas
     stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
@@ -392,6 +397,9 @@ def _guarded(
         and not problem.model.owns_frame(name)
         and std > problem.common_sense(name)
     }
+    if problem.learned is not None:
+        more = replace(problem.learned, priors={**problem.learned.priors, **guards})
+        return replace(problem, learned=more) if guards else problem
     noise = 1.0 if simpler is None else _told_by(simpler.noise, None)
     return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
 

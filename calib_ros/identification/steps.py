@@ -50,8 +50,6 @@ SINGULAR = 1e-8
 """Eigenvalue of scaled normal equations from which a direction counts."""
 NOISE_FREE = 1e-6
 """RMS residual [sigma] below which nothing but rounding is left."""
-ONE_SIDED = 0.1
-"""Mean weight of one side of a step up to which the fit is that of the other side alone."""
 ROWS_NS = 10**15
 """Whole seconds below that are the numbers of rows, in place of stamps."""
 
@@ -76,7 +74,7 @@ class Step:
     share : float
         Of the squares of the residuals that it explains beyond as many useless parameters.
     outside : bool
-        What was measured on one side of it are outliers, so that the fit is not spoilt by it.
+        All that was measured on one side of it are outliers, so that the fit is not spoilt by it.
 
     """
 
@@ -300,7 +298,7 @@ class _Scan:
             size, unit = turn, 'rad'
         else:
             size, unit = shift, 'm'
-        outside = min(float(np.concatenate(side).mean()) for side in weights) < ONE_SIDED
+        outside = not all(np.concatenate(side).any() for side in weights)
         return Step(
             group.what, group.kind, of_set, sample, stamp, size, unit, found.share, outside
         )
