@@ -13,10 +13,12 @@ probability of the data, parameters integrated out (evidence; MacKay 1992):
 with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1. L is the normal matrix with
 the given sigmas, t the factor by which the noise is larger, shared errors included. gamma counts
 the parameters that the data determine. Where these are few, a hyperprior holds: a size is about
-TYPICAL, within a factor of SPREAD. Parameters that the data determine keep their values, and the
-others shrink to nominal. One error may be far larger than the others, as of a motor that was put
-in wrongly: the prior has the tails of Student's t with TAILS degrees of freedom, as a normal one
-with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 + V_ii) / s^2).
+TYPICAL, within a factor of SPREAD; and where a calibration may be used is judged with sizes above
+and below, because a size that few parameters tell may be wrong by much. Parameters that the data
+determine keep their values, and the others shrink to nominal. One error may be far larger than the
+others, as of a motor that was put in wrongly: the prior has the tails of Student's t with TAILS
+degrees of freedom, as a normal one with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 +
+V_ii) / s^2).
 
 Effects that a model leaves out are *considered*: they are columns of the same posterior with sizes
 of their own, so that the arm as it may be, effects included, can be held against the one that was
@@ -32,7 +34,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, special
 
 from calib_ros.identification.leastsquares import Samples, System, normal_equations
 from calib_ros.kinematics import effects
@@ -98,9 +100,9 @@ class Posterior(Shown):
         Standard deviation [m or rad] of every parameter that has a prior.
     sizes : mapping of str to float
         Size of the errors by group.
-    doubted : (P,), (P, P)
+    doubted : tuple of (float, (P,), (P, P))
         Mean and covariance of the offsets if the device may have a scale of its own, and if joint
-        values that were rounded are off.
+        values that were rounded are off; for sizes that may as well be, each with its weight.
 
     """
 
@@ -111,7 +113,7 @@ class Posterior(Shown):
     covariance: FloatArray
     priors: Mapping[str, float]
     sizes: Mapping[str, float]
-    doubted: tuple[FloatArray, FloatArray]
+    doubted: tuple[tuple[float, FloatArray, FloatArray], ...]
 
     @cached_property
     def square(self) -> FloatArray:
@@ -182,22 +184,25 @@ def posterior_of(
         mixing = np.column_stack([mixing, [parts.get(name, 0.0) for name in columns]])
     matrix = share / noise**2 * (mixing.T @ normal.matrix @ mixing)
     gradient = share / noise**2 * (mixing.T @ normal.gradient)
-    size = len(gradient)
-    offsets = np.zeros(size)
+    offsets = np.zeros(len(gradient))
     for k, name in enumerate(names):
         if not chain.owns_frame(name):
             offsets[k] = chain.offset(name, nominal)
     vector = matrix @ offsets + gradient
     groups = [None if name in known else group_of(chain, name) for name in every]
-    groups += [None] * (size - len(every))
+    groups += [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
-    stds, sizes = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    size, near = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    stds = evidence.stds(size)
     own = stds[: len(every)].tolist()
     priors = {name: std for name, std in zip(every, own, strict=True) if std < np.inf}
     arm = np.s_[: len(every)]
     mean, root, _ = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
-    doubted, doubt, _ = _solved(matrix, vector, stds**-2)
+    doubted = []
+    for weight, other in near:
+        there, its_root, _ = _solved(matrix, vector, evidence.stds(other) ** -2)
+        doubted.append((weight, there[arm], its_root[arm] @ its_root[arm].T))
     return Posterior(
         chain,
         every,
@@ -205,8 +210,8 @@ def posterior_of(
         mean - offsets[arm],
         root @ root.T,
         priors,
-        sizes,
-        (doubted[arm], doubt[arm] @ doubt[arm].T),
+        evidence.named(size),
+        tuple(doubted),
     )
 
 
@@ -268,8 +273,10 @@ class _Evidence:
         self._own = np.array([group in ('length', 'angle') for group in groups])
         self._tails = np.ones(len(groups))
 
-    def told(self, considered: set[str | None]) -> tuple[FloatArray, dict[str, float]]:
-        """Return the standard deviation (P,) of each parameter, and the size of each group.
+    def told(
+        self, considered: set[str | None]
+    ) -> tuple[FloatArray, list[tuple[float, FloatArray]]]:
+        """Return the logarithm of the size of each group (G,), and others near by with weights.
 
         Effects that are only considered are of no size where the data would show the usual ones,
         and do not show any.
@@ -287,8 +294,7 @@ class _Evidence:
             told = (self._member - weight * variance).sum(axis=1)
             slope = weight @ mean**2 - told - width * (size - self._typical)
             step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
-            reach = -np.log(LEAST)
-            size = np.clip(size + step, self._typical - reach, self._typical + reach)
+            size = self._within(size + step)
             self._lengthen(mean**2 + variance, 0.0, size)
             if np.abs(step).max(initial=0.0) < SETTLED:
                 break
@@ -301,10 +307,42 @@ class _Evidence:
             shown = self._of(size) - without > SHOWN
             if name in considered and not shown and without - self._of(usual) > REFUTED:
                 size = none
+        return size, self._near(size, 2.0 * np.maximum(told, 0.0) + width)
+
+    def _near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
+        """Return sizes that may as well be, with their weights, by the curvature (G,) there.
+
+        One group differs at a time, up and down, by as much as makes means right to the second
+        order (the unscented transform, Julier and Uhlmann 1997); the evidence weighs both. What
+        is of no size stays so.
+        """
+        some = np.flatnonzero(size > self._typical + np.log(LEAST))
+        if not len(some):
+            return [(1.0, size)]
+        found = []
+        for k in some:
+            step = np.sqrt(len(some) / slope[k]) * np.eye(len(size))[k]
+            pair = [self._within(size + step), self._within(size - step)]
+            prior = [float(np.sum(((s - self._typical) / np.log(SPREAD)) ** 2)) for s in pair]
+            upper = special.expit(
+                self._of(pair[0]) - self._of(pair[1]) + 0.5 * (prior[1] - prior[0])
+            )
+            found += [(upper / len(some), pair[0]), ((1.0 - upper) / len(some), pair[1])]
+        return found
+
+    def _within(self, size: FloatArray) -> FloatArray:
+        """Return sizes (G,) no further from the typical ones than any that are looked for."""
+        return self._typical + np.clip(size - self._typical, np.log(LEAST), -np.log(LEAST))
+
+    def stds(self, size: FloatArray) -> FloatArray:
+        """Return the standard deviation (P,) of each parameter for sizes (G,), by logarithms."""
         precision = self._given + self._weight(size).sum(axis=0)
         with np.errstate(divide='ignore'):
-            stds = 1.0 / np.sqrt(precision)
-        return stds, dict(zip(self._names, np.exp(size).tolist(), strict=True))
+            return np.asarray(1.0 / np.sqrt(precision))
+
+    def named(self, size: FloatArray) -> dict[str, float]:
+        """Return the size [m, rad] of each group, given by their logarithms (G,)."""
+        return dict(zip(self._names, np.exp(size).tolist(), strict=True))
 
     def _lengthen(self, squares: FloatArray, more: float, size: FloatArray) -> None:
         """Give offsets of expected squares (P,), larger by `more` sizes, the tails of the prior.

@@ -8,9 +8,10 @@ are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse 
 
     |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
 
-whose left side is normal: this *risk* is one value of the normal distribution. The calibration is
-used at the poses measured if the risk there is below RISK, and further out, in shells of growing
-standard deviation of the predicted position, as far as the risk in each shell is.
+whose left side is normal: this *risk* is one value of the normal distribution, or the mean of some
+with other sizes of errors, which are not known for sure. The calibration is used at the poses
+measured if the risk there is below RISK, and further out, in shells of growing standard deviation
+of the predicted position, as far as the risk in each shell is.
 """
 
 from __future__ import annotations
@@ -229,8 +230,10 @@ class _Judge:
         self._frames = rows[:, :, : len(frames)]
         self._rows = rows[:, :, [column[names[k]] for k in own]]
         self._offsets = posterior.offsets[own]
-        mean, covariance = posterior.doubted
-        self._mean, self._covariance = mean[own], covariance[np.ix_(own, own)]
+        self._doubted = [
+            (weight, mean[own], covariance[np.ix_(own, own)])
+            for weight, mean, covariance in posterior.doubted
+        ]
         self._freedom = freedom
 
     def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
@@ -241,8 +244,12 @@ class _Judge:
         left = (self._rows[which] - self._frames[which] @ taken).reshape(-1, rows.shape[2])
         gain = left @ self._offsets
         slope = left.T @ gain
-        margin = float(slope @ self._mean) - 0.5 * float(gain @ gain)
-        spread = float(np.sqrt(max(float(slope @ self._covariance @ slope), 0.0)))
-        if spread == 0.0:
-            return 0.0 if margin > 0.0 else 1.0
-        return float(special.stdtr(min(self._freedom, KNOWN), -margin / spread))
+        risk = 0.0
+        for weight, mean, covariance in self._doubted:
+            margin = float(slope @ mean) - 0.5 * float(gain @ gain)
+            spread = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
+            if spread == 0.0:
+                risk += weight * (margin <= 0.0)
+            else:
+                risk += weight * float(special.stdtr(min(self._freedom, KNOWN), -margin / spread))
+        return risk
