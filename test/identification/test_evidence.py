@@ -9,6 +9,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.evidence import TYPICAL, considered
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
 
@@ -146,3 +147,40 @@ def test_effects_that_an_arm_has_are_considered_with_their_size():
     assert set(considered(found.chain, found.names)) == set(EFFECTS)
     assert set(EFFECTS) < set(found.posterior.names)
     assert 1e-4 < found.posterior.sizes['drive'] < 1e-3
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_a_joint_that_moves_in_outliers_only_is_told_by_its_prior(seed):
+    """Without them the fit to the rest would be singular, and the noise found nonsense."""
+    rng = np.random.default_rng(seed)
+    q = spread(seed)
+    q[15:, 0] = q[15, 0]
+    problem = problem_of(arm(seed), q, seed)
+    positions = problem.observations.positions
+    positions[:15] += rng.normal(scale=0.05, size=(15, 3))
+    seen = Observations.from_arrays(q, positions)
+    result = identify(replace(problem, observations=seen))
+    assert {outlier.sample for outlier in result.outliers} == set(range(15))
+    rest = identify(replace(problem, observations=seen.select(np.arange(15, 60))))
+    assert result.noise.position == pytest.approx(rest.noise.position, rel=1e-3)
+    assert not result.accepted
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_few_parameters_tell_is_judged_by_other_sizes_as_well(seed):
+    """Several sizes may be, and none is taken that all parameters refute."""
+    few = identify(problem_of(arm(seed), spread(seed, 0.1, 15), seed)).posterior
+    many = identify(problem_of(arm(seed), spread(seed), seed)).posterior
+    for told in (few, many):
+        assert sum(weight for weight, _, _ in told.doubted) == pytest.approx(1.0)
+    name = next(n for n in many.names if n.endswith('.theta') and n in few.names)
+    spans = [
+        np.ptp(
+            [
+                np.sqrt(cov[told.names.index(name), told.names.index(name)])
+                for _, _, cov in told.doubted
+            ]
+        )
+        for told in (few, many)
+    ]
+    assert spans[0] > 10.0 * spans[1]

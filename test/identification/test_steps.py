@@ -9,7 +9,10 @@ import pytest
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.robust import Robust
+from calib_ros.identification.steps import find_step
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, markdown
@@ -159,6 +162,21 @@ def test_a_step_beside_the_fit_is_told_and_harms_nothing():
     assert 'carries no weight' in result.remarks[0]
     assert result.remarks[0] in markdown(result, {}, ())
     assert as_document(result, {})['remarks'] == list(result.remarks)
+
+
+def test_a_step_of_which_samples_are_fitted_is_not_beside_the_fit():
+    true, seen = session(2)
+    problem = Problem(UR10E, moved(seen, true, 'base', 0.02, at=45), **SIGMAS)
+    result = identify(problem)
+    (distances,) = result.distances
+    distances[50] = 1.0
+    system = problem.system(problem.sets)
+    fit = minimise(result.chain, result.names, system, iterations=0)
+    robust = Robust(fit, (distances,), True, 0, problem.loss)
+    step = find_step(problem, result.names, robust)
+    assert step.kind == 'base'
+    assert not step.outside
+    assert step.harmful
 
 
 def test_the_order_is_that_of_the_stamps(rng):
