@@ -384,7 +384,7 @@ class Collector:
 
     def _is_known(self, begin: int, end: int) -> bool:
         """Tell whether a stop was sampled before the clock jumped back; if not, remember it."""
-        where = self._track.at(np.array([(begin + end) // 2])).joints[0]
+        where = self._track.at(np.array([(begin + end) // 2]), standing=True).joints[0]
         begins, lengths = self._stops.stamps, self._stops.values[:, 0]
         meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)
         steps = unwrapped(self._stops.values[meets, 1:] - where, self._revolute)
@@ -401,7 +401,7 @@ class Collector:
             stamps = rows.stamps - self.delay_ns
             due = stamps <= end
             inside = due & (stamps >= calm)
-            motion = self._track.at(stamps[inside])
+            motion = self._track.at(stamps[inside], standing=True)
             good = np.flatnonzero(inside)[motion.cause == 0]
             early = int((due & ~inside).sum())
             if early:

@@ -188,15 +188,19 @@ class Track:
         """Put all samples in order; return how many had the stamp of another one."""
         return sum(rows.sort() for rows in self._parts.values())
 
-    def at(self, stamps: Stamps) -> Motion:
-        """Return the motion at stamps (N,), after `sort`."""
+    def at(self, stamps: Stamps, standing: bool = False) -> Motion:
+        """Return the motion at stamps (N,), after `sort`.
+
+        While the arm stands joint values are interpolated linearly: a cubic beside the end of a
+        stop would hold a part of the move.
+        """
         shape = (len(stamps), len(self._revolute))
         joints, velocity, acceleration, approach = (np.zeros(shape) for _ in range(4))
         for columns, rows in self._by_size():
             index = list(columns)
             revolute = self._revolute[index]
             why, first, last = self._brackets(rows.stamps, stamps)
-            found = _interpolated(rows, stamps, first, last, revolute)
+            found = _interpolated(rows, stamps, first, last, revolute, standing)
             came = _approach(rows.values, first, found[0], self._came[index], revolute)
             good = np.ix_(why == 0, index)
             for whole, part in zip(
@@ -317,11 +321,12 @@ def _interpolated(
     first: NDArray[np.intp],
     last: NDArray[np.intp],
     revolute: NDArray[np.bool_],
+    straight: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return values, velocities and accelerations (N, n) of the cubic through four samples.
 
     Two before and two after the stamp (Lagrange). At the ends of the recording and beside equal
-    stamps, where there are fewer, values are interpolated linearly.
+    stamps, where there are fewer, values are interpolated linearly; with `straight` everywhere.
     """
     known, values = rows.stamps, rows.values
     nothing = np.zeros((len(stamps), values.shape[1]))
@@ -333,6 +338,8 @@ def _interpolated(
     step = unwrapped(values[last] - origin, revolute)
     joints = origin + share[:, np.newaxis] * step
     velocity = step / np.maximum(span, 1e-9)[:, np.newaxis]
+    if straight:
+        return joints, velocity, nothing
     before, behind = first - 1, np.maximum(last, first + 1) + 1
     inner = (before >= 0) & (behind < rows.count)
     near = np.stack([first - 1, first, np.maximum(last, first + 1), behind])[:, inner]

@@ -27,8 +27,8 @@ def filled(samples, columns=BOTH, **options):
     return made
 
 
-def at(made, *ms):
-    return made.at(np.array([round(each * MS) for each in ms], dtype=np.int64))
+def at(made, *ms, **options):
+    return made.at(np.array([round(each * MS) for each in ms], dtype=np.int64), **options)
 
 
 def words(motion):
@@ -85,6 +85,15 @@ def test_a_cubic_does_not_reach_over_a_pause_in_the_samples():
     motion = at(made, *range(4, 91))
     assert motion.joints.min() >= 0.0
     assert motion.joints.max() <= 1.0
+
+
+def test_within_a_stop_nothing_of_the_moves_beside_it_shows():
+    """The cubic through a sample of the move would be off by a sixteenth of it."""
+    made = filled([(0, (0.5, 0)), (50, (0, 0)), (100, (1e-4, 0)), (150, (0.5, 0))])
+    assert at(made, 75).joints[0, 0] < -0.05
+    stood = at(made, 50, 75, 100, standing=True)
+    np.testing.assert_allclose(stood.joints, [[0, 0], [5e-5, 0], [1e-4, 0]], atol=1e-15)
+    assert words(stood) == ['', '', '']
 
 
 def test_stamps_of_today_are_interpolated_to_the_nanosecond():
