@@ -31,10 +31,15 @@ WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
 
 
-def summary(result: Identification, numbers: Mapping[Outlier, int] | None = None) -> str:
+def summary(
+    result: Identification,
+    numbers: Mapping[Outlier, int] | None = None,
+    warnings: Sequence[str] = (),
+) -> str:
     """Return the one line that an operator reads.
 
-    With the `numbers` of the samples that are outliers these are named.
+    With the `numbers` of the samples that are outliers these are named; `warnings` are of the
+    measurements.
     """
     before, after = (result.validation or result.fitted).figures
     text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
@@ -60,8 +65,8 @@ def summary(result: Identification, numbers: Mapping[Outlier, int] | None = None
     weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
         text += f'; weakly determined: {", ".join(weak)}'
-    if result.remarks:
-        text += f'; note: {"; ".join(result.remarks)}'
+    if notes := (*warnings, *result.remarks):
+        text += f'; note: {"; ".join(notes)}'
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'

@@ -83,6 +83,7 @@ class Snapshot(NamedTuple):
     numbers: dict[Sample, int]
     origin: dict[str, Any]
     configuration: str
+    warnings: tuple[str, ...]
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the numbers by which the operator knows the samples that are outliers."""
@@ -308,7 +309,8 @@ class CalibrationNode(Node):
         }
         model = self.session.settings.model
         numbers = {sample: k + 1 for k, sample in enumerate(self.session.samples)}
-        found = Snapshot(problem, model, samples, numbers, origin, self._configuration())
+        warnings = self.session.warnings
+        found = Snapshot(problem, model, samples, numbers, origin, self._configuration(), warnings)
         self._progress.begin()
         return found
 
@@ -316,7 +318,8 @@ class CalibrationNode(Node):
         """Identify, on a thread of its own; publish only what is accepted."""
         with self._progress.running():
             result = identify_model(given.problem, given.model, self._progress)
-        self._last = words.summary(result, given.numbers_of(result.outliers))
+        numbers = given.numbers_of(result.outliers)
+        self._last = words.summary(result, numbers, given.warnings)
         self._observability = words.observability_in_words(result)
         self._residuals.publish(
             to_ros.residual_markers(

@@ -33,11 +33,17 @@ WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
+STILL = 6.0
+"""What `still` must be at least [noise of the joints] for a stop to show as one."""
+MOST_RESTS = 1000
+"""Rests in which no stop shows that are counted."""
 MOST_STREAMS = 50
 """Streams of measurements that are told apart: a tracker may number its markers without end."""
 _DISTANCE, _POSITION, _QUAT, _COVARIANCE = slice(0, 1), slice(0, 3), slice(3, 7), slice(7, 43)
 _WIDTH = 43
 TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
+VIBRATING = 'poses: still vibrating, or a spike'
+RESTLESS = 'poses: a stop that spreads more than the noise'
 _ONE = np.ones(1, dtype=bool)
 _FOREVER = np.iinfo(np.int64).max
 
@@ -78,6 +84,9 @@ class Collector:
         self._advanced_ns = 0  # the newest joint sample at the last round
         self._settled_ns = 0  # measurements before have been dealt with
         self._sampled_ns = 0  # a stop that stands at this moment has been sampled
+        self._stopped = 0  # how many stops were sampled
+        self._unseen: list[float] = []  # noise of the joints at rests in which no stop shows
+        self._rests = False
         self._backwards = 0
         self._fresh: list[Sample] = []
         self.delay_ns = round(settings.delay * 1e9)
@@ -102,6 +111,7 @@ class Collector:
     def find_delay(self, chain: Chain, now_ns: int | None) -> Delay | None:
         """Return how late the waiting measurements are, and take it into account from now on.
 
+        One that has rivals is not taken into account.
         Only what is older by `lateness` than the stamp `now_ns` counts, of which all has come;
         None: everything counts.
         """
@@ -130,8 +140,9 @@ class Collector:
         convincing = [delay for delay in found if delay is not None]
         if not convincing:
             return None
-        best = max(convincing, key=lambda delay: delay.correlation)
-        self.delay_ns = round(best.seconds * 1e9)
+        best = max(convincing, key=lambda delay: (not delay.rivals, delay.correlation))
+        if not best.rivals:
+            self.delay_ns = round(best.seconds * 1e9)
         return best
 
     def take(self) -> list[Sample]:
@@ -248,6 +259,19 @@ class Collector:
             return 'the arm stands and is sampled: move on'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
+    @property
+    def still_needed(self) -> float | None:
+        """Return what `still` must be at least where more rests passed unseen than not."""
+        if len(self._unseen) <= self._stopped:
+            return None
+        needed = STILL * float(np.median(self._unseen))
+        return needed if needed > self.settings.still else None
+
+    @property
+    def unrest(self) -> int:
+        """Return how many measurements at stops were not at rest."""
+        return self.dropped[VIBRATING] + self.dropped[RESTLESS]
+
     def capture(self) -> tuple[int, str]:
         """Take one sample of each stream now; return how many, and why not more in words."""
         if self.settings.mode == 'continuous':
@@ -335,7 +359,9 @@ class Collector:
         )
         newest = self._track.newest_ns
         done = self._settled_ns
-        for begin, end in self._track.standing(settings.still, WINDOW).tolist():
+        stands = self._track.standing(settings.still, WINDOW)
+        self._look_for_rest(bool((np.diff(stands) >= shortest).any()))
+        for begin, end in stands.tolist():
             goes_on = end >= newest
             if ends_here:
                 end, goes_on = min(end, until), False
@@ -368,6 +394,13 @@ class Collector:
                 self._sampled_ns = done
         return self._drop(done, until, 'the arm was moving')
 
+    def _look_for_rest(self, found: bool) -> None:
+        """Note the noise of the joints where they rest though no stop is `found`."""
+        noise = None if found else self._track.noise_at_rest(ADVANCE_NS)
+        before, self._rests = self._rests, noise is not None
+        if noise is not None and not before and len(self._unseen) < MOST_RESTS:
+            self._unseen.append(noise)
+
     def _drop(self, after: int, until: int, why: str) -> int:
         """Drop what was measured after a stamp and until another; return the latter."""
         for rows in self._waiting.values():
@@ -396,6 +429,7 @@ class Collector:
 
     def _average(self, begin: int, end: int) -> None:
         """Make one sample of each stream from what was measured in a stop."""
+        self._stopped += 1
         calm = begin + round(self.settings.settle * 1e9)
         for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
@@ -425,11 +459,11 @@ class Collector:
         try:
             mean = average(measured, rotations, sigma)
         except RestlessError:
-            self.dropped['poses: a stop that spreads more than the noise'] += len(good)
+            self.dropped[RESTLESS] += len(good)
             return
         left_out = int((~mean.used).sum())
         if left_out:
-            self.dropped['poses: still vibrating, or a spike'] += left_out
+            self.dropped[VIBRATING] += left_out
         stamp = round(float((rows.stamps[good][mean.used] - rows.stamps[good][0]).mean()))
         self._make(key, int(rows.stamps[good][0]) + stamp, mean, values[mean.used], motion, None)
 

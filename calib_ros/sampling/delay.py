@@ -10,11 +10,13 @@ parabola; the identification then fits the rest as a parameter (`base.delay`).
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import find_peaks
 
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -29,6 +31,10 @@ LEAST_MOTION = 3.0
 """Time in motion that is needed [s]."""
 CONVINCING = 0.8
 """Least correlation."""
+RISE = 0.02
+"""Least rise of the correlation beyond a valley for another peak."""
+RIVAL = 3.0
+"""A rival explains the speeds unless it leaves so many times what the best delay leaves."""
 MOVING = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
 FEWEST = 10
@@ -43,51 +49,87 @@ DENSE_NS = 4_000_000
 """Time between two samples that it keeps; nearer ones tell no more."""
 SMOOTHING = 0.05
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
+CLOCKS_MOVED = 0.05
+"""Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
+MOST_MOVES = 5
+"""Moves of the clocks that are remembered."""
 
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later than the joints' the stamps of measurements are, and how sure it is."""
+    """How much later than the joints' the stamps of measurements are, and how sure it is.
+
+    Where the motion repeats itself, `rivals` [s] explain it nearly as well.
+    """
 
     seconds: float
     correlation: float
+    rivals: tuple[float, ...] = ()
 
 
 class Watch:
-    """Joint values and poses while the arm moves between stops, to see whether the clocks agree.
+    """Joint values and poses while the arm moves, to see whether the clocks agree.
+
+    Once that is seen it sleeps until measurements at stops show unrest: where a clock was moved
+    they do, and are left out or refused.
 
     Parameters
     ----------
-    joints : int
-        Number of joints.
+    chain : Chain
+    sleepless : bool
+        Watch all the time, as there are no stops.
 
     """
 
-    def __init__(self, joints: int) -> None:
-        self._joints = Rows(joints, WATCHED)
+    def __init__(self, chain: Chain, sleepless: bool) -> None:
+        self._chain = chain
+        self._sleepless = sleepless
+        self._joints = Rows(len(chain.joints), WATCHED)
         self._poses = Rows(7, WATCHED)
         self._begun_ns = 0
         self._last_ns = [0, 0]
+        self._unrest = 0
+        self._taken = self._agreed = 0
+        self.awake = True
+        self.delay: Delay | None = None
+        """The last one seen."""
+        self.unclear: Delay | None = None
+        """One with rivals, while no other was seen."""
+        self.moves: deque[tuple[float, int]] = deque(maxlen=MOST_MOVES)
+        """By how much [s] it changed, and after how many samples at least."""
 
-    def add_joints(self, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Take joint values; return whether it is time to look."""
+    def wake(self, unrest: int, taken: int) -> None:
+        """Watch again if more measurements at stops were not at rest, with so many samples."""
+        if unrest > self._unrest and not self.awake:
+            self.awake, self._agreed = True, self._taken
+        self._unrest, self._taken = unrest, taken
+
+    def add_joints(self, stamp_ns: int, values: Sequence[float]) -> None:
+        """Take joint values, and look if it is time to."""
+        if not self.awake:
+            return
         if not self._begun_ns:
             self._begun_ns = stamp_ns
         if abs(stamp_ns - self._last_ns[0]) >= DENSE_NS and not self._joints.full:
             self._last_ns[0] = stamp_ns
             self._joints.append(stamp_ns, values)
-        return abs(stamp_ns - self._begun_ns) > WATCH_NS
+        if abs(stamp_ns - self._begun_ns) > WATCH_NS:
+            self._look()
 
     def add_pose(
         self, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float] | None
     ) -> None:
         """Take a measured pose or position."""
+        if not self.awake:
+            return
         if abs(stamp_ns - self._last_ns[1]) >= DENSE_NS and not self._poses.full:
             self._last_ns[1] = stamp_ns
             self._poses.append(stamp_ns, (*position, *(quat_xyzw or ())))
 
     def uneventful(self, stamps: Stamps) -> NDArray[np.bool_]:
         """Return (M,) at which stamps of joint values it is not yet time to look."""
+        if not self.awake:
+            return np.ones(len(stamps), dtype=bool)
         quiet = np.abs(stamps - self._begun_ns) <= WATCH_NS
         return quiet if self._begun_ns else np.zeros(len(stamps), dtype=bool)
 
@@ -100,6 +142,8 @@ class Watch:
         self._extend(1, self._poses, stamps, numbers)
 
     def _extend(self, which: int, rows: Rows, stamps: Stamps, values: FloatArray) -> None:
+        if not self.awake:
+            return
         chosen: list[int] = []
         last = self._last_ns[which]
         room = rows.capacity - rows.count
@@ -110,14 +154,14 @@ class Watch:
         self._last_ns[which] = last
         rows.extend(stamps[chosen], values[chosen])
 
-    def look(self, chain: Chain) -> Delay | None:
-        """Return the delay if it shows, and begin anew."""
+    def _look(self) -> None:
+        """Look what the motion shows, and begin anew."""
         self._joints.sort()
         self._poses.sort()
         values = self._poses.values
         oriented = len(values) > 0 and not np.isnan(values).any()
         found = find_delay(
-            chain,
+            self._chain,
             self._joints.stamps,
             self._joints.values,
             self._poses.stamps,
@@ -127,7 +171,19 @@ class Watch:
         for rows in (self._joints, self._poses):
             rows.keep(np.zeros(rows.count, dtype=bool))
         self._begun_ns = 0
-        return found
+        if found is None:
+            return
+        known = self.delay
+        every = (found.seconds, *found.rivals)
+        if known is None or min(abs(each - known.seconds) for each in every) > CLOCKS_MOVED:
+            if found.rivals:
+                self.unclear = found if known is None else None
+                return
+            if known is not None:
+                self.moves.append((found.seconds - known.seconds, self._agreed))
+            self.delay, self.unclear = found, None
+        self._agreed = self._taken
+        self.awake = self._sleepless
 
 
 def find_delay(
@@ -170,7 +226,19 @@ def find_delay(
     left, middle, right = score[best - 1 : best + 2]
     bend = left - 2.0 * middle + right
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
-    return Delay(float(lags[best] + shift * STEP), float(score[best]))
+    return Delay(
+        float(lags[best] + shift * STEP),
+        float(score[best]),
+        tuple(lags[_rivals(score, best)].tolist()),
+    )
+
+
+def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
+    """Return where other peaks of the correlation are nearly as high as the best."""
+    peaks, _ = find_peaks(np.pad(score, 1, constant_values=-1.0), prominence=RISE)
+    others = peaks[peaks - 1 != best] - 1
+    left, least = (1.0 - np.maximum(score[k], 0.0) ** 2 for k in (others, best))
+    return np.asarray(others[left < RIVAL * least])
 
 
 def _speed(

@@ -28,12 +28,13 @@ from calib_ros.sampling.account import Account
 from calib_ros.sampling.calibration import Calibration
 from calib_ros.sampling.collector import Collector, StreamKey
 from calib_ros.sampling.delay import Delay, Watch
+from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved, restless, sparse
 from calib_ros.sampling.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.sampling.names import FrameNames, JointNames, strange
 from calib_ros.sampling.sample import Sample, collect, named
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.strays import JOINTS, POSES, STRAY, Gate
-from calib_ros.sampling.track import Stamps
+from calib_ros.sampling.track import APART, Stamps
 from calib_ros.settings import Settings
 
 Positions: TypeAlias = NDArray[np.intp]
@@ -123,9 +124,8 @@ class CalibrationSession:
         """Messages that came so far, by stream."""
         self.latest: tuple[int, Sequence[float]] | None = None
         """Stamp [ns] and values of the last joint state that named all joints."""
-        self._watch = None if continuous else Watch(len(self.chain.joints))
-        self.delay: Delay | None = None
-        """How late the measurements are stamped, as far as the motion shows."""
+        self._watch = Watch(self.chain, sleepless=continuous)
+        self._found: Delay | None = None  # in the motion that is sampled
         self._dropped: Counter[str] = Counter()
         self._unused: Counter[str] = Counter()
         self._notes: Counter[str] = Counter()
@@ -195,8 +195,8 @@ class CalibrationSession:
         """Keep joint values."""
         self._watch_order(JOINTS, stamp_ns)
         self._look_for_delay(stamp_ns)
-        if self._watch is not None and len(columns) == len(self.chain.joints):
-            self._watch_clocks(stamp_ns, values)
+        if len(columns) == len(self.chain.joints):
+            self._watch.add_joints(stamp_ns, values)
         self._collector.add_joints(columns, stamp_ns, values)
         self._take()
 
@@ -230,7 +230,7 @@ class CalibrationSession:
         if self._collector.holding:
             since = stamps - self._looked_ns
             quiet &= (since >= 0) & (since < LOOK_AGAIN_NS)
-        if self._watch is not None and len(columns) == len(self.chain.joints):
+        if len(columns) == len(self.chain.joints):
             quiet &= self._watch.uneventful(stamps)
         return quiet
 
@@ -263,8 +263,7 @@ class CalibrationSession:
         if whole:
             stamps, values = _in_order(whole)
             self.latest = (int(stamps[-1]), values[-1].tolist())
-            if self._watch is not None:
-                self._watch.extend_joints(stamps, values)
+            self._watch.extend_joints(stamps, values)
         used = [(where, s, each) for where, s, each in measured if self._keep_readings(s, each)]
         self._watch_orders(POSES, [(where, each.stamps_ns) for where, _, each in used])
         seen = [
@@ -272,7 +271,7 @@ class CalibrationSession:
             for where, source, each in used
             if not each.distance and not source.eye_in_hand
         ]
-        if seen and self._watch is not None:
+        if seen and self._watch.awake:
             self._watch.extend_poses(*_in_order(seen))
 
     def _keep_readings(self, source: Source, readings: messages.Readings) -> bool:
@@ -314,7 +313,7 @@ class CalibrationSession:
     def _add_pose(self, key: StreamKey, reading: messages.Reading) -> None:
         """Keep a measurement."""
         self._watch_order(POSES, reading.stamp_ns)
-        if self._watch is not None and reading.position is not None and not key.eye_in_hand:
+        if reading.position is not None and not key.eye_in_hand:
             self._watch.add_pose(reading.stamp_ns, reading.position, reading.quat_xyzw)
         self._collector.add(key, reading)
 
@@ -476,18 +475,41 @@ class CalibrationSession:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Return what an engineer should know about the measurements."""
-        found = []
+        return tuple(hint.text for hint in self.hints)
+
+    @property
+    def hints(self) -> list[Hint]:
+        """Return what looks wrong in what is heard."""
+        found: list[Hint | None] = []
         if self._different:
-            found.append(f'{self._different}, {ONE_FRAME}')
-        delay = self._disagreement
-        if delay is not None:
-            left = delay - self.settings.delay
-            words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
             found.append(
-                f'measurements are stamped {words} than the joint states of their time: '
-                f'set delay to {delay:.3f}, or make the clocks agree'
+                Hint(f'{self._different}: set frame_id', f'{self._different}, {ONE_FRAME}')
             )
-        return tuple(found)
+        if self._watch.moves:
+            found.append(moved(self._watch.moves))
+        elif self._disagreement is not None:
+            found.append(disagreement(self._disagreement, self.settings.delay))
+        unclear = self._found if self.settings.mode == 'continuous' else self._watch.unclear
+        if unclear is not None and unclear.rivals and not self.settings.delay:
+            found.append(ambiguous((unclear.seconds, *unclear.rivals)))
+        needed = self._collector.still_needed
+        if needed is not None:
+            found.append(restless(needed, self.settings.still))
+        between = self._collector.dropped[f'poses: {APART}']
+        found.append(sparse(between, self.received['poses'], self.settings.max_gap))
+        return [hint for hint in found if hint is not None]
+
+    @property
+    def delay(self) -> Delay | None:
+        """Return how late the measurements are stamped, as far as the motion shows."""
+        if self.settings.mode != 'continuous':
+            return self._watch.delay
+        return None if self._found is None or self._found.rivals else self._found
+
+    @property
+    def _came(self) -> str:
+        """Return in words what became of the messages, and what looks wrong in them."""
+        return '; '.join((str(self.account()), *self.warnings))
 
     @property
     def _disagreement(self) -> float | None:
@@ -511,10 +533,7 @@ class CalibrationSession:
         fitted = [sample for sample in self.usable if not sample.validation]
         estimate = self.estimate
         words = [self.state, work]
-        if self._different:
-            words.append(f'{self._different}: set frame_id')
-        if self._disagreement is not None:
-            words.append(f'stamps disagree: set delay to {self._disagreement:.3f}')
+        words += [hint.status for hint in self.hints]
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
             words.append(f'sample {number} does not fit to the others, was the target moved?')
@@ -574,7 +593,7 @@ class CalibrationSession:
         settings = self.settings
         fitted, held_out = collect(samples, (settings.sigma_position, settings.sigma_orientation))
         if not fitted:
-            raise InputError(f'no samples to fit: {self.account()}')
+            raise InputError(f'no samples to fit: {self._came}')
         return Problem(
             self.chain,
             fitted[0],
@@ -590,7 +609,7 @@ class CalibrationSession:
         try:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
-            raise InputError(f'{err} ({self.account()})') from err
+            raise InputError(f'{err} ({self._came})') from err
         self.adopt(result, self.samples)
         return result
 
@@ -664,6 +683,7 @@ class CalibrationSession:
             if not self._is_strange(sample):
                 self.samples.append(sample)
                 self.on_sample(sample)
+        self._watch.wake(self._collector.unrest, len(self.samples))
 
     def _watch_order(self, stream: str, stamp_ns: int) -> None:
         """Note stamps that go backwards; samples go by stamps, so nothing is lost by it."""
@@ -684,14 +704,6 @@ class CalibrationSession:
             self._notes[f'{stream} with a stamp older than the one before'] += back
         self._newest[stream] = int(newest[-1])
 
-    def _watch_clocks(self, stamp_ns: int, values: Sequence[float]) -> None:
-        """Look between stops whether the clocks agree, until it shows."""
-        assert self._watch is not None
-        if self._watch.add_joints(stamp_ns, values):
-            self.delay = self._watch.look(self.chain)
-            if self.delay is not None:
-                self._watch = None
-
     def _look_for_delay(self, now_ns: int | None) -> None:
         """Look for the delay of the measurements after some time of motion, until it shows.
 
@@ -703,7 +715,7 @@ class CalibrationSession:
         if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
             return
         self._looked_ns = now_ns or 0
-        self.delay = collector.find_delay(self.chain, now_ns)
+        self._found = collector.find_delay(self.chain, now_ns)
         collector.holding = self.delay is None and now_ns is not None
 
 

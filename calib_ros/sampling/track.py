@@ -23,13 +23,13 @@ MOVED = 1e-3
 """A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
 LAGS = 4
 """Samples within the window with which the present one is compared."""
+FEWEST = 8
+"""Fewest samples that tell the noise of joints."""
+MOST_SPREAD = 2.0
+"""Largest spread [noise] of joints that stand; a motion is in the spread, not in the noise."""
 
-CAUSES = (
-    '',
-    'no joint sample before',
-    'no joint sample after',
-    'joint samples too far apart',
-)
+APART = 'joint samples too far apart'
+CAUSES = ('', 'no joint sample before', 'no joint sample after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
 
 
@@ -266,6 +266,25 @@ class Track:
                 found = _intersection(found, _union([stands[columns], unheard]))
             common = found if common is None else _intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
+
+    def noise_at_rest(self, time_ns: int) -> float | None:
+        """Return the standard deviation [rad or m] of the noisiest joint, after `sort`.
+
+        Second differences of the last samples of some time show it, with no motion in them (von
+        Neumann 1941). None where they are too few, or spread more than that: the arm moves.
+        """
+        largest = None
+        for columns, rows in self._parts.items():
+            first = int(np.searchsorted(rows.stamps, self.newest_ns - time_ns))
+            values = rows.values[max(0, min(first, rows.count - FEWEST)) :]
+            if len(values) < FEWEST:
+                return None
+            values = _continuous(values, self._revolute[list(columns)])
+            noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)
+            if (values.std(axis=0) > MOST_SPREAD * noise).any():
+                return None
+            largest = max(largest or 0.0, float(noise.max()))
+        return largest
 
     def release(self, before_ns: int) -> int:
         """Let go the samples before a stamp, after `sort`; return how many.

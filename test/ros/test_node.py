@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy: what it hears, keeps, answers and publishes."""
 
+import json
 import queue
 import signal
 import threading
@@ -49,6 +50,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros.apply.simulation import Cell as SimulatedCell
 from calib_ros.apply.simulation import faulty, measure, random_frame
+from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError
 from calib_ros.files.archive import Archive
 from calib_ros.files.bags import replay, write_bag
@@ -111,6 +113,48 @@ def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, ex
         assert live.delay == expected.delay == replayed.delay
         if mode == 'continuous':
             assert abs(live.delay.seconds - 0.03) < 0.002
+
+
+def with_a_hole(recording):
+    """Return a recording without the joint states of its last seven stops but for the end."""
+    stamps = recording.joint_stamps_ns
+    begin, end = stamps[0] + 17 * 10**9, stamps[-1] - 5 * 10**8
+    kept = (stamps < begin) | (stamps > end)
+    return replace(recording, joint_stamps_ns=stamps[kept], joints=recording.joints[kept])
+
+
+def with_noise(recording):
+    """Return a recording with joint values that never stay within `still`."""
+    noise = np.random.default_rng(8).normal(scale=3e-4, size=recording.joints.shape)
+    return replace(recording, joints=recording.joints + noise)
+
+
+@pytest.mark.parametrize(
+    ('spoilt', 'accepted', 'said', 'status'),
+    [
+        (with_a_hole, True, 'max_gap (0.1 s): 20 Hz or more are needed', '20 Hz or more'),
+        (with_noise, False, 'hardly ever rest within still (0.0005)', 'set still to 0.00'),
+    ],
+)
+def test_what_looks_wrong_is_told_live_and_of_a_bag(
+    tmp_path, capfd, recording, spoilt, accepted, said, status
+):
+    recording = spoilt(recording)
+    write_bag(tmp_path / 'bag', recording, 'mcap')
+    arguments = ['identify', str(tmp_path / 'bag'), '--chain', 'ur10e', '--json']
+    arguments += ['--largest-loss', '1']
+    assert (main(arguments) == 0) == accepted
+    heard = capfd.readouterr()
+    assert said in heard.err
+    if accepted:
+        assert said in ''.join(json.loads(heard.out)['warnings'])
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        words = cell.listen(String, 'calibration_node/status')
+        cell.play(topics(recording))
+        answer = cell.call('identify')
+        assert answer.success == accepted
+        assert said in answer.message
+        cell.spin_until(lambda: words and status in words[-1].data)
 
 
 @pytest.fixture

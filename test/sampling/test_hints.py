@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint states that are slow, noisy or on another clock: as good as they can be, or told."""
 
+import re
+
 import numpy as np
 import pytest
-from streams import POSE, TRACKER, joint_state, pose, stamps, stops
+from streams import POSE, START, TRACKER, S, joint_state, pose, stamps, stops, sweep
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -21,24 +24,39 @@ def tour(count, seed=2):
     return stops(0.5 * UR5E.random_joints(count, np.random.default_rng(seed)))
 
 
-def heard(motion, seconds, rate=100.0, noise=0.0, late=lambda times: 0.0, **settings):
+def heard(
+    motion,
+    seconds,
+    rate=100.0,
+    noise=0.0,
+    hole=(0.0, 0.0),
+    late=lambda times: 0.0,
+    shaken=(0.0, 0.0),
+    **more,
+):
     """Return a session that has heard joint states at a rate, with noise, and poses at 50 Hz.
 
-    Poses are stamped `late` by a function of times (N,) [s].
+    There are no joint states in the `hole` [s], poses are stamped `late` by a function of times
+    (N,) [s], and the target vibrates for half of each second while it is `shaken` [s]; `more` are
+    settings.
     """
     rng = np.random.default_rng(3)
     times, measured = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.003, seconds - 0.3, 0.02)
+    times = times[(times < hole[0]) | (times >= hole[1])]
     joints = motion(times)
     joints = joints + rng.normal(scale=noise, size=joints.shape)
     seen = measure(TRUE, motion(measured), rng, 2e-5, 1e-4)
+    swing = 2e-3 * np.exp(-(measured % 1.0) / 0.08) * np.sin(50.0 * measured)
+    swing *= (measured >= shaken[0]) & (measured < shaken[1])
+    positions = seen.positions + swing[:, np.newaxis]
     measured = measured + late(measured)
-    made = CalibrationSession(UR5E, Settings(**settings))
+    made = CalibrationSession(UR5E, Settings(**more))
     events = [(time, 0, k) for k, time in enumerate(times.tolist())]
     events += [(time, 1, k) for k, time in enumerate(measured.tolist())]
     known, others = stamps(times).tolist(), stamps(measured).tolist()
     for _, kind, k in sorted(events):
         if kind:
-            message = pose(others[k], seen.positions[k], seen.rotations[k])
+            message = pose(others[k], positions[k], seen.rotations[k])
             made.take(TRACKER, POSE, message)
         else:
             made.take_joints(joint_state(known[k], UR5E.joint_names, joints[k].tolist()))
@@ -60,3 +78,125 @@ def test_slow_joint_states_cost_no_accuracy_at_stops(rate):
     made.finish()
     assert len(made.samples) == 25
     assert error(made.identify().chain, motion, 49.0) < 0.006
+
+
+def told(made):
+    """Return the warnings of a session, which its status and its refusals hold as well."""
+    for hint in made.hints:
+        assert hint.status in made.status()
+    assert made.warnings == tuple(hint.text for hint in made.hints)
+    return made.warnings
+
+
+@pytest.mark.parametrize('rate', [50.0, 100.0, 500.0])
+@pytest.mark.parametrize('mode', ['dwell', 'triggered'])
+def test_joints_that_hardly_rest_within_still_are_told_and_what_to_set(rate, mode):
+    motion = tour(15)
+    made = heard(motion, 29.5, rate, noise=3e-4, mode=mode)
+    assert len(told(made)) == 1  # while it lasts already
+    made.finish()
+    assert made.samples == []
+    (warning,) = told(made)
+    with pytest.raises(InputError, match=re.escape(warning)):
+        made.identify()
+    found = re.search(r'hardly ever rest within still \(0.0005\), .* set still to (\S+),', warning)
+    still = float(found[1])
+    assert still == pytest.approx(6 * 3e-4, rel=0.3)
+    better = heard(motion, 29.5, rate, noise=3e-4, still=still)
+    better.finish()
+    assert len(better.samples) == 15
+    assert told(better) == ()
+
+
+@pytest.mark.parametrize(
+    ('motion', 'noise'),
+    [
+        (sweep(6, np.random.default_rng(5)), 3e-4),  # never stands
+        (stops(UR5E.random_joints(60, np.random.default_rng(5)), 0.4, 0.1), 0.0),  # hardly
+        (tour(15), 5e-5),  # is sampled
+    ],
+)
+@pytest.mark.parametrize('rate', [10.0, 100.0])
+def test_nothing_is_told_of_still_where_the_arm_moves_or_is_sampled(motion, noise, rate):
+    made = heard(motion, 29.5, rate, noise=noise)
+    made.finish()
+    assert told(made) == ()
+
+
+def test_joint_states_that_are_too_slow_are_told_and_the_rate_needed():
+    made = heard(tour(15), 29.5, 8.0)
+    made.finish()
+    (warning,) = told(made)
+    assert re.match(r'\d{4} of 1460 measurements lie between joint states', warning)
+    assert 'further apart than max_gap (0.1 s): 20 Hz or more are needed' in warning
+    with pytest.raises(InputError, match=re.escape(warning)):
+        made.identify()
+    better = heard(tour(15), 29.5, 20.0)
+    better.finish()
+    assert told(better) == ()
+
+
+@pytest.mark.parametrize(('pause', 'count'), [(5.0, 0), (7.0, 1)])
+def test_of_a_pause_in_the_joint_states_a_fifth_must_have_been_measured(pause, count):
+    made = heard(tour(15), 29.5, hole=(10.0, 10.0 + pause))
+    made.finish()
+    assert len(told(made)) == count
+
+
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+@pytest.mark.parametrize('step', [0.15, 0.4, -0.15, -0.4])
+def test_a_clock_that_is_moved_is_told_with_the_sample(step, mode):
+    seconds = 79.0
+    made = heard(
+        tour(40), seconds, late=lambda times: np.where(times > 30.0, step, 0.0), mode=mode
+    )
+    made.finish()
+    (warning,) = told(made)
+    found = re.search(r'by ([+-]\d\.\d+) s after about (\d+) samples', warning)
+    assert float(found[1]) == pytest.approx(step, abs=0.01)
+    stamps_ns = np.array([sample.stamp_ns for sample in made.samples])
+    before = int((stamps_ns < START + 30 * S).sum())
+    if mode == 'dwell':
+        assert int(found[2]) - before in (0, 1)
+    else:
+        assert before - 15 * 50 <= int(found[2]) <= before
+
+
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+def test_clocks_that_agree_all_the_time_are_not_told_of(mode):
+    """Measurements that vibrate at some stops, or a target that slips, move no clock."""
+    made = heard(tour(40), 79.0, shaken=(30.0, 50.0), mode=mode)
+    made.finish()
+    assert told(made) == ()
+    if mode == 'dwell':
+        assert made.account().dropped['poses: still vibrating, or a spike'] > 10
+
+
+def back_and_forth(times):
+    """Return joints that go to and fro between two places, 0.4 s each way, and rest 0.3 s."""
+    ends = 0.5 * UR5E.random_joints(2, np.random.default_rng(0))
+    return stops(np.tile(ends, (100, 1)), 0.4, 0.3)(times)
+
+
+@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
+def test_a_delay_that_periodic_motion_leaves_open_is_told_and_not_applied(mode):
+    made = heard(back_and_forth, 40.0, mode=mode, settle=0.0)
+    (warning,) = told(made)
+    assert re.search(r'may be -0\.70 or 0\.00 or 0\.70 s, for the motion repeats itself', warning)
+    made.finish()
+    assert made.delay is None
+    assert {sample.delay for sample in made.samples} == {0.0}
+    assert told(made) == (warning,)
+    known = heard(back_and_forth, 40.0, mode=mode, delay=1e-4)
+    assert told(known) == ()
+
+
+def test_a_delay_left_open_is_found_when_the_motion_is_less_regular():
+    def motion(times):
+        later = np.asarray(times) > 20.0
+        return np.where(later[:, np.newaxis], tour(60)(times), back_and_forth(times))
+
+    made = heard(motion, 60.0, late=lambda times: 0.15)
+    made.finish()
+    (warning,) = told(made)
+    assert re.search(r'0\.1[45]\d s later', warning)

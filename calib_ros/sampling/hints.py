@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What looks wrong in what is heard, and what to do: words for the status, and a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+MANY = 20
+"""Fewest measurements without joint values of which it is told."""
+SHARE = 0.2
+"""Least share of them."""
+
+
+class Hint(NamedTuple):
+    """One thing that looks wrong, in a few words for the status and in a sentence."""
+
+    status: str
+    text: str
+
+
+def restless(needed: float, still: float) -> Hint:
+    """Tell that joints stand, but hardly ever within `still`; how much is `needed` [rad or m]."""
+    return Hint(
+        f'joints hardly ever rest within still: set still to {needed:.2g}',
+        f'the joints hardly ever rest within still ({still:g}), though the arm stands: their '
+        f'values are noisy, set still to {needed:.2g}, 6 x their noise',
+    )
+
+
+def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
+    """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
+    if between < MANY or between <= SHARE * measurements:
+        return None
+    rate = f'{2.0 / max_gap:g} Hz or more'
+    return Hint(
+        f'joint states are too rare: {rate} are needed',
+        f'{between} of {measurements} measurements lie between joint states further apart than '
+        f'max_gap ({max_gap:g} s): {rate} are needed',
+    )
+
+
+def disagreement(delay: float, known: float) -> Hint:
+    """Tell that the clocks disagree: the `delay` [s] that the motion shows is not the `known`."""
+    left = delay - known
+    words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
+    return Hint(
+        f'stamps disagree: set delay to {delay:.3f}',
+        f'measurements are stamped {words} than the joint states of their time: '
+        f'set delay to {delay:.3f}, or make the clocks agree',
+    )
+
+
+def ambiguous(delays: Sequence[float]) -> Hint:
+    """Tell that several delays [s] explain a motion that repeats itself."""
+    words = ' or '.join(f'{round(delay, 2) + 0.0:.2f}' for delay in sorted(delays))
+    return Hint(
+        f'delay not clear, {words} s: move less regularly',
+        f'the delay of the measurements may be {words} s, for the motion repeats itself: none is '
+        'used. Move less regularly for 15 s, or set delay',
+    )
+
+
+def moved(steps: Collection[tuple[float, int]]) -> Hint:
+    """Tell by how much [s] the clocks moved against each other, and after how many samples."""
+    words = ', '.join(f'by {seconds:+.3f} s after about {count}' for seconds, count in steps)
+    return Hint(
+        f'clocks moved after about {max(count for _, count in steps)} samples: make them agree',
+        f'the stamps of the measurements moved against those of the joint states {words} samples: '
+        'make the clocks agree, and measure again what came after',
+    )
