@@ -33,13 +33,14 @@ from calib_ros.files.salvage import NOT_CLOSED, Salvage, check, recorded, salvag
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.sampling.account import Account
-from calib_ros.sampling.intake import Stream, feed, links_of
-from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
+from calib_ros.sampling.messages import BODIES, JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import VALIDATION
 from calib_ros.sampling.topics import Reading, check_joints, choose
 
 if TYPE_CHECKING:
+    from rosbags.interfaces import MessageDefinition
     from rosbags.rosbag2 import Reader
 
 STORAGES = ('sqlite3', 'mcap')
@@ -136,15 +137,16 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
         return _salvaged(path, folder, found, session)
     with closing(reader):
         available = {c.topic: c.msgtype for c in reader.connections}
-        streams = _chosen(session, available, partial(read, reader))
+        defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
+        streams, deserialise = _chosen(session, available, partial(read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
-        count, problem = _feed(session, read(reader, streams))
+        count, problem = _feed(session, read(reader, streams), deserialise)
     if problem is not None and count == 0:
         found = salvage(folder)
         if found is not None:
-            _check_joints(session, streams, found.on)
-            count, _ = _feed(session, found.on(streams))
+            _check_joints(session, streams, found.on, deserialise)
+            count, _ = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     if problem is None:
         return Replayed(expected, count, session.warnings)
@@ -155,8 +157,8 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
 
 def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSession) -> Replayed:
     """Feed what could be read of a bag without the library."""
-    streams = _chosen(session, found.topics, found.on)
-    count, problem = _feed(session, found.on(streams))
+    streams, deserialise = _chosen(session, found.topics, found.on, {})
+    count, problem = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     problem = problem or found.problem
     total = recorded(folder if folder.is_dir() else folder.parent)
@@ -175,21 +177,35 @@ def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSess
 
 
 def _chosen(
-    session: CalibrationSession, available: Mapping[str, str], messages_on: Reading
-) -> dict[str, Stream]:
-    """Return what is read of the topics available."""
-    streams = choose(available, session.settings, _decodable(messages_on))
-    _check_joints(session, streams, messages_on)
-    return streams
+    session: CalibrationSession,
+    available: Mapping[str, str],
+    messages_on: Reading,
+    definitions: Mapping[str, MessageDefinition],
+) -> tuple[dict[str, Stream], Deserialise]:
+    """Return what is read of the topics available, and what makes messages of it."""
+    defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
+    deserialise = _deserialiser(defined)
+    streams = choose(available, session.settings, _decodable(messages_on), deserialise)
+    for topic, stream in streams.items():
+        if stream.type in BODIES and stream.type not in defined:
+            raise InputError(
+                f'the bag does not define {stream.type} of {topic}: record it where that package '
+                'is installed'
+            )
+    _check_joints(session, streams, messages_on, deserialise)
+    return streams, deserialise
 
 
 def _check_joints(
-    session: CalibrationSession, streams: Mapping[str, Stream], messages_on: Reading
+    session: CalibrationSession,
+    streams: Mapping[str, Stream],
+    messages_on: Reading,
+    deserialise: Deserialise,
 ) -> None:
     """Refuse several topics of the same joints, unless they were named."""
     joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
     if len(joints) > 1 and not session.settings.joint_topics:
-        check_joints(_decodable(messages_on)(joints), session.joint_names, _deserialised)
+        check_joints(_decodable(messages_on)(joints), session.joint_names, deserialise)
 
 
 def _check_links(streams: Mapping[str, Stream]) -> None:
@@ -318,8 +334,19 @@ def _typestore() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def _deserialised(data: bytes, kind: str) -> Any:
-    return _typestore().deserialize_cdr(data, kind)
+def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
+    """Return what makes messages of bytes, also of types that a bag itself defines."""
+    if not defined:
+        return lambda data, kind: _typestore().deserialize_cdr(data, kind)
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for kind, (form, text) in defined.items():
+        idl = form == MessageDefinitionFormat.IDL
+        found = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
+        store.register({name: each for name, each in found.items() if name not in store.fielddefs})
+    return store.deserialize_cdr
 
 
 def _is_message(data: object) -> bool:
@@ -333,7 +360,9 @@ def _decodable(messages_on: Reading) -> Reading:
 
 
 def _feed(
-    session: CalibrationSession, messages: Iterator[tuple[Stream, bytes]]
+    session: CalibrationSession,
+    messages: Iterator[tuple[Stream, bytes]],
+    deserialise: Deserialise,
 ) -> tuple[int, str | None]:
     """Feed serialised messages; return how many, and what is wrong with the others if any."""
     count, problem, ended = 0, None, False
@@ -345,7 +374,7 @@ def _feed(
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
         usable = [each for each in batch if _is_message(each[1])]
-        problems = feed(session, usable, _deserialised)
+        problems = feed(session, usable, deserialise)
         count += len(usable) - len(problems)
         if len(usable) < len(batch):
             problems.append(f'messages without data, or of more than {LARGEST_MESSAGE} bytes')

@@ -163,18 +163,30 @@ class Alike:
     ends: tuple[bytes, bytes]
     rows: NDArray[np.uint8]
 
+    @property
+    def links(self) -> tuple[tuple[str, str], ...]:
+        """Return which frames their transforms link."""
+        return self.layout.links
+
     def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
         """Return stamps (N,) and numbers (N, 7) of one transform of each, and which are usable."""
         numbers = _numbers(self.rows, self.layout.numbers[k], '<f8', 7).astype(np.float64)
-        good = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
-        length = np.linalg.norm(numbers[:, 3:], axis=1)
-        good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
-        return _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2)), numbers, good
+        stamps = _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2))
+        return stamps, numbers, usable(numbers)
 
     def span(self, k: int) -> tuple[int, int]:
         """Return the first and the last stamp of one transform of each."""
         (s, ns), (t, nt) = (struct.unpack_from('<iI', x, self.layout.stamps[k]) for x in self.ends)
         return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
+
+
+def usable(numbers: FloatArray) -> NDArray[np.bool_]:
+    """Return (N,) which positions and quaternions (N, 7) the decoders would take."""
+    good = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
+    with np.errstate(over='ignore'):  # of what is not good
+        length = np.linalg.norm(numbers[:, 3:], axis=1)
+    found: NDArray[np.bool_] = good & (np.abs(length - 1.0) <= QUATERNION_TOLERANCE)
+    return found
 
 
 def transforms(blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:

@@ -7,14 +7,16 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.sampling.cdr import readings, transforms
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.cdr import Alike, readings, transforms, usable
 from calib_ros.sampling.messages import (
     DECODERS,
+    LINKS,
     TRANSFORM,
     TRANSFORMS,
     JointReading,
@@ -22,10 +24,15 @@ from calib_ros.sampling.messages import (
     MessageError,
     Readings,
     frame_name,
+    transforms_in,
 )
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
-from calib_ros.sampling.transforms import STATIC, Links
+from calib_ros.sampling.track import Stamps
+from calib_ros.sampling.transforms import STATIC, Links, Pair
+
+Deserialise: TypeAlias = Callable[[bytes, str], Any]
+"""Makes a message of its bytes and type."""
 
 WINDOW = 1024
 """Messages that are looked at at once."""
@@ -52,16 +59,17 @@ class Stream:
 def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream]:
     """Return the streams of sources; message types (by topic) where they name none."""
     streams = []
-    linked: dict[str, list[Source]] = {}
+    linked: dict[tuple[str, str], list[Source]] = {}
     for source in sources:
         kind = source.type or types[source.topic]
-        if kind == TRANSFORMS:
-            linked.setdefault(source.topic, []).append(source)
+        if kind in LINKS:
+            linked.setdefault((source.topic, kind), []).append(source)
         else:
             streams.append(Stream(source.topic, kind, source))
-    for topic, some in linked.items():
-        links = Links(topic, some)
-        streams += [Stream(name, TRANSFORMS, None, links) for name in (topic + STATIC, topic)]
+    for (topic, kind), some in linked.items():
+        links = Links(topic, some, kind)
+        names = (topic + STATIC, topic) if kind == TRANSFORMS else (topic,)
+        streams += [Stream(name, kind, None, links) for name in names]
     return streams
 
 
@@ -94,7 +102,7 @@ class Group:
 def feed(
     session: CalibrationSession,
     batch: Sequence[tuple[Stream, bytes]],
-    deserialise: Callable[[bytes, str], Any],
+    deserialise: Deserialise,
 ) -> list[str]:
     """Let a session take messages in their order; return what went wrong with some, in words.
 
@@ -109,15 +117,15 @@ def feed(
         Takes the messages.
     batch : sequence of (Stream, bytes)
         Messages in the order in which they came.
-    deserialise : callable
-        Makes a message of bytes and a message type.
+    deserialise : Deserialise
+        For those that are not decoded at once.
 
     """
     groups = decoded(batch)
     alone = np.ones(len(batch), dtype=bool)
     for group in groups:
         alone[group.places] = False
-    more, known = linked(batch)
+    more, known = linked(batch, deserialise)
     groups += more
     alone[known] = False
     problems = []
@@ -145,6 +153,10 @@ def feed(
         except Exception:
             problems.append(f'internal error: {traceback.format_exc()}')
         begin = min(end + 1, stop)
+    for links in links_of(stream for stream, _ in batch):
+        count = links.let_go()
+        if count:
+            session.miss(count, 'buffer full before their frames were linked')
     return problems
 
 
@@ -167,7 +179,63 @@ def decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
     return groups
 
 
-def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int]]:
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Messages that link the same frames: which of a batch they are, their stamps and numbers.
+
+    Stamps (N,) are in ns, numbers (N, links, 7) are positions [m] and quaternions.
+    """
+
+    links: tuple[Pair, ...]
+    which: NDArray[np.intp]
+    stamps: Stamps
+    numbers: FloatArray
+
+    def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
+        """Return stamps (N,) and numbers (N, 7) of one body in each, and which are usable."""
+        return self.stamps, self.numbers[:, k], usable(self.numbers[:, k])
+
+    def span(self, k: int) -> tuple[int, int]:
+        """Return the first and the last stamp."""
+        return int(self.stamps[0]), int(self.stamps[-1])
+
+
+def bodies(
+    batch: Sequence[tuple[Stream, bytes]], places: Sequence[int], deserialise: Deserialise
+) -> list[Bodies]:
+    """Return what is in messages of bodies; those that cannot be decoded are in none."""
+    alike: dict[tuple[Pair, ...], list[tuple[int, int, list[list[float]]]]] = {}
+    for k, place in enumerate(places):
+        stream, data = batch[place]
+        try:
+            message = deserialise(data, stream.type)
+        except Exception:  # told when it is taken by itself
+            continue
+        come = transforms_in(message, stream.type)
+        frame_id = frame_name(message.header.frame_id)
+        links = tuple((frame_id, frame_name(each.child_frame_id)) for each in come)
+        time = message.header.stamp
+        numbers = [
+            [getattr(part, axis) for part, axes in parts for axis in axes]
+            for parts in (
+                ((each.transform.translation, 'xyz'), (each.transform.rotation, 'xyzw'))
+                for each in come
+            )
+        ]
+        stamp_ns = time.sec * 1_000_000_000 + time.nanosec
+        alike.setdefault(links, []).append((k, stamp_ns, numbers))
+    found = []
+    for links, some in alike.items():
+        which = np.array([k for k, _, _ in some])
+        stamps = np.array([stamp_ns for _, stamp_ns, _ in some], dtype=np.int64)
+        rows = np.array([row for _, _, row in some], dtype=np.float64)
+        found.append(Bodies(links, which, stamps, rows.reshape(len(some), len(links), 7)))
+    return found
+
+
+def linked(
+    batch: Sequence[tuple[Stream, bytes]], deserialise: Deserialise
+) -> tuple[list[Group], list[int]]:
     """Return what is measured by transforms between frames, and the places of all that are known.
 
     Frames that are named anywhere in the batch are known for all of it.
@@ -175,16 +243,21 @@ def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int
     lengths: dict[tuple[str, int], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
         if stream.links is not None:
-            lengths.setdefault((stream.topic, len(data)), []).append(place)
-    parts = []
+            length = len(data) if stream.type == TRANSFORMS else 0
+            lengths.setdefault((stream.topic, length), []).append(place)
+    parts: list[tuple[Stream, NDArray[np.intp], Alike | Bodies]] = []
     for places in lengths.values():
         stream = batch[places[0]][0]
         assert stream.links is not None
-        for alike in transforms([batch[place][1] for place in places], stream.links.layouts):
-            parts.append((stream, np.array(places)[alike.which], alike))
+        found: Sequence[Alike | Bodies] = (
+            transforms([batch[place][1] for place in places], stream.links.layouts)
+            if stream.type == TRANSFORMS
+            else bodies(batch, places, deserialise)
+        )
+        parts += [(stream, np.array(places)[alike.which], alike) for alike in found]
     for stream, _, alike in parts:
         assert stream.links is not None
-        for k, link in enumerate(alike.layout.links):
+        for k, link in enumerate(alike.links):
             if stream.still:
                 _, numbers, good = alike.of(k)
                 for row in numbers[good]:
@@ -194,24 +267,27 @@ def linked(batch: Sequence[tuple[Stream, bytes]]) -> tuple[list[Group], list[int
     groups, known = [], []
     for links in links_of(stream for stream, _, _ in parts):
         first = min(int(places[0]) for stream, places, _ in parts if stream.links is links)
-        for source, found in links.released():
-            where = np.full(len(found.stamps_ns), first)
-            groups.append(Group(Stream(links.topic, TRANSFORMS, source), where, found))
+        for source, released in links.released():
+            where = np.full(len(released.stamps_ns), first)
+            groups.append(Group(Stream(links.topic, links.kind, source), where, released))
     for stream, where, alike in parts:
         assert stream.links is not None
         values = [
             (link, *alike.of(k))
-            for k, link in enumerate(alike.layout.links)
+            for k, link in enumerate(alike.links)
             if not stream.still and stream.links.wanted(link)
         ]
-        usable = np.ones(len(where), dtype=bool)
+        kept = np.ones(len(where), dtype=bool)
         for _, stamps, _, good in values:
-            usable &= good & (stamps > 0)
-        known += where[usable].tolist()
+            kept &= good & (stamps > 0)
+        known += where[kept].tolist()
+        if not kept.all():  # they are learned of again when they are taken by themselves
+            for k, link in enumerate(alike.links):
+                stream.links.move(link, -int((~kept).sum()), *alike.span(k))
         for link, stamps, numbers, _ in values:
-            for source, found in stream.links.readings(link, stamps[usable], numbers[usable]):
+            for source, measured_by in stream.links.readings(link, stamps[kept], numbers[kept]):
                 one = Stream(stream.topic, stream.type, source)
-                groups.append(Group(one, where[usable], found))
+                groups.append(Group(one, where[kept], measured_by))
     return groups, known
 
 
@@ -241,7 +317,7 @@ def _take(
     session: CalibrationSession,
     stream: Stream,
     data: bytes,
-    deserialise: Callable[[bytes, str], Any],
+    deserialise: Deserialise,
 ) -> None:
     """Let a session take one message that is not decoded yet."""
     try:
@@ -249,7 +325,7 @@ def _take(
     except Exception as err:  # damaged bytes fail in many ways
         raise DecodingError(f'a message on {stream.topic} cannot be decoded: {err!r}') from err
     if stream.links is not None:
-        _take_transforms(session, stream, stream.links, message.transforms)
+        _take_transforms(session, stream, stream.links, transforms_in(message, stream.type))
     elif stream.source is None:
         session.take_joints(message)
     else:

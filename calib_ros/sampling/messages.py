@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Sequence
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,13 @@ from calib_ros.values import QUATERNION_TOLERANCE, covariance_fault
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+BODIES = {
+    'mocap4r2_msgs/msg/RigidBodies': ('rigidbodies', 'rigid_body_name'),
+    'motion_capture_tracking_interfaces/msg/NamedPoseArray': ('poses', 'name'),
+}
+"""Types of poses by name in one frame, of motion capture: their fields of the poses and names."""
+LINKS = (TRANSFORMS, *BODIES)
+"""Types of messages that link several frames at once."""
 
 
 class MessageError(InputError):
@@ -158,6 +166,24 @@ DECODERS: dict[str, Callable[[Any], Reading]] = {
     'sensor_msgs/msg/Range': distance,
 }
 """Types of measurements."""
+
+
+def transforms_in(message: Any, kind: str) -> Sequence[Any]:
+    """Return what a message that links several frames holds, each like a TransformStamped."""
+    if kind == TRANSFORMS:
+        found: Sequence[Any] = message.transforms
+        return found
+    bodies, name = BODIES[kind]
+    return [
+        SimpleNamespace(
+            header=message.header,
+            child_frame_id=getattr(body, name),
+            transform=SimpleNamespace(
+                translation=body.pose.position, rotation=body.pose.orientation
+            ),
+        )
+        for body in getattr(message, bodies)
+    ]
 
 
 def frame_name(name: str) -> str:

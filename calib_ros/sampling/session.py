@@ -292,10 +292,14 @@ class CalibrationSession:
         try:
             reading = messages.DECODERS[msgtype](message)
         except messages.MessageError as err:
-            self.received['poses'] += 1
-            self._dropped[f'poses: {err}'] += 1
+            self.miss(1, str(err))
             return
         self.take_reading(source, reading)
+
+    def miss(self, count: int, cause: str) -> None:
+        """Count measurements that came and cannot be taken."""
+        self.received['poses'] += count
+        self._dropped[f'poses: {cause}'] += count
 
     def take_reading(self, source: Source, reading: messages.Reading) -> None:
         """Take a decoded measurement."""

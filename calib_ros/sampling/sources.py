@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.sampling.messages import DECODERS, TRANSFORMS, frame_name
+from calib_ros.sampling.messages import DECODERS, LINKS, TRANSFORMS, frame_name
 
 VALIDATION = 'validation_'
 """Topics whose last name starts so hold measurements that judge the result, never fitted."""
@@ -40,7 +40,8 @@ class Source:
     validation : bool
         The measurements judge the result and are never fitted.
     parent, child : str
-        On a topic of many transforms, such as /tf: the frames between which it is measured.
+        On a topic of many transforms or bodies, such as /tf: the frames between which it is
+        measured.
 
     """
 
@@ -58,17 +59,17 @@ class Source:
         if self.type and self.type not in TYPES:
             raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
         frames = {self.parent, self.child} - {''}
-        if len(frames) != (2 if self.type == TRANSFORMS else 0):
+        if len(frames) != (2 if self.type in LINKS else 0):
             raise ConfigError(
                 f'source "{self.topic}" needs parent=FRAME child=FRAME, between which it '
-                'measures, if its type is TFMessage, and only then'
+                f'measures, if its type is {_or(LINKS)}, and only then'
             )
         for name in (self.device, self.target):
             if '.' in name or ',' in name:
                 raise ConfigError(f'a device or target needs a name without . and , not "{name}"')
 
 
-TYPES = (*DECODERS, TRANSFORMS)
+TYPES = (*DECODERS, *LINKS)
 """Types of messages that hold measurements."""
 
 STANDARD = (
@@ -89,7 +90,7 @@ def parse_source(text: str) -> Source:
 
     Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
     child. A short type such as PoseStamped will do; a topic named tf is of type TFMessage, and so
-    is one with a parent or a child.
+    is one with a parent or a child and no type.
     """
     topic, *pairs = text.split() or ('',)
     if not topic or '=' in topic:
@@ -130,6 +131,16 @@ def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
     return sources
 
 
+def short_type(kind: str) -> str:
+    """Return the name of a message type without its package."""
+    return kind.rpartition('/')[2]
+
+
+def _or(kinds: Sequence[str]) -> str:
+    *first, last = map(short_type, kinds)
+    return f'{", ".join(first)} or {last}'
+
+
 def _full_type(name: str) -> str:
-    matches = [known for known in TYPES if name in (known, known.rpartition('/')[2])]
+    matches = [known for known in TYPES if name in (known, short_type(known))]
     return matches[0] if matches else name

@@ -7,21 +7,22 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.intake import Stream, decoded, linked, measured
-from calib_ros.sampling.messages import (
-    DECODERS,
-    JOINT_STATE,
-    TRANSFORMS,
-    JointReadings,
-    joint_state,
+from calib_ros.sampling.intake import Deserialise, Stream, decoded, linked, measured
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE, LINKS, JointReadings, joint_state
+from calib_ros.sampling.sources import (
+    MARKERS,
+    TYPES,
+    Source,
+    parse_source,
+    parse_sources,
+    short_type,
 )
-from calib_ros.sampling.sources import MARKERS, TYPES, Source, parse_source, parse_sources
 from calib_ros.sampling.track import Stamps
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
@@ -35,7 +36,10 @@ Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, byt
 
 
 def choose(
-    available: Mapping[str, str], settings: Settings, messages_on: Reading
+    available: Mapping[str, str],
+    settings: Settings,
+    messages_on: Reading,
+    deserialise: Deserialise,
 ) -> dict[str, Stream]:
     """Choose topics by type from those available (topic to type), unless they are named.
 
@@ -67,21 +71,32 @@ def choose(
             raise _no_topic(f'"{source.topic}"', expected, available)
     if all(source.validation for source in sources):
         error = _no_topic('pose topic', tuple(DECODERS), available)
-        raise InputError('; '.join([str(error), *_links(available, messages_on)]))
+        raise InputError('; '.join([str(error), *_links(available, messages_on, deserialise)]))
     streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
-    return {stream.topic: stream for stream in streams if stream.topic in available}
+    chosen = {stream.topic: stream for stream in streams if stream.topic in available}
+    still = {topic: stream for topic, stream in chosen.items() if stream.still}
+    if still:  # whenever it was recorded: measurements must not wait for it
+        _learn(messages_on(still), deserialise)
+    return chosen
 
 
-def _links(available: Mapping[str, str], messages_on: Reading) -> list[str]:
+def _links(
+    available: Mapping[str, str], messages_on: Reading, deserialise: Deserialise
+) -> list[str]:
     """Return in words which links between frames move, by topic."""
     found = []
     for topic, kind in available.items():
-        if kind == TRANSFORMS and not topic.endswith(STATIC):
-            links = Links(topic)
-            for batch in _batches(messages_on({topic: Stream(topic, kind, None, links)})):
-                linked(batch)
+        if kind in LINKS and not topic.endswith(STATIC):
+            links = Links(topic, kind=kind)
+            _learn(messages_on({topic: Stream(topic, kind, None, links)}), deserialise)
             found.append(str(links))
     return found
+
+
+def _learn(messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise) -> None:
+    """Let the links of streams learn of all that comes on them."""
+    for batch in _batches(messages):
+        linked(batch, deserialise)
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
@@ -102,7 +117,7 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 def check_joints(
     messages: Iterator[tuple[Stream, bytes]],
     joint_names: Sequence[str],
-    deserialise: Callable[[bytes, str], Any],
+    deserialise: Deserialise,
 ) -> None:
     """Refuse joint states of which several topics name the same joints of the chain.
 
@@ -112,8 +127,8 @@ def check_joints(
         The joint states of a recording.
     joint_names : sequence of str
         How messages name the joints of the chain.
-    deserialise : callable
-        Makes a message of bytes and a message type.
+    deserialise : Deserialise
+        For those that are not decoded at once.
 
     Raises
     ------
@@ -143,7 +158,7 @@ def check_joints(
 
 
 def _joint_values(
-    messages: Iterator[tuple[Stream, bytes]], deserialise: Callable[[bytes, str], Any]
+    messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise
 ) -> dict[tuple[str, str], list[tuple[Stamps, FloatArray]]]:
     """Return stamps and values by topic and joint."""
     found = defaultdict(list)
@@ -224,20 +239,16 @@ def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
 
 def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
     return InputError(
-        f'the bag has no {what} ({", ".join(map(_short, types))}); it holds {_contents(available)}'
+        f'the bag has no {what} ({", ".join(map(short_type, types))}); it holds '
+        f'{_contents(available)}'
     )
-
-
-def _short(kind: str) -> str:
-    """Return the name of a type without its package."""
-    return kind.rpartition('/')[2]
 
 
 def _contents(available: Mapping[str, str]) -> str:
     own = outputs(available)
     return (
         ', '.join(
-            f'{t} (own output)' if t in own else f'{t} ({_short(kind)})'
+            f'{t} (own output)' if t in own else f'{t} ({short_type(kind)})'
             for t, kind in sorted(available.items())
         )
         or 'nothing'

@@ -10,7 +10,7 @@ by which it would be measured with itself.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -20,8 +20,8 @@ import numpy as np
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import Layout
-from calib_ros.sampling.messages import Readings
-from calib_ros.sampling.sources import Source
+from calib_ros.sampling.messages import TRANSFORMS, Readings
+from calib_ros.sampling.sources import Source, short_type
 from calib_ros.sampling.track import Stamps
 
 Pair: TypeAlias = tuple[str, str]
@@ -70,11 +70,14 @@ class Links:
         Of the links that move; those that stand still come on the same with _static behind it.
     sources : sequence of Source
         What is measured on it.
+    kind : str
+        The type of its messages.
 
     """
 
-    def __init__(self, topic: str, sources: Sequence[Source] = ()) -> None:
+    def __init__(self, topic: str, sources: Sequence[Source] = (), kind: str = TRANSFORMS) -> None:
         self.topic = topic
+        self.kind = kind
         self.sources = tuple(sources)
         self._fixed: dict[Pair, FloatArray] = {}
         self._moving: dict[Pair, Seen] = {}
@@ -87,6 +90,7 @@ class Links:
         """How its messages are laid out, by their length."""
         self._held: deque[tuple[Pair, Stamps, FloatArray]] = deque()
         self._count = 0
+        self._let_go: Counter[Pair] = Counter()
 
     def fix(self, link: Pair, numbers: FloatArray) -> None:
         """Learn a link that stands still: position and quaternion (7)."""
@@ -131,7 +135,9 @@ class Links:
             self._held.append((link, stamps, numbers))
             self._count += len(stamps)
             while self._count > HELD:
-                self._count -= len(self._held.popleft()[1])
+                oldest, gone, _ = self._held.popleft()
+                self._count -= len(gone)
+                self._let_go[oldest] += len(gone)
         return [
             (source, self._reading(source, route, stamps, numbers))
             for source, route in self._of(link)
@@ -156,6 +162,14 @@ class Links:
             self._held.clear()
             self._count = 0
         return found
+
+    def let_go(self) -> int:
+        """Return how many measurements could not wait for their frames, once these are known."""
+        if self._open or not self._let_go:
+            return 0
+        count = sum(n * len(self.measured_by(link)) for link, n in self._let_go.items())
+        self._let_go.clear()
+        return count
 
     def problems(self) -> list[str]:
         """Return in words why sources measure nothing, with what to use instead."""
@@ -185,9 +199,10 @@ class Links:
         parent, child = order[0]
         if not self._stands_alone(order[0]):
             return f'{words}; they hang on one another, as the joints of a robot do'
+        kind = '' if self.kind == TRANSFORMS else f'type={short_type(self.kind)} '
         return (
             f'{words}; name what a device measures, such as '
-            f'--sources "{self.topic} parent={parent} child={child}"'
+            f'--sources "{self.topic} {kind}parent={parent} child={child}"'
         )
 
     # Details

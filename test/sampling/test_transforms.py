@@ -12,6 +12,7 @@ from recorded import (
     STORAGES,
     TYPES,
     TYPESTORE,
+    joint_state,
     pose_stamped,
     record,
     session_of,
@@ -43,6 +44,11 @@ def link(parent, child, stamp_ns=0, matrix=None):
     message = transform_stamped(stamp_ns, matrix[:3, 3].tolist(), quat.tolist(), child)
     message.header.frame_id = parent
     return message
+
+
+def stamp_ns(message):
+    stamp = getattr(message, 'transforms', [message])[0].header.stamp
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def frame(rng):
@@ -150,6 +156,23 @@ def test_links_that_stand_still_are_composed(tmp_path, rng, name, late):
                 elif b in frames:
                     frames[a] = frames[b] @ se3.invert(matrix)
         np.testing.assert_allclose(pose, frames[child], rtol=0, atol=1e-12)
+
+
+@storages
+def test_a_bag_tells_what_stands_still_even_at_its_end(tmp_path, rng, storage):
+    """Later than measurements may come, and more messages later than are read at once."""
+    matrices = [frame(rng) for _ in TIMES]
+    known = frame(rng)
+    content = [('/joint_states', joint_state(2 * k * MS)) for k in range(1, 2600)]
+    content += [
+        ('/tf', tf(link('tracker', 'tool', ms * MS, matrix)))
+        for ms, matrix in zip(TIMES, matrices, strict=True)
+    ]
+    content.sort(key=lambda item: stamp_ns(item[1]))
+    content.append(('/tf_static', tf(link('world', 'tracker', 0, known))))
+    found, session = poses_of(record(tmp_path / 'bag', content, storage))
+    np.testing.assert_allclose(found, [known @ each for each in matrices], rtol=0, atol=1e-12)
+    assert session.account().dropped == {}
 
 
 def test_names_with_a_slash_before_them_are_the_same(tmp_path, rng):
@@ -298,6 +321,19 @@ def session_fed(come, little_endian=True, at_once=True):
         assert feed(session, some, TYPESTORE.deserialize_cdr) == []
     session.finish()
     return session
+
+
+def test_what_could_not_wait_for_its_frames_is_counted(monkeypatch, rng):
+    monkeypatch.setattr('calib_ros.sampling.transforms.HELD', 5)
+    stamps = [100 + 5 * k for k in range(20)]
+    come = [tf(link('tracker', 'tool', ms * MS, frame(rng))) for ms in stamps]
+    come += [robot(300 * MS, rng), ('/tf_static', tf(link('world', 'tracker', 1, frame(rng))))]
+    come.append(tf(link('tracker', 'tool', 400 * MS, frame(rng))))
+    account = session_fed(come, at_once=False).account()
+    assert account.poses == 21
+    assert account.samples == 1
+    assert account.dropped == {'poses: buffer full before their frames were linked': 20}
+    assert session_fed(come).account().samples == 21
 
 
 @pytest.mark.parametrize('little_endian', [False, True])

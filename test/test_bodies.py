@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Measurements out of messages of motion capture that hold several bodies by name."""
+
+import numpy as np
+import pytest
+from recorded import MS, STORAGES, TYPES, header, pose, record, session_of, standing
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from test_transforms import TIMES, frame, link, tf
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.kinematics import se3
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.sources import parse_source
+
+storages = pytest.mark.parametrize('storage', sorted(STORAGES))
+MOCAP = 'mocap4r2_msgs/msg/RigidBodies'
+NAMED = 'motion_capture_tracking_interfaces/msg/NamedPoseArray'
+TEXTS = {
+    'mocap4r2_msgs/msg/Marker': 'int8 USE_NAME=0\nint8 id_type\nint32 marker_index\n'
+    'string marker_name\ngeometry_msgs/Point translation\n',
+    'mocap4r2_msgs/msg/RigidBody': 'string rigid_body_name\nMarker[] markers\n'
+    'geometry_msgs/Pose pose\n',
+    MOCAP: 'std_msgs/Header header\nuint32 frame_number\nmocap4r2_msgs/RigidBody[] rigidbodies\n',
+    'motion_capture_tracking_interfaces/msg/NamedPose': 'string name\ngeometry_msgs/Pose pose\n'
+    'float32 quality\n',
+    NAMED: 'std_msgs/Header header\nNamedPose[] poses\n',
+}
+STORE = get_typestore(Stores.ROS2_JAZZY)
+for name, text in TEXTS.items():
+    STORE.register(get_types_from_msg(text, name))
+
+
+def message(kind, stamp_ns, bodies):
+    """Return a message that holds bodies (name to matrix)."""
+    found = []
+    for name, matrix in bodies.items():
+        at = pose(matrix[:3, 3].tolist(), se3.to_quat(matrix[:3, :3]).tolist())
+        if kind == MOCAP:
+            point = TYPES['geometry_msgs/msg/Point'](1.0, 2.0, 3.0)
+            marker = STORE.types['mocap4r2_msgs/msg/Marker'](2, 7, 'm', point)
+            found.append(STORE.types['mocap4r2_msgs/msg/RigidBody'](name, [marker] * 4, at))
+        else:
+            kinds = STORE.types['motion_capture_tracking_interfaces/msg/NamedPose']
+            found.append(kinds(name, at, 0.5))
+    head = header(stamp_ns, 'hall')
+    return STORE.types[kind](head, 3, found) if kind == MOCAP else STORE.types[kind](head, found)
+
+
+def write(path, events, storage='mcap', defined=True):
+    """Write (topic, message) in the order given, with the definitions that a recorder adds."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        connections = {}
+        for k, (topic, each) in enumerate(events):
+            kind = each.__msgtype__
+            if topic not in connections:
+                text, digest = STORE.generate_msgdef(kind, ros_version=2)
+                connections[topic] = writer.add_connection(
+                    topic, kind, msgdef=text if defined else '', rihs01=digest
+                )
+            writer.write(connections[topic], k + 1, STORE.serialize_cdr(each, kind))
+    return path
+
+
+def measured(rng, kind, stamps=TIMES):
+    """Return messages of the robot's base, the tool and something that is never seen."""
+    base, lost = frame(rng), frame(rng)
+    lost[0, 3] = np.nan
+    tools = [frame(rng) for _ in stamps]
+    return tools, [
+        message(kind, ms * MS, {'base': base, 'tool': tool} | ({'lost': lost} if k % 2 else {}))
+        for k, (ms, tool) in enumerate(zip(stamps, tools, strict=True))
+    ]
+
+
+def line(kind, child='tool'):
+    return f'/bodies type={kind.rpartition("/")[2]} parent=hall child={child}'
+
+
+@storages
+@pytest.mark.parametrize('kind', [MOCAP, NAMED])
+def test_a_body_is_worth_its_transform_to_the_last_digit(tmp_path, rng, kind, storage):
+    tools, come = measured(rng, kind)
+    content = standing(come, '/bodies')
+    session, found = session_of(write(tmp_path / 'bag', content, storage), sources=(line(kind),))
+    moving = [tf(link('hall', 'tool', ms * MS, t)) for ms, t in zip(TIMES, tools, strict=True)]
+    as_tf = record(tmp_path / 'tf', standing(moving, '/tf'))
+    expected, _ = session_of(as_tf, sources=('/tf parent=hall child=tool',))
+    assert found == ()
+    assert session.account() == expected.account()
+    assert session.account().poses == session.account().samples == len(TIMES)
+    assert {(each.frame_id, each.target) for each in session.samples} == {('hall', 'tool')}
+    for name in ('stamps_ns', 'joints', 'positions', 'rotations'):
+        np.testing.assert_array_equal(
+            getattr(session.problem().observations, name),
+            getattr(expected.problem().observations, name),
+        )
+
+
+def test_several_bodies_are_several_targets(tmp_path, rng):
+    _, come = measured(rng, MOCAP)
+    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    session, _ = session_of(path, sources=(line(MOCAP), f'{line(MOCAP, "base")} validation=true'))
+    found = [(each.target, each.validation) for each in session.samples]
+    assert sorted(found) == [('base', True)] * len(TIMES) + [('tool', False)] * len(TIMES)
+
+
+def test_bodies_that_are_not_seen_are_counted(tmp_path, rng):
+    _, come = measured(rng, MOCAP)
+    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    session, _ = session_of(path, sources=(line(MOCAP), line(MOCAP, 'lost')))
+    assert session.account().poses == len(TIMES) + len(TIMES) // 2
+    assert session.account().dropped == {
+        'poses: NaN or infinite position': len(TIMES) // 2,
+    }
+
+
+@storages
+@pytest.mark.parametrize('kind', [MOCAP, NAMED])
+def test_a_bag_without_named_sources_lists_the_bodies(tmp_path, rng, kind, storage):
+    _, come = measured(rng, kind, range(10, 1000, 5))
+    path = write(tmp_path / 'bag', standing(come, '/bodies'), storage)
+    with pytest.raises(InputError, match='has no pose topic') as caught:
+        session_of(path)
+    assert 'hall to tool at 200 Hz' in str(caught.value)
+    assert f'--sources "{line(kind, "base")}"' in str(caught.value)
+    with pytest.raises(InputError) as caught:
+        session_of(path, sources=(line(kind, 'tol'),))
+    assert 'nothing links frame "tol" to "hall" on /bodies' in str(caught.value)
+    assert 'hall to tool at 200 Hz' in str(caught.value)
+
+
+def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
+    _, come = measured(rng, MOCAP)
+    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=False)
+    with pytest.raises(InputError, match=f'does not define {MOCAP}'):
+        session_of(path, sources=(line(MOCAP),))
+
+
+def test_messages_that_cannot_be_decoded_are_told(tmp_path, rng):
+    _, come = measured(rng, MOCAP)
+    bad = STORE.types['std_msgs/msg/String']('no bodies')
+    path = tmp_path / 'bag'
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=STORE)
+        bodies = writer.add_connection('/bodies', MOCAP, typestore=STORE)
+        for k, (topic, each) in enumerate([*standing(come, '/bodies'), ('/bodies', bad)]):
+            data = STORE.serialize_cdr(each, each.__msgtype__)
+            writer.write(joints if topic == '/joint_states' else bodies, k + 1, data)
+    session, (warning,) = session_of(path, sources=(line(MOCAP),))
+    assert 'a message on /bodies cannot be decoded' in warning
+    assert session.account().samples == len(TIMES)
+
+
+def test_bodies_need_their_names():
+    for text in ('/bodies type=RigidBodies', '/bodies type=NamedPoseArray child=tool'):
+        with pytest.raises(ConfigError, match='RigidBodies or NamedPoseArray, and only then'):
+            parse_source(text)
