@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
 
-test: $(VENV)/installed $(VENV)/tf2_msgs/installed
+test: $(VENV)/installed $(VENV)/tf2_msgs/installed $(VENV)/mocap4r2_msgs/installed
 	$(BIN)/python -m pytest $(PYTEST_ARGUMENTS)
 
 FUZZ_SECONDS ?= 600
@@ -42,15 +42,15 @@ $(VENV)/installed: setup.py pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[ros,test]'
 	touch $@
 
-# The one package of messages that ROS has and PyPI has not.
-$(VENV)/tf2_msgs/installed: $(VENV)/installed test/tf2_msgs/CMakeLists.txt
-	mkdir -p $(VENV)/tf2_msgs
+# Packages of messages that ROS has and PyPI has not.
+$(VENV)/%_msgs/installed: $(VENV)/installed test/messages.cmake test/%_msgs/msg/*.msg
+	mkdir -p $(@D)
 	export PATH="$(CURDIR)/$(BIN):$$PATH" CMAKE_PREFIX_PATH="$(CURDIR)/$(VENV)" \
 	AMENT_PREFIX_PATH="$(CURDIR)/$(VENV)" && { \
-	cmake -S test/tf2_msgs -B $(VENV)/tf2_msgs -DBUILD_TESTING=OFF \
+	cmake -S test/$*_msgs -B $(@D) -DBUILD_TESTING=OFF \
 	-DCMAKE_INSTALL_PREFIX="$(CURDIR)/$(VENV)" -DPython3_EXECUTABLE="$(CURDIR)/$(BIN)/python" && \
-	cmake --build $(VENV)/tf2_msgs --target install; } > $(VENV)/tf2_msgs/log 2>&1 \
-	|| { tail $(VENV)/tf2_msgs/log; echo 'needs a C++ compiler: apt install g++'; exit 1; }
+	cmake --build $(@D) --target install; } > $(@D)/log 2>&1 \
+	|| { tail $(@D)/log; echo 'needs a C++ compiler: apt install g++'; exit 1; }
 	touch $@
 
 clean:

@@ -23,7 +23,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from calib_ros.ros.arguments import NODE, ros_arguments, switched
+from calib_ros.ros.arguments import node_options, switched
 
 ARGUMENTS = {
     'chain': ('', 'robot of the calibration, as for the node'),
@@ -46,15 +46,11 @@ def start(context: LaunchContext) -> list[Node]:
         path = Path(given['calibration']).expanduser().absolute()
         words |= {'calibration_filename': str(path), 'allowed_folders': str(path.parent)}
     node = Node(
-        package='calib_ros',
-        executable=NODE,
-        name=NODE,
-        ros_arguments=ros_arguments(words),
+        **node_options(words),
         remappings=[
             ('~/joint_trajectory', given['planned']),
             ('~/compensated_joint_trajectory', target),
         ],
-        output='screen',
     )
     return [node]
 

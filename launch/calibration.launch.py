@@ -12,7 +12,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from calib_ros.ros.arguments import NODE, launch_arguments, refuse_unknown, ros_arguments
+from calib_ros.ros.arguments import launch_arguments, node_options, refuse_unknown
 
 ARGUMENTS = launch_arguments()
 
@@ -21,15 +21,7 @@ def start(context: LaunchContext) -> list[Node]:
     """Return the node with what was given."""
     refuse_unknown(sys.argv, Path(__file__).name, [*ARGUMENTS])
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
-    node = Node(
-        package='calib_ros',
-        executable=NODE,
-        name=NODE,
-        namespace=given['namespace'] or None,
-        ros_arguments=ros_arguments(given),
-        output='screen',
-    )
-    return [node]
+    return [Node(**node_options(given))]
 
 
 def generate_launch_description() -> LaunchDescription:

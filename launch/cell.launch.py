@@ -30,8 +30,8 @@ from calib_ros.errors import ConfigError
 from calib_ros.ros.arguments import (
     NODE,
     launch_arguments,
+    node_options,
     refuse_unknown,
-    ros_arguments,
     rviz_config,
     switched,
 )
@@ -54,14 +54,7 @@ ARGUMENTS = {name: ('', text) for name, text in launch_arguments().items()} | OU
 
 def calibration(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
     """Return the node, and what starts it again with its samples when it was killed."""
-    node = Node(
-        package='calib_ros',
-        executable=NODE,
-        name=NODE,
-        namespace=given['namespace'] or None,
-        ros_arguments=ros_arguments(given),
-        output='screen',
-    )
+    node = Node(**node_options(given))
 
     def on_exit(event: Any, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         if event.returncode >= 0 or context.is_shutdown:  # it has said why, or was told to end

@@ -160,6 +160,18 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     return words
 
 
+def node_options(given: Mapping[str, str]) -> dict[str, Any]:
+    """Return with what launch makes the node, for launch arguments."""
+    return {
+        'package': 'calib_ros',
+        'executable': NODE,
+        'name': NODE,
+        'namespace': given.get('namespace') or None,
+        'ros_arguments': ros_arguments(given),
+        'output': 'screen',
+    }
+
+
 def typed(command: Sequence[str]) -> list[str]:
     """Return a command line of the node on which ROS takes text as it was typed.
 

@@ -24,7 +24,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
-from rclpy._rclpy_pybind11 import RCLError  # has no public name in Jazzy
+from rclpy._rclpy_pybind11 import (  # these have no public names in Jazzy
+    RCLError,
+    RCLInvalidROSArgsError,
+    UnknownROSArgsError,
+)
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -467,7 +471,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
     command = typed(sys.argv if arguments is None else [NODE, *arguments])
-    usage(NODE).parse_args(remove_ros_args(command)[1:])
+    parser = usage(NODE)
+    try:
+        parser.parse_args(remove_ros_args(command)[1:])
+    except UnknownROSArgsError as err:
+        parser.error(f'unknown ROS arguments: {err}')
+    except RCLInvalidROSArgsError as err:
+        parser.error(str(err))
     stop = threading.Event()
 
     def on_signal(number: int, frame: Any) -> None:

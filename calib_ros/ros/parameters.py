@@ -145,14 +145,32 @@ def _declare(
 ) -> Any:
     descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
     override = node._parameter_overrides.get(name)
-    if isinstance(default, str) and override and not isinstance(override.value, str):
-        raise ConfigError(
-            f'parameter "{name}" must be text, not {override.value!r}: write it in quotes, for '
-            f"""example {name}: '0012'"""
-        )
+    expected = _expected(name, default, override.value) if override else ''
+    if expected:
+        raise ConfigError(f'parameter "{name}" must be {expected}')
     if isinstance(default, tuple):  # an empty list has no type in ROS, [''] has one
         return _names(node.declare_parameter(name, [''], descriptor).value)
+    if isinstance(default, float):  # so that 1 is taken as 1.0
+        value = float(override.value if override else default)
+        return node.declare_parameter(name, value, descriptor, ignore_override=True).value
     return node.declare_parameter(name, default, descriptor).value
+
+
+def _expected(name: str, default: Any, value: Any) -> str:
+    """Return in words what a value is and should be; empty when it will do."""
+    if isinstance(default, str) and not isinstance(value, str):
+        return f"text, not {value!r}: write it in quotes, for example {name}: '0012'"
+    if isinstance(default, tuple) and not (
+        isinstance(value, list) and all(isinstance(each, str) for each in value)
+    ):
+        return f"a list of texts such as ['a', 'b'], not {value!r}"
+    if isinstance(default, bool) and not isinstance(value, bool):
+        return f'true or false, not {value!r}'
+    if isinstance(default, float) and type(value) not in (int, float):
+        return f'a number, not {value!r}'
+    if type(default) is int and type(value) is not int:
+        return f'a whole number, not {value!r}'
+    return ''
 
 
 def _declare_setting(node: Node, item: Any) -> Any:
@@ -163,17 +181,8 @@ def _declare_setting(node: Node, item: Any) -> Any:
     if isinstance(item.default, int):
         span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)
         return _declare(node, item.name, item.default, text, fixed, integer_range=[span])
-    # Declared with any type first, so that "max_gap: 1" is taken as 1.0.
-    loose = ParameterDescriptor(dynamic_typing=True)
-    value = node.declare_parameter(item.name, item.default, loose).value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigError(f'parameter "{item.name}" must be a number, not {value!r}')
-    node.undeclare_parameter(item.name)
     span = FloatingPointRange(from_value=float(lower), to_value=1e9)
-    descriptor = ParameterDescriptor(
-        description=text, read_only=fixed, floating_point_range=[span]
-    )
-    return node.declare_parameter(item.name, float(value), descriptor, ignore_override=True).value
+    return _declare(node, item.name, item.default, text, fixed, floating_point_range=[span])
 
 
 def _names(values: Sequence[str] | None) -> tuple[str, ...]:

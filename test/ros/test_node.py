@@ -1004,6 +1004,12 @@ def test_signals_end_the_node_cleanly(tmp_path, number, executor):
         ({'delay': 'none'}, 'parameter "delay" must be a number'),
         ({'serial': 12}, 'must be text, not 12: write it in quotes'),
         ({'model': True}, 'parameter "model" must be text, not True'),
+        ({'marker_scale': 'large'}, 'parameter "marker_scale" must be a number, not \'large\''),
+        ({'resume': 1}, 'parameter "resume" must be true or false, not 1'),
+        ({'folds': 5.0}, 'parameter "folds" must be a whole number, not 5.0'),
+        ({'folds': True}, 'parameter "folds" must be a whole number, not True'),
+        ({'sources': '/tf'}, 'parameter "sources" must be a list of texts such as ['),
+        ({'joint_names': [1, 2]}, 'parameter "joint_names" must be a list of texts such as ['),
         ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
         ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
     ],
@@ -1012,6 +1018,12 @@ def test_a_wrong_parameter_is_refused_at_the_start(tmp_path, parameters, said):
     with Cell() as cell, pytest.raises((CalibrationError, ParameterException)) as caught:
         cell.start(**{'chain': 'ur10e', 'data_dir': str(tmp_path)} | parameters)
     assert said in str(caught.value)
+
+
+def test_whole_numbers_are_numbers(tmp_path):
+    with Cell(chain='ur10e', data_dir=str(tmp_path), marker_scale=100, settle=1) as cell:
+        assert cell.node.get_parameter('marker_scale').value == 100.0
+        assert cell.node.session.settings.settle == 1.0
 
 
 @pytest.mark.parametrize(
@@ -1028,6 +1040,22 @@ def test_a_wrong_parameter_ends_the_node_with_one_clear_line(parameters, said):
         assert said in child.output
         assert 'ready' not in child.output
         assert 'Traceback' not in child.output
+
+
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (['--params-file', '/nowhere.yaml'], '/nowhere.yaml'),
+        (['-p', 'chain'], "parse parameter override rule: '-p chain'"),
+        (['-r', '__ns:=bad-name'], '__ns:=bad-name'),
+        (['--foo'], "unknown ROS arguments: ['--foo']"),
+    ],
+)
+def test_words_that_ros_cannot_read_are_told(capsys, words, said):
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--ros-args', '-p', 'chain:=ur10e', *words])
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
 
 
 def test_help_names_every_parameter_and_starts_nothing(capsys):
