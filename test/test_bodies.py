@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measurements out of messages of motion capture that hold several bodies by name."""
 
+import re
+import shlex
+
 import numpy as np
 import pytest
 from recorded import MS, STORAGES, TYPES, header, pose, record, session_of, standing
@@ -129,6 +132,21 @@ def test_a_bag_without_named_sources_lists_the_bodies(tmp_path, rng, kind, stora
         session_of(path, sources=(line(kind, 'tol'),))
     assert 'nothing links frame "tol" to "hall" on /bodies' in str(caught.value)
     assert 'hall to tool at 200 Hz' in str(caught.value)
+
+
+def test_the_line_that_is_proposed_is_of_use_whatever_a_body_is_called(tmp_path, rng):
+    come = [
+        message(NAMED, ms * MS, {"Rigid Body 1 of 'Tom'": frame(rng)}) for ms in range(10, 1000, 5)
+    ]
+    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    with pytest.raises(InputError, match='has no pose topic') as caught:
+        session_of(path)
+    (proposed,) = re.findall('--sources (.*)$', str(caught.value))
+    (text,) = shlex.split(proposed)
+    session, _ = session_of(path, sources=(text,))
+    assert {each.target for each in session.samples} == {"Rigid Body 1 of 'Tom'"}
+    with pytest.raises(ConfigError, match='closing quotation'):
+        parse_source("/bodies type=NamedPoseArray parent=hall child='Tom")
 
 
 def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -90,9 +91,12 @@ def parse_source(text: str) -> Source:
 
     Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
     child. A short type such as PoseStamped will do; a topic named tf is of type TFMessage, and so
-    is one with a parent or a child and no type.
+    is one with a parent or a child and no type. What holds blanks stands in quotes.
     """
-    topic, *pairs = text.split() or ('',)
+    try:
+        topic, *pairs = shlex.split(text) or ('',)
+    except ValueError as err:
+        raise ConfigError(f'source "{text}" cannot be read: {err}') from err
     if not topic or '=' in topic:
         raise ConfigError(f'source "{text}" must begin with its topic: "TOPIC key=value ..."')
     values: dict[str, Any] = {'validation': topic.rpartition('/')[2].startswith(VALIDATION)}

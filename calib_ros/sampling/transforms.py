@@ -10,6 +10,7 @@ by which it would be measured with itself.
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -200,10 +201,10 @@ class Links:
         if not self._stands_alone(order[0]):
             return f'{words}; they hang on one another, as the joints of a robot do'
         kind = '' if self.kind == TRANSFORMS else f'type={short_type(self.kind)} '
-        return (
-            f'{words}; name what a device measures, such as '
-            f'--sources "{self.topic} {kind}parent={parent} child={child}"'
-        )
+        pair = f'parent={shlex.quote(parent)} child={shlex.quote(child)}'
+        line = f'{self.topic} {kind}{pair}'
+        quoted = f'"{line}"' if '"' not in line else shlex.quote(line)
+        return f'{words}; name what a device measures, such as --sources {quoted}'
 
     # Details
 
