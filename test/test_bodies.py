@@ -66,6 +66,17 @@ def write(path, events, storage='mcap', defined=True):
     return path
 
 
+def defined_by(path, text, come):
+    """Write a bag that defines the bodies by a text."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=STORE)
+        bodies = writer.add_connection('/bodies', MOCAP, msgdef=text, rihs01='RIHS01_0')
+        for k, (_, each) in enumerate(standing([])):
+            writer.write(joints, k + 1, STORE.serialize_cdr(each, JOINT_STATE))
+        writer.write(bodies, 1000, STORE.serialize_cdr(come, MOCAP))
+    return path
+
+
 def measured(rng, kind, stamps=TIMES):
     """Return messages of the robot's base, the tool and something that is never seen."""
     base, lost = frame(rng), frame(rng)
@@ -154,6 +165,28 @@ def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
     path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=False)
     with pytest.raises(InputError, match=f'does not define {MOCAP}'):
         session_of(path, sources=(line(MOCAP),))
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'std_msgs/Header header\nnonsense',
+        'std_msgs/Header header\n' + 'uint32 x\n' * 10_000,
+        'std_msgs/Header header\nuint32 a=b',
+    ],
+)
+def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
+    (come,) = measured(rng, MOCAP, [105])[1]
+    path = defined_by(tmp_path / 'bag', text, come)
+    with pytest.raises(InputError, match=f'defines {MOCAP} by what cannot be read'):
+        session_of(path, sources=(line(MOCAP),))
+
+
+def test_another_message_of_that_name_is_told(tmp_path, rng):
+    (come,) = measured(rng, MOCAP, [105])[1]
+    path = defined_by(tmp_path / 'bag', 'std_msgs/Header header\nuint32 class\nuint32 x', come)
+    _, (warning,) = session_of(path, sources=(line(MOCAP),))
+    assert 'a message on /bodies cannot be decoded' in warning
 
 
 def test_messages_that_cannot_be_decoded_are_told(tmp_path, rng):

@@ -344,8 +344,13 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     store = get_typestore(Stores.ROS2_JAZZY)
     for kind, (form, text) in defined.items():
         idl = form == MessageDefinitionFormat.IDL
-        found = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
-        store.register({name: each for name, each in found.items() if name not in store.fielddefs})
+        try:
+            if len(text) > LARGEST_MESSAGE:
+                raise ValueError(f'it has more than {LARGEST_MESSAGE} characters')
+            found = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
+            store.register({k: each for k, each in found.items() if k not in store.fielddefs})
+        except Exception as err:  # a damaged definition fails in many ways
+            raise InputError(f'the bag defines {kind} by what cannot be read: {err}') from err
     return store.deserialize_cdr
 
 

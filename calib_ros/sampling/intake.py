@@ -209,9 +209,9 @@ def bodies(
         stream, data = batch[place]
         try:
             message = deserialise(data, stream.type)
+            come = transforms_in(message, stream.type)
         except Exception:  # told when it is taken by itself
             continue
-        come = transforms_in(message, stream.type)
         frame_id = frame_name(message.header.frame_id)
         links = tuple((frame_id, frame_name(each.child_frame_id)) for each in come)
         time = message.header.stamp
@@ -322,10 +322,11 @@ def _take(
     """Let a session take one message that is not decoded yet."""
     try:
         message = deserialise(data, stream.type)
+        come = transforms_in(message, stream.type) if stream.links is not None else ()
     except Exception as err:  # damaged bytes fail in many ways
         raise DecodingError(f'a message on {stream.topic} cannot be decoded: {err!r}') from err
     if stream.links is not None:
-        _take_transforms(session, stream, stream.links, transforms_in(message, stream.type))
+        _take_transforms(session, stream, stream.links, come)
     elif stream.source is None:
         session.take_joints(message)
     else:
