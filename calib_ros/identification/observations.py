@@ -235,7 +235,7 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
         return np.zeros(0, dtype=np.intp)
     standing = joints[np.concatenate([[True], _moved(joints)])]  # one row a stop
     near = _near(standing)
-    links = coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=(len(standing),) * 2)
+    links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
     _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
     return np.asarray(_repeats(standing[first])[label[stops(joints)]], dtype=np.intp)
@@ -269,21 +269,27 @@ def _repeats(joints: FloatArray) -> NDArray[np.intp]:
     first, which = np.nonzero(np.isfinite(far))
     if not (far < SCATTER).any():
         return apart
-    graph = coo_array((far[first, which], (first, near[first, which])), shape=(count, count))
+    graph = _graph(far[first, which], first, near[first, which], count)
     tree = minimum_spanning_tree(graph).tocoo()
     lengths = np.append(np.sort(tree.data), GAP * SCATTER)
     gaps = np.flatnonzero((lengths[1:] >= GAP * lengths[:-1]) & (lengths[:-1] <= SCATTER))
     for reach in lengths[gaps[::-1]]:
         close = tree.data <= reach
-        links = coo_array(
-            (tree.data[close], (tree.row[close], tree.col[close])), shape=(count, count)
-        )
+        links = _graph(tree.data[close], tree.row[close], tree.col[close], count)
         number, label = connected_components(links, directed=False)
         middle = np.stack([np.bincount(label, row) for row in place.T]) / np.bincount(label)
         extent = np.linalg.norm(place - middle.T[label], axis=1).max()
         if number >= FEWEST and extent <= WIDEST * reach:
             return np.asarray(label, dtype=np.intp)
     return apart
+
+
+def _graph(
+    lengths: FloatArray, first: NDArray[np.integer], second: NDArray[np.integer], count: int
+) -> coo_array:
+    """Return edges (K,) between nodes, whose numbers scipy 1.11 wants in 32 bits."""
+    ends = (first.astype(np.int32), second.astype(np.int32))
+    return coo_array((lengths, ends), shape=(count, count))
 
 
 def _near(joints: FloatArray) -> NDArray[np.intp]:
