@@ -493,9 +493,12 @@ class CalibrationSession:
             found.append(moved(self._watch.moves))
         elif self._disagreement is not None:
             found.append(disagreement(self._disagreement, self.settings.delay))
-        unclear = self._found if self.settings.mode == 'continuous' else self._watch.unclear
+        continuous = self.settings.mode == 'continuous'
+        unclear = self._found if continuous else self._watch.unclear
         if unclear is not None and unclear.rivals and not self.settings.delay:
-            found.append(ambiguous((unclear.seconds, *unclear.rivals)))
+            delays = (unclear.seconds, *unclear.rivals)
+            if continuous or all(map(self._spoils, delays)):
+                found.append(ambiguous(delays))
         needed = self._collector.still_needed
         if needed is not None:
             found.append(restless(needed, self.settings.still))
@@ -520,8 +523,11 @@ class CalibrationSession:
         """Return the delay that the motion shows [s], if it spoils stops."""
         if self.delay is None or self.settings.mode == 'continuous':
             return None  # there it is a parameter of the fit
-        left = self.delay.seconds - self.settings.delay
-        return None if -EARLY <= left <= self.settings.settle else self.delay.seconds
+        return self.delay.seconds if self._spoils(self.delay.seconds) else None
+
+    def _spoils(self, delay: float) -> bool:
+        """Tell whether a delay [s] spoils stops."""
+        return not -EARLY <= delay - self.settings.delay <= self.settings.settle
 
     @property
     def estimate(self) -> Estimate | None:
