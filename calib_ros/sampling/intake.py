@@ -204,25 +204,19 @@ def bodies(
     batch: Sequence[tuple[Stream, bytes]], places: Sequence[int], deserialise: Deserialise
 ) -> list[Bodies]:
     """Return what is in messages of bodies; those that cannot be decoded are in none."""
-    alike: dict[tuple[Pair, ...], list[tuple[int, int, list[list[float]]]]] = {}
+    alike: dict[tuple[Pair, ...], list[tuple[int, np.int64, list[list[float]]]]] = {}
     for k, place in enumerate(places):
         stream, data = batch[place]
         try:
             message = deserialise(data, stream.type)
             come = transforms_in(message, stream.type)
+            head = message.header
+            frame_id = frame_name(head.frame_id)
+            links = tuple((frame_id, frame_name(each.child_frame_id)) for each in come)
+            stamp_ns = np.int64(head.stamp.sec * 1_000_000_000 + head.stamp.nanosec)
+            numbers = [_pose_numbers(each.transform) for each in come]
         except Exception:  # told when it is taken by itself
             continue
-        frame_id = frame_name(message.header.frame_id)
-        links = tuple((frame_id, frame_name(each.child_frame_id)) for each in come)
-        time = message.header.stamp
-        numbers = [
-            [getattr(part, axis) for part, axes in parts for axis in axes]
-            for parts in (
-                ((each.transform.translation, 'xyz'), (each.transform.rotation, 'xyzw'))
-                for each in come
-            )
-        ]
-        stamp_ns = time.sec * 1_000_000_000 + time.nanosec
         alike.setdefault(links, []).append((k, stamp_ns, numbers))
     found = []
     for links, some in alike.items():
@@ -231,6 +225,12 @@ def bodies(
         rows = np.array([row for _, _, row in some], dtype=np.float64)
         found.append(Bodies(links, which, stamps, rows.reshape(len(some), len(links), 7)))
     return found
+
+
+def _pose_numbers(transform: Any) -> list[float]:
+    """Return position and quaternion (7)."""
+    at, turn = transform.translation, transform.rotation
+    return [float(each) for each in (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)]
 
 
 def linked(

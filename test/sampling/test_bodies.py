@@ -182,9 +182,18 @@ def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
         session_of(path, sources=(line(MOCAP),))
 
 
-def test_another_message_of_that_name_is_told(tmp_path, rng):
+@pytest.mark.parametrize(
+    'text',
+    [
+        'std_msgs/Header header\nuint32 class\nuint32 x',
+        'uint8[] rigidbodies',
+        'uint8[<=9] rigidbodies\nmocap4r2_msgs/RigidBody header',
+        'mocap4r2_msgs/RigidBodies header',
+    ],
+)
+def test_another_message_of_that_name_is_told(tmp_path, rng, text):
     (come,) = measured(rng, MOCAP, [105])[1]
-    path = defined_by(tmp_path / 'bag', 'std_msgs/Header header\nuint32 class\nuint32 x', come)
+    path = defined_by(tmp_path / 'bag', text, come)
     _, (warning,) = session_of(path, sources=(line(MOCAP),))
     assert 'a message on /bodies cannot be decoded' in warning
 
