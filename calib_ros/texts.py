@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -25,6 +26,10 @@ LARGEST_TABLE = 100_000_000
 """Bytes of a table."""
 MOST_COLUMNS = 1000
 """Columns of a table."""
+MOST_ROWS = 200_000
+"""Rows of a table of measurements or poses."""
+LONGEST_LINE = 1_000_000
+"""Characters in a line of a table."""
 DEEPEST = 20
 """Levels of nested YAML."""
 MOST_NODES = 500_000
@@ -70,23 +75,48 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
         raise error(f'cannot read {where}: {err}') from err
 
 
+def csv_lines(text: str, where: str) -> io.StringIO:
+    """Return the lines of a table for the reader of csv, which cuts lines of any length."""
+    longest = max(map(len, io.StringIO(text)), default=0)
+    if longest > LONGEST_LINE:
+        raise InputError(
+            f'{where} has a line of {longest} characters, more than {LONGEST_LINE}: is it a table?'
+        )
+    return io.StringIO(text, newline='')
+
+
 def read_rows(text: str, path: Path) -> tuple[Sequence[str], list[tuple[int, Row]]]:
     """Return the header of a table, and its rows with their lines; cells may be missing.
 
     Raises
     ------
     InputError
-        When it is no table, or has more columns than any.
+        When it is no table, has more columns or rows than any, or cells that no column or
+        several columns could be meant with.
 
     """
-    reader = csv.DictReader(io.StringIO(text, newline=''), strict=True)
+    reader = csv.DictReader(csv_lines(text, str(path)), strict=True)
+    rows: list[tuple[int, Row]] = []
     try:
         header = reader.fieldnames or []
         if len(header) > MOST_COLUMNS:
             raise InputError(f'{path} has {len(header)} columns, more than {MOST_COLUMNS}')
-        return header, [(reader.line_num, row) for row in reader]
+        twice = [name for name, count in Counter(header).items() if name and count > 1]
+        if twice:
+            raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
+        for row in reader:
+            if any(row.pop(None, ())):
+                raise InputError(
+                    f'{path}, line {reader.line_num}: more values than the {len(header)} columns'
+                )
+            if len(rows) == MOST_ROWS:
+                raise InputError(
+                    f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
+                )
+            rows.append((reader.line_num, row))
     except csv.Error as err:
         raise InputError(f'cannot read {path}: {err}') from err
+    return header, rows
 
 
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:

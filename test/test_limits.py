@@ -261,6 +261,29 @@ def test_a_header_of_too_many_columns_is_refused(tmp_path):
         read_table(path, 2)
 
 
+@pytest.mark.parametrize(
+    ('rows', 'wrong'),
+    [
+        (('q1,q2,q1,x,y,z', '0,0,0,1,2,3'), 'several columns q1'),
+        (('q1,q2,x,y,z', '0,0,1,2,3,4'), 'line 2: more values than the 5 columns'),
+        (('q1,q2,x,y,z', '0,' * 600_000), 'a line of 120000. characters'),
+        (('q1,q2,x,y,z', *['0,0,1,2,3'] * 200_001), 'more than 200000 rows'),
+    ],
+)
+def test_rows_that_no_table_has_are_refused(tmp_path, rows, wrong):
+    path = tmp_path / 'table.csv'
+    path.write_text('\n'.join(rows) + '\n')
+    for read in (read_table, read_journal):
+        with pytest.raises(InputError, match=wrong):
+            read(path, 2)
+
+
+def test_blank_cells_behind_the_columns_are_left_alone(tmp_path):
+    path = tmp_path / 'table.csv'
+    path.write_text('q1,q2,x,y,z,,\n0,0,1,2,3,,,,\n')
+    assert len(read_table(path, 2).samples) == 1
+
+
 def test_many_rows_that_were_taken_back_take_no_longer_than_others(tmp_path):
     rows = [f'{k},0,0,1,2,3,{split}' for k in range(20_000) for split in ('', 'removed')]
     path = tmp_path / 'table.csv'
@@ -367,6 +390,24 @@ def test_messages_without_data_are_lost_and_no_more(bag):
     replayed = replay(bag, session())
     assert (replayed.recorded, replayed.read) == (120, 119)
     assert 'without data' in replayed.warnings[0]
+
+
+@pytest.mark.parametrize('bag', ['sqlite3'], indirect=True)
+@pytest.mark.parametrize('known', [True, False])
+@pytest.mark.parametrize('column', ['name', 'type'])
+def test_topics_whose_names_are_no_text_are_not_read(bag, column, known):
+    (file,) = bag.glob('*.db3')
+    with sqlite3.connect(file) as connection:
+        connection.execute(f"UPDATE topics SET {column}=x'05' WHERE type LIKE '%Point%'")
+    connection.close()
+    if not known:
+        (bag / 'metadata.yaml').unlink()
+    if known:  # the metadata name them
+        replayed = replay(bag, session())
+        assert (replayed.recorded, replayed.read) == (120, 100)
+    else:
+        with pytest.raises(InputError, match='has no pose topic'):
+            replay(bag, session())
 
 
 @pytest.mark.parametrize('bag', ['mcap'], indirect=True)

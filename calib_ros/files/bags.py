@@ -29,7 +29,15 @@ from calib_ros.files.mcap import (
     unpacked,
     unpacked_size,
 )
-from calib_ros.files.salvage import NOT_CLOSED, Salvage, check, recorded, salvage, unpacked_files
+from calib_ros.files.salvage import (
+    NOT_CLOSED,
+    Salvage,
+    check,
+    named,
+    recorded,
+    salvage,
+    unpacked_files,
+)
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.sampling.account import Account
@@ -117,8 +125,8 @@ def replay(path: Path, session: CalibrationSession) -> Replayed:
         Takes the messages; its settings name topics where the types leave a choice.
 
     """
-    if not path.exists():
-        raise InputError(f'there is no bag at {path}')
+    if not (path.is_dir() or path.is_file()):
+        raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
     with unpacked_files(path) as folder:
         return _replay(path, folder, session)
 
@@ -136,7 +144,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
             raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
         return _salvaged(path, folder, found, session)
     with closing(reader):
-        available = {c.topic: c.msgtype for c in reader.connections}
+        available = named((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
         streams, deserialise = _chosen(session, available, partial(read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]

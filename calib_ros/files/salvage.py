@@ -92,6 +92,11 @@ def _unpack_file(file: Path, target: Path) -> None:
         return
 
 
+def named(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
+    """Return the types of topics; a database may hold something else than text for both."""
+    return {name: kind for name, kind in topics if isinstance(name, str) and isinstance(kind, str)}
+
+
 def check(path: Path) -> None:
     """Refuse a bag folder or file that the library must not open, though messages may be in it.
 
@@ -193,7 +198,7 @@ def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
             _check_layout(connection)
             rows = connection.execute('SELECT id, name, type FROM topics')
             topics = {key: (name, kind) for key, name, kind in _growing(rows, 'topics')}
-            found.topics |= dict(topics.values())
+            found.topics |= named(topics.values())
             rows = connection.execute('SELECT id, topic_id, data FROM messages ORDER BY id')
             for _, key, data in _growing(rows, 'messages'):
                 yield topics[key][0], data

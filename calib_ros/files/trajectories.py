@@ -19,7 +19,7 @@ import numpy as np
 from calib_ros.apply.compensation import Program
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, parse_yaml, read_text
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_lines, parse_yaml, read_text
 from calib_ros.values import parse_number, parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
@@ -59,7 +59,7 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
 
 
 def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
-    reader = csv.reader(io.StringIO(text, newline=''))
+    reader = csv.reader(csv_lines(text, where))
     try:
         lines = [(reader.line_num, row) for row in reader if row]
     except csv.Error as err:
