@@ -342,7 +342,7 @@ def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
 def _joint(row: object, where: str) -> Joint:
     content = _mapping(row, JOINT_KEYS, where)
     for key in ('name', 'a', 'alpha', 'd', 'theta'):
-        if key not in content:
+        if content.get(key) is None:
             raise ConfigError(f'{where}: key "{key}" is missing')
     numbers = {
         key: parse_number(content[key], f'{where}: {key}')
