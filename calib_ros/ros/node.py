@@ -25,8 +25,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import (  # these have no public names in Jazzy
+    InvalidHandle,
     RCLError,
-    RCLInvalidROSArgsError,
     UnknownROSArgsError,
 )
 from rclpy.clock import Clock, ClockType
@@ -422,6 +422,8 @@ class CalibrationNode(Node):
         def guarded(*arguments: Any) -> None:
             try:
                 callback(*arguments)
+            except InvalidHandle:  # the node was ended meanwhile: nobody hears any more
+                return
             except Exception:
                 self.get_logger().error(f'internal error: {traceback.format_exc()}')
 
