@@ -203,8 +203,9 @@ def triangular(rows: FloatArray) -> FloatArray:
 def _root_of_inverse(covariance: FloatArray) -> FloatArray:
     """Return rows (P, P) with the information whose inverse is a covariance."""
     std = np.sqrt(np.diag(covariance))
-    lower = linalg.cholesky(covariance / np.outer(std, std), lower=True)
-    return np.asarray(linalg.solve_triangular(lower, np.diag(1.0 / std), lower=True))
+    values, vectors = linalg.eigh(covariance / np.outer(std, std))
+    least = len(std) * np.finfo(float).eps * values[-1]  # by rounding, zero and below as well
+    return np.asarray((vectors / np.sqrt(np.maximum(values, least))).T / std)
 
 
 def _with_assumed_tool(chain: Chain, tool: str) -> Chain:
