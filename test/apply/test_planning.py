@@ -21,6 +21,7 @@ from calib_ros.apply.design import (
     information_of,
     predicted,
 )
+from calib_ros.apply.design import _root_of_inverse as root_of_inverse
 from calib_ros.apply.planning import choose
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
@@ -185,6 +186,13 @@ def test_parameters_that_no_candidate_shows_are_named():
     assert found.lacking
     assert set(found.lacking) == set(result.not_excited)
     assert np.isfinite(found.accuracy[-1])
+
+
+def test_a_covariance_that_rounding_made_singular_still_informs():
+    known = np.array([[4.0, 1.0], [1.0, 2.0]])
+    rows = root_of_inverse(known)
+    assert rows.T @ rows == pytest.approx(np.linalg.inv(known))
+    assert np.isfinite(root_of_inverse(np.ones((3, 3)))).all()
 
 
 def test_priors_make_up_for_poses():
