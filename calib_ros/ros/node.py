@@ -27,6 +27,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy._rclpy_pybind11 import (  # these have no public names in Jazzy
     InvalidHandle,
     RCLError,
+    RCLInvalidROSArgsError,
     UnknownROSArgsError,
 )
 from rclpy.clock import Clock, ClockType
