@@ -216,7 +216,7 @@ def metadata(path):
 
 def message(data):
     """The first byte chooses the type; messages are divided by a mark."""
-    from calib_ros.files.bags import _deserialised
+    from calib_ros.files.bags import _deserialiser
     from calib_ros.sampling.intake import Stream, feed
     from calib_ros.sampling.messages import DECODERS, JOINT_STATE
     from calib_ros.sampling.session import CalibrationSession
@@ -229,7 +229,7 @@ def message(data):
         kind = types[part[0] % len(types)] if part else JOINT_STATE
         source = None if kind == JOINT_STATE else Source(f'/{kind}', kind)
         batch.append((Stream(f'/{kind}', kind, source), part[1:]))
-    problems = feed(session, batch, _deserialised)
+    problems = feed(session, batch, _deserialiser({}))
     session.finish()
     assert not any('internal error' in text for text in problems), problems
     str(session.account())
