@@ -10,8 +10,9 @@ are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse 
 
 whose left side is normal: this *risk* is one value of the normal distribution, or the mean of some
 with other sizes of errors, which are not known for sure. The calibration is used at the poses
-measured if the risk there is below RISK, and further out, in shells of growing standard deviation
-of the predicted position, as far as the risk in each shell is.
+measured if the risk there is below RISK, by themselves and with those of the whole range that are
+known as well; and further out, in shells of growing standard deviation of the predicted position,
+as far as the risk in each shell is.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
-RISK = 0.01
+RISK = 0.02
 """Probability at which a calibration may make the arm worse over the poses of a shell."""
 DRAWN = 200
 """Random configurations that stand for the range of the joints."""
@@ -179,8 +180,9 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     near, far = np.split(judge.sigma, [len(measured)])
     limit = float(near.max())
     order = np.argsort(far)
-    inner = [*range(len(measured)), *(len(measured) + order[far[order] <= limit]).tolist()]
-    if not judge.risk(inner, inner) < RISK:
+    own = [*range(len(measured))]
+    inner = [*own, *(len(measured) + order[far[order] <= limit]).tolist()]
+    if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
         return None
     shells = len(measured) + order[far[order] > limit]
     for first in range(0, len(shells), SHELL):

@@ -71,7 +71,7 @@ def test_a_drift_is_no_gain_of_the_arm(kind):
 
 @pytest.mark.parametrize('kind', DRIFTS)
 def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts(kind):
-    """One of eight may be refused: 0.3 mm of drift in a narrow path leave its risk above 1 %."""
+    """One of eight may be refused: 0.3 mm of drift in a narrow path leave its risk above 2 %."""
     accepted = 0
     for seed in range(4):
         accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
