@@ -9,7 +9,7 @@ demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
 
 test: $(VENV)/installed $(VENV)/tf2_msgs/installed $(VENV)/mocap4r2_msgs/installed
-	$(BIN)/python -m pytest $(PYTEST_ARGUMENTS)
+	$(BIN)/python -m pytest -n auto $(PYTEST_ARGUMENTS)
 
 FUZZ_SECONDS ?= 600
 fuzz: $(VENV)/installed

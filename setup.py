@@ -52,6 +52,7 @@ setup(
             'kinpy',
             'mypy',
             'pytest',
+            'pytest-xdist',
             'ros-jazzy-ament-cmake',
             *(f'ros-jazzy-ament-cmake-{name}' for name in AMENT),
             'ros-jazzy-ament-package',

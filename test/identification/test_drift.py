@@ -115,7 +115,7 @@ def test_sessions_move_each_in_itself():
 
 
 @pytest.mark.parametrize('kind', ['walk', 'swing'])
-@pytest.mark.parametrize(('count', 'width'), [(60, None), (120, None), (120, 0.8)])
+@pytest.mark.parametrize(('count', 'width'), [(60, None), (120, 0.8)])
 def test_a_drift_of_the_tracker_chooses_no_effects(kind, count, width):
     """At 99 % a group: of 8 sessions one or none."""
     chosen = 0

@@ -131,7 +131,7 @@ def happening(seed, parts, dies, joint_period, sources, period, stand, latest, w
     return [what for _, what in events] * (1 + again)
 
 
-@settings(max_examples=100, phases=[Phase.generate])  # to shrink takes minutes
+@settings(max_examples=50, phases=[Phase.generate])  # to shrink takes minutes
 @given(plans, traffic)
 def test_every_measurement_is_accounted_for(plan, traffic):
     session = CalibrationSession(ARM, Settings(**plan))
