@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray, String
 from calib_ros.atomic import confined
 from calib_ros.errors import InputError
 from calib_ros.files.archive import Archive
-from calib_ros.files.export import exports
+from calib_ros.files.export import exports, urdf_foot
 from calib_ros.files.vendors import vendor_files
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.region import region_of_record
@@ -152,7 +152,8 @@ class Keeper:
         forms += vendor_files(found.chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
-            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **links)
+            text = corrected_urdf(self._urdf, found.chain, **links)
+            files['corrected.urdf'] = text + urdf_foot(found.chain)
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:
