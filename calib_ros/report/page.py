@@ -30,11 +30,15 @@ BLOCK = 1 << 20
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader sees first: 'good', 'bad', 'open' (undecided) or 'info', and words."""
+    """What a reader sees first: 'good', 'bad', 'open' (undecided) or 'info', and words.
+
+    `gain` are the figures before and after.
+    """
 
     state: State
     heading: str
     text: tuple[str, ...] = ()
+    gain: str = ''
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
@@ -94,7 +95,7 @@ def identification_report(
 def _verdict(
     result: Identification, limits: tuple[float, float], tolerance: float | None
 ) -> Verdict:
-    before, after = (result.validation or result.fitted).figures
+    gain = _gain(result.validation or result.fitted)
     if not result.accepted:
         return Verdict(
             'bad',
@@ -104,23 +105,37 @@ def _verdict(
                 'do not use them.',
             ),
         )
-    gain = (
-        f'On poses that were not used to compute the correction, the RMS position error falls '
-        f'from {before.rms_mm:.3f} mm to {after.rms_mm:.3f} mm.'
+    how = (
+        'RMS position error before and after, on poses that were not used to compute the '
+        'correction; in brackets the 95 % interval.'
     )
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
-    text = tuple(each for each in (gain, where) if each)
+    text = tuple(each for each in (how, where) if each)
     if tolerance is None:
-        return Verdict('good', 'Accepted', text)
+        return Verdict('good', 'Accepted', text, gain)
     wanted = f'{1e3 * tolerance:g} mm'
     lower, upper = limits
     if upper <= tolerance:
-        return Verdict('good', f'Accepted, and within the tolerance of {wanted}', text)
+        return Verdict('good', f'Accepted, and within the tolerance of {wanted}', text, gain)
     if lower > tolerance:
-        return Verdict('open', f'Accepted, but beyond the tolerance of {wanted}', text)
+        return Verdict('open', f'Accepted, but beyond the tolerance of {wanted}', text, gain)
     return Verdict(
-        'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text
+        'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text, gain
     )
+
+
+def _gain(which: Comparison) -> str:
+    """Return the errors before and after with their uncertainty."""
+    parts = []
+    for when, found in enumerate(which.figures):
+        between = _between(_limits(which, when, INTERVAL))
+        parts.append(f'{found.rms_mm:.3f} mm' + (f' ({between})' if between else ''))
+    return ' → '.join(parts)
+
+
+def _between(limits: tuple[float, float]) -> str:
+    """Return limits [m] in mm; nothing where they are not known."""
+    return f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if np.isfinite(limits[1]) else ''
 
 
 def _steps(
@@ -170,8 +185,7 @@ def _rows(label: str, which: Comparison) -> list[tuple[str, ...]]:
 
 
 def _row(label: str, found: ErrorFigures, limits: tuple[float, float] | None) -> tuple[str, ...]:
-    known = limits is not None and np.isfinite(limits[1])
-    between = f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if limits and known else ''
+    between = '' if limits is None else _between(limits)
     turned = '' if found.rms_mrad is None else f'{found.rms_mrad:.3f}'
     lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
     shown = (f'{each:.3f}' for each in lengths)
@@ -433,7 +447,7 @@ def verification_report(
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
-        verdict=Verdict(state.state, state.heading, (limits, *wanted)),
+        verdict=replace(state, text=(limits, *wanted), gain=_gain(found.comparison)),
         accuracy=Section(
             'accuracy',
             'Accuracy before and after the correction',
