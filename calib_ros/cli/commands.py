@@ -427,7 +427,7 @@ def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]
     from calib_ros.files.waypoints import read_joints
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report.poses import poses_to_verify
-    from calib_ros.report.reports import verification_report
+    from calib_ros.report.verified import verification_report
 
     nominal = load_chain(options.chain)
     arm = CalibratedArm.read(options.calibration, nominal)

@@ -190,14 +190,12 @@ def _identify(options: argparse.Namespace) -> int:
     else:
         with results(options, RESULT_FILES) as folder:
             found = _identified(options)
-            origin = origin_of(options, (options.csv, options.bag), found.configuration)
-            _write_result(folder, options.out, found, origin, options.tolerance)
+            _write_result(folder, options.out, found, options.tolerance)
     result = found.result
     for warning in (*found.warnings, *result.remarks):
         print(f'warning: {warning}', file=sys.stderr)
     if options.json:
-        document = words.as_document(result, found.samples) | {'warnings': list(found.warnings)}
-        print(json.dumps(document, indent=2))
+        print(json.dumps(_document(found, options.tolerance), indent=2))
     else:
         if found.read:
             print(found.read)
@@ -215,7 +213,7 @@ class _Identified(NamedTuple):
     result: Identification
     samples: dict[str, Any]
     warnings: tuple[str, ...]
-    configuration: str
+    origin: Origin
     read: str = ''
     lines: bool = False
 
@@ -287,7 +285,8 @@ def _identified(options: argparse.Namespace) -> _Identified:
         lost = replayed.refusals(account, options.largest_loss)
         result = replace(result, refusals=(*result.refusals, *lost))
     configuration = words.configuration_yaml(options.chain, settings)
-    return _Identified(problem, result, samples, warnings, configuration, read, lines)
+    origin = origin_of(options, (options.csv, options.bag), configuration)
+    return _Identified(problem, result, samples, warnings, origin, read, lines)
 
 
 def _sessions(options: argparse.Namespace) -> tuple[str, ...]:
@@ -415,15 +414,15 @@ def _demo(options: argparse.Namespace) -> int:
         session = CalibrationSession(chain, Settings())
         replay(bag, session)
         result = session.identify()
+        configuration = words.configuration_yaml(options.chain, session.settings)
         found = _Identified(
             session.problem_of(session.usable),
             result,
             session.account().as_document(),
             (),
-            words.configuration_yaml(options.chain, session.settings),
+            Origin(inputs_of([bag]), settings=configuration),
         )
-        origin = Origin(inputs_of([bag]), settings=found.configuration)
-        _write_result(folder, options.out, found, origin)
+        _write_result(folder, options.out, found)
         against = words.against_truth(result, load_chain(truth))
     print(f'1. simulated: {options.out / "bag"}, an arm with known errors ({truth.name})')
     print(f'2. replayed: {session.account()}')
@@ -472,11 +471,19 @@ RESULT_FILES = (
 )
 
 
+def _document(found: _Identified, tolerance: float | None) -> dict[str, Any]:
+    """Return the content of result.json; `tolerance` is the wanted error [mm]."""
+    from calib_ros.report import words
+
+    document = words.as_document(found.result, found.samples)
+    document |= {'warnings': list(found.warnings), 'tolerance_mm': tolerance}
+    return document | {'origin': found.origin.document()}
+
+
 def _write_result(
     folder: Path,
     out: Path,
     found: _Identified,
-    origin: Origin,
     tolerance: float | None = None,
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
@@ -490,19 +497,18 @@ def _write_result(
     from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report
 
-    _, result, samples, warnings, configuration, _, lines = found
-    document = words.as_document(result, samples) | {'warnings': list(warnings)}
-    document['origin'] = origin.document() | {'tolerance_mm': tolerance}
-    poses = poses_of(found.problem, result, lines)
+    problem, result, samples, warnings, origin, _, lines = found
+    document = _document(found, tolerance)
+    poses = poses_of(problem, result, lines)
     contents: dict[str, str | bytes] = {
         'result.json': json.dumps(document, indent=2) + '\n',
         'report.md': words.markdown(result, samples, warnings),
         'residuals.csv': poses.table(),
         'before_after.png': before_after_png(result),
-        'settings.yaml': configuration,
+        'settings.yaml': origin.settings,
     }
     wanted = None if tolerance is None else 1e-3 * tolerance
-    report = identification_report(found.problem, result, poses, origin, warnings, wanted)
+    report = identification_report(problem, result, poses, origin, warnings, wanted)
     contents |= page_of(report)
     earlier = out / 'calibration.yaml'
     if result.accepted:

@@ -147,8 +147,9 @@ RULES: tuple[tuple[str, Advice], ...] = (
         'that of a drift',
         Advice(
             'The improvement may only be drift of the measuring device',
-            'Poses measured one after the other share their error. A device that warms up looks '
-            'the same, and a correction for it would be wrong tomorrow.',
+            'The errors changed slowly during the session. A measuring device that warms up or '
+            'settles does just that. Then the correction would fit the device, not the robot, '
+            'and be wrong tomorrow.',
             (
                 'Let the measuring device warm up.',
                 'Measure the same poses again in random order.',

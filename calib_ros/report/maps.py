@@ -16,7 +16,7 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures
 from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.reports import identity_of
+from calib_ros.report.reports import coverage, identity_of
 
 MOST_POSES = 200
 """Poses of a plan that have a row."""
@@ -167,18 +167,7 @@ def plan_report(
         sections.insert(0, Section('promise', 'What the poses promise', (about,), curve))
         if np.isfinite(found.accuracy[-1]):
             text += (f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.',)
-    figure, rows = figures.coverage(chain, joints)
-    sections.append(
-        Section(
-            'coverage',
-            'How far each joint will move',
-            (),
-            figure,
-            ('joint', 'range', 'from, to', 'parts with poses'),
-            rows,
-            100 + 45 * len(rows),
-        )
-    )
+    sections.append(coverage(chain, joints, 'How far each joint will move'))
     show = [figures.unit_of(joint) for joint in chain.joints]
     more = f' The first {MOST_POSES} are shown.' if len(joints) > MOST_POSES else ''
     sections.append(

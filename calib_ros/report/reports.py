@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page of an identification and of a verification says."""
+"""What the page of an identification says."""
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Sequence
-from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.verification import MOST_LINES, Verification, rms_interval
+from calib_ros.apply.verification import rms_interval
 from calib_ros.apply.workspace import CalibratedArm, survey
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, words
 from calib_ros.report.advice import SPREAD, advice
 from calib_ros.report.explorer import explorer
@@ -56,7 +56,7 @@ def identification_report(
         row
         for label, which in (('fitted', result.fitted), ('not fitted', result.validation))
         if which is not None
-        for row in _rows(label, which)
+        for row in accuracy_rows(label, which)
     ]
     if judged.outliers:
         accuracy.append(_row('after, with outliers', judged.figures_of_all[1], None))
@@ -71,6 +71,8 @@ def identification_report(
             (
                 f'"Before" is {words.BEFORE}. Judged by {result.validated_by}. The interval is '
                 'that of the RMS error over poses like these, each configuration counted once.',
+                'RMS (root mean square) is the usual size of the error. 1 mrad of orientation '
+                'moves the tip of a tool of 1 m by 1 mm.',
                 ISO_9283,
             ),
             head=HEAD,
@@ -95,14 +97,14 @@ def identification_report(
 def _verdict(
     result: Identification, limits: tuple[float, float], tolerance: float | None
 ) -> Verdict:
-    gain = _gain(result.validation or result.fitted)
+    both = gain(result.validation or result.fitted)
     if not result.accepted:
         return Verdict(
             'bad',
             'Not accepted: the robot stays as it was',
             (
-                'No correction was written or published. The figures below show what was tried; '
-                'do not use them.',
+                f'Why: {"; ".join(each.heading for each in advice(result.refusals))}.',
+                'No correction was written or published. The figures below show what was tried.',
             ),
         )
     how = (
@@ -112,19 +114,19 @@ def _verdict(
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(each for each in (how, where) if each)
     if tolerance is None:
-        return Verdict('good', 'Accepted', text, gain)
+        return Verdict('good', 'Accepted', text, both)
     wanted = f'{1e3 * tolerance:g} mm'
     lower, upper = limits
     if upper <= tolerance:
-        return Verdict('good', f'Accepted, and within the tolerance of {wanted}', text, gain)
+        return Verdict('good', f'Accepted, and within the tolerance of {wanted}', text, both)
     if lower > tolerance:
-        return Verdict('open', f'Accepted, but beyond the tolerance of {wanted}', text, gain)
+        return Verdict('open', f'Accepted, but beyond the tolerance of {wanted}', text, both)
     return Verdict(
-        'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text, gain
+        'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text, both
     )
 
 
-def _gain(which: Comparison) -> str:
+def gain(which: Comparison) -> str:
     """Return the errors before and after with their uncertainty."""
     parts = []
     for when, found in enumerate(which.figures):
@@ -141,9 +143,13 @@ def _between(limits: tuple[float, float]) -> str:
 def _steps(
     result: Identification, limits: tuple[float, float], tolerance: float | None
 ) -> tuple[str, ...]:
-    """Return what to do with an accepted result."""
+    """Return what to do with a result."""
     if not result.accepted:
-        return ()
+        return (
+            'Do what is said above under "What to do", the first point first.',
+            'Then identify again. Nothing is lost: the measurements so far can be used with the '
+            'new ones.',
+        )
     found = []
     if tolerance is not None and limits[0] > tolerance:
         if not result.chain.effects:
@@ -176,7 +182,7 @@ def _limits(which: Comparison, when: int, confidence: float) -> tuple[float, flo
     return rms_interval(residuals.position[mask], residuals.configurations[mask], confidence)
 
 
-def _rows(label: str, which: Comparison) -> list[tuple[str, ...]]:
+def accuracy_rows(label: str, which: Comparison) -> list[tuple[str, ...]]:
     """Return the rows of the table of accuracy, before and after."""
     return [
         _row(f'{label}, {name}', found, _limits(which, when, INTERVAL))
@@ -231,7 +237,8 @@ def _measured(poses: Poses | None) -> str:
     return f'{first} to {last} UTC'
 
 
-def _distributions(poses: Poses) -> list[Section]:
+def distributions(poses: Poses) -> list[Section]:
+    """Return how many of the judged poses are how good."""
     chosen = poses.judged
     errors = [1e3 * np.linalg.norm(each[chosen], axis=1) for each in (poses.before, poses.after)]
     return [
@@ -246,7 +253,7 @@ def _distributions(poses: Poses) -> list[Section]:
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> list[Section]:
     """Return the sections below the poses."""
-    found = _distributions(poses)
+    found = distributions(poses)
     found.append(
         Section(
             'noise',
@@ -273,18 +280,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> list[Se
     )
     if gauges:
         found.append(Section('gauges', 'What no measurement of this kind can tell', gauges))
-    figure, rows = figures.coverage(result.chain, poses.joints)
-    found.append(
-        Section(
-            'coverage',
-            'How far each joint was moved',
-            ('Errors show only where a joint was: blank parts of its range were not measured.',),
-            figure,
-            ('joint', 'range', 'measured from, to', 'parts with poses'),
-            rows,
-            100 + 45 * len(rows),
-        )
-    )
+    found.append(coverage(result.chain, poses.joints, 'How far each joint was moved'))
     if result.verdicts:
         found.append(
             Section(
@@ -306,6 +302,20 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> list[Se
     if result.accepted:
         found.append(_map(result))
     return found
+
+
+def coverage(chain: Chain, joints: FloatArray, title: str) -> Section:
+    """Return how far joint values (N, n) reach in the range of each joint."""
+    figure, rows = figures.coverage(chain, joints)
+    return Section(
+        'coverage',
+        title,
+        ('Errors show only where a joint was: blank parts of its range hold no poses.',),
+        figure,
+        ('joint', 'range', 'poses from, to', 'parts with poses'),
+        rows,
+        100 + 45 * len(rows),
+    )
 
 
 def _outliers(result: Identification, poses: Poses) -> Section:
@@ -405,116 +415,3 @@ def _map(result: Identification) -> Section:
         ),
         figures.error_map(found),
     )
-
-
-STATES: dict[str, Verdict] = {
-    'PASS': Verdict('good', 'Passed'),
-    'FAIL': Verdict('bad', 'Failed: the error is beyond the tolerance'),
-    'UNDECIDED': Verdict('open', 'Undecided: more poses are needed'),
-    'JUDGED': Verdict('info', 'Measured: no tolerance was given'),
-}
-NEXT: dict[str, tuple[str, ...]] = {
-    'PASS': ('Keep this page with the calibration. Verify again after a collision or repair.',),
-    'FAIL': (
-        'Check that the measuring device, the target and the robot stand as they did for the '
-        'calibration; if not, use --new-base or --new-tool.',
-        'Check that the correction is active in the controller (--commanded tells).',
-        'Calibrate again with new poses; try --model auto.',
-    ),
-    'UNDECIDED': (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
-    'JUDGED': ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
-}
-
-
-def verification_report(
-    chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
-) -> Report:
-    """Return the report of a verification of a calibrated chain."""
-    share = f'{100.0 * found.confidence:g} %'
-    limits = (
-        f'The RMS position error over poses like these is between {1e3 * found.lower:.3f} mm and '
-        f'{1e3 * found.upper:.3f} mm; each limit holds with {share} confidence.'
-    )
-    wanted: tuple[str, ...] = (
-        () if found.tolerance is None else (f'Tolerance: {1e3 * found.tolerance:g} mm.',)
-    )
-    enough = f'About {found.needed}' if found.needed else 'Not even 10,000'
-    if found.verdict == 'UNDECIDED':
-        wanted += (f'{enough} configurations with the same error would decide.',)
-    figure, rows = figures.coverage(chain, poses.joints)
-    notes = _assumed(found)
-    state = STATES[found.verdict]
-    return Report(
-        kind='Verification of a calibrated arm',
-        robot=chain.name,
-        verdict=replace(state, text=(limits, *wanted), gain=_gain(found.comparison)),
-        accuracy=Section(
-            'accuracy',
-            'Accuracy before and after the correction',
-            (ISO_9283,),
-            head=HEAD,
-            rows=tuple(_rows('measured', found.comparison)),
-        ),
-        steps=NEXT[found.verdict],
-        remarks=(*warnings, *notes),
-        identity=identity_of(
-            chain, origin, poses, ('Configurations', str(found.configurations)), table_hash(chain)
-        ),
-        explorer=explorer(chain, poses),
-        sections=(
-            *_by_configuration(found),
-            *_distributions(poses),
-            Section(
-                'coverage',
-                'How far each joint was moved',
-                (),
-                figure,
-                ('joint', 'range', 'measured from, to', 'parts with poses'),
-                rows,
-                100 + 45 * len(rows),
-            ),
-        ),
-        inputs=origin.inputs,
-        settings=origin.settings,
-    )
-
-
-def _assumed(found: Verification) -> tuple[str, ...]:
-    """Return what a verification assumes."""
-    notes = []
-    if found.fitted:
-        notes.append(f'Fitted to these measurements, for both: {" and ".join(found.fitted)}.')
-    if not found.by_program:
-        notes.append(
-            'This is about the calibration. Whether its correction arrives at the arm shows only '
-            'with the program as it was before (--commanded).'
-        )
-    return tuple(notes)
-
-
-def _by_configuration(found: Verification) -> list[Section]:
-    """Return accuracy and repeatability of a few configurations, one by one."""
-    if found.configurations > MOST_LINES:
-        return []
-    rows = []
-    for k in range(found.configurations):
-        before, after = (
-            1e3 * each.position[found.group == k]
-            for each in (found.comparison.before, found.comparison.after)
-        )
-        apart = np.linalg.norm(after - after.mean(axis=0), axis=1)
-        again = f'{apart.mean() + 3.0 * apart.std(ddof=1):.4f}' if len(after) > 1 else ''
-        accuracies = (f'{np.linalg.norm(each.mean(axis=0)):.4f}' for each in (before, after))
-        rows.append((f'P{k + 1}', str(len(after)), *accuracies, again))
-    return [
-        Section(
-            'configurations',
-            'Pose by pose (ISO 9283)',
-            (
-                'AP: position accuracy, of the mean of all cycles. RP: repeatability, '
-                'mean + 3 sigma.',
-            ),
-            head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
-            rows=tuple(rows),
-        )
-    ]

@@ -45,12 +45,16 @@
   if (!data.explorer) return;
 
   // Poses
-  const e = data.explorer, n = e.joints.length, count = e.sources.length;
+  const e = data.explorer, n = e.joints.length;
   const floats = {};
-  for (const [name, text] of Object.entries(e.arrays)) {
-    const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-    floats[name] = new Float32Array(bytes.buffer);
-  }
+  const unpacked = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
+  for (const [name, text] of Object.entries(e.arrays)) floats[name] = new Float32Array(unpacked(text));
+  const stamps = new BigInt64Array(unpacked(e.stamps)), count = stamps.length;
+  const number = (i) => (e.number ? number(i) : i + 1);
+  const source = (i) => {
+    const seconds = String(stamps[i] / 1000000000n);
+    return e.lines ? 'line ' + seconds : `${seconds}.${String(stamps[i] % 1000000000n).padStart(9, '0')} s`;
+  };
   const triple = (name, i) => [...floats[name].subarray(3 * i, 3 * i + 3)];
   const length = (v) => Math.hypot(v[0], v[1], v[2]);
   const lengths = {};
@@ -113,18 +117,17 @@
 
   function vectors() {
     const out = { x: [], y: [], z: [] }, s = scale() * 1e-3;
-    const source = e.cells ? e.cells : null;
-    const total = source ? source.count.length : count;
+    const total = e.cells ? e.cells.count.length : count;
     const step = Math.ceil(total / 4000);
     for (let i = 0; i < total; i += step) {
-      const p = source ? source.position[i] : triple('position', i);
-      const v = source ? source['mean_' + state.when][i] : triple(state.when, i);
+      const p = e.cells ? e.cells.position[i] : triple('position', i);
+      const v = e.cells ? e.cells['mean_' + state.when][i] : triple(state.when, i);
       ['x', 'y', 'z'].forEach((c, k) => out[c].push(p[k], p[k] + s * v[k], null));
     }
     return out;
   }
   const errors = () => (e.cells ? e.cells['rms_' + state.when] : good.map((i) => lengths[state.when][i]));
-  const words = (i) => `${e.sources[i]}: ${fixed(lengths.before[i])} mm before, ${fixed(lengths.after[i])} mm after`;
+  const words = (i) => `${source(i)}: ${fixed(lengths.before[i])} mm before, ${fixed(lengths.after[i])} mm after`;
   const at = (list) => ({
     x: list.map((i) => floats.position[3 * i]), y: list.map((i) => floats.position[3 * i + 1]),
     z: list.map((i) => floats.position[3 * i + 2]),
@@ -181,7 +184,7 @@
       state.page = Math.floor(place / SIZE);
     }
     list();
-    byId('picked').textContent = `Picked: ${e.sources[i]}, error ${fixed(lengths.before[i])} mm before, ${fixed(lengths.after[i])} mm after` + (e.outlier[i] ? '; an outlier.' : '.');
+    byId('picked').textContent = `Picked: ${source(i)}, error ${fixed(lengths.before[i])} mm before, ${fixed(lengths.after[i])} mm after` + (e.outlier[i] ? '; an outlier.' : '.');
     if (!drawn('space')) return;
     const [line, axes] = arm(i), mark = at([i]);
     const parts = [line, ...axes, mark];
@@ -213,15 +216,15 @@
       row.className = i === state.picked ? 'picked' : e.outlier[i] ? 'outlier' : '';
       const button = document.createElement('button');
       button.type = 'button';
-      button.textContent = e.number[i];
-      button.setAttribute('aria-label', `Show pose ${e.number[i]} in the figure`);
+      button.textContent = number(i);
+      button.setAttribute('aria-label', `Show pose ${number(i)} in the figure`);
       button.addEventListener('click', () => { pick(i, true); byId('rows').querySelector('.picked button').focus(); });
       cell(row, '', false).append(button);
-      cell(row, e.sources[i], false);
-      cell(row, e.role[i] + (e.outlier[i] ? ', outlier' : ''), false);
+      cell(row, source(i), false);
+      cell(row, e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : ''), false);
       cell(row, fixed(lengths.before[i]));
       cell(row, fixed(lengths.after[i]));
-      if (e.oriented) { cell(row, fixed(length(triple('turned_before', i)))); cell(row, fixed(length(triple('turned_after', i)))); }
+      if (e.oriented) { cell(row, fixed(floats.turned_before[i])); cell(row, fixed(floats.turned_after[i])); }
       cell(row, fixed(floats.size[i], 1));
       for (let k = 0; k < n; k++) cell(row, fixed(floats.joints[n * i + k] * e.show[k][0], e.show[k][2]));
     }
@@ -242,7 +245,7 @@
   for (const [value, text] of names) byId('component').add(new Option(text, value));
   const AXIS = { x: 0, y: 1, z: 2 };
   const value = (when, i) => (state.component === 'length' ? lengths[when][i]
-    : state.component === 'angle' ? length(triple('turned_' + when, i))
+    : state.component === 'angle' ? floats['turned_' + when][i]
       : floats[when][3 * i + AXIS[state.component]]);
   const label = () => names.find(([v]) => v === state.component)[1];
   function series(xs, key, axis) {
@@ -250,7 +253,7 @@
     const type = hasGL && count > 2000 ? 'scattergl' : 'scatter';
     const one = (when, list, more) => ({
       type, mode: 'markers', x: list.map(xs), y: list.map((i) => value(when, i)), customdata: list,
-      text: list.map((i) => e.sources[i]), hovertemplate: '%{text}<br>%{y:.3f}<extra></extra>', ...axis, ...more });
+      text: list.map((i) => source(i)), hovertemplate: '%{text}<br>%{y:.3f}<extra></extra>', ...axis, ...more });
     const found = [
       one('before', good, { name: 'before', marker: { color: BEFORE, size: 4, symbol: 'diamond', opacity: 0.6 } }),
       one('after', good, { name: 'after', marker: { color: AFTER, size: 4, opacity: 0.8 } }),
@@ -277,7 +280,7 @@
     const layout = base();
     layout.xaxis = { title: { text: 'pose in the order of measurement' } };
     layout.yaxis = { title: { text: label() }, zeroline: true };
-    Plotly.react('session', series((i) => e.number[i], 'session', {}), layout, plain).then(() => byId('session').removeAllListeners && (byId('session').removeAllListeners('plotly_click'), clicks('session')));
+    Plotly.react('session', series(number, 'session', {}), layout, plain).then(() => byId('session').removeAllListeners && (byId('session').removeAllListeners('plotly_click'), clicks('session')));
   }
   function drawJoints() {
     const columns = narrow() ? 1 : Math.min(3, n), rows = Math.ceil(n / columns);
