@@ -110,7 +110,6 @@ def render(report: Report) -> str | None:
     """Return a report as HTML; None where jinja2 or plotly is not installed."""
     try:
         import jinja2
-        from markupsafe import Markup
         from plotly.offline import get_plotlyjs
 
         plotly = get_plotlyjs()
@@ -131,9 +130,9 @@ def render(report: Report) -> str | None:
     return environment.get_template('report.html.jinja').render(
         report=report,
         marks=MARKS,
-        css=Markup(source('report.css')),
-        js=Markup(source('report.js')),
-        plotly=Markup(plotly),
+        css=source('report.css'),
+        js=source('report.js'),
+        plotly=plotly,
         data={
             'figures': {each.name: each.figure for each in report.sections if each.figure},
             'explorer': report.explorer,
