@@ -24,6 +24,8 @@ BINS = 60
 """Parts of the session, and of each joint's values, whose quantiles are shown."""
 CELLS = 24
 """Cells along the longest edge of the workspace."""
+DRAWN = 60_000
+"""Poses from which quantiles are taken, evenly spread over the session."""
 SHARES = (0.05, 0.5, 0.95)
 ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
 
@@ -97,6 +99,7 @@ def _values(poses: Poses, kind: str, when: str) -> FloatArray:
 def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     """Return quantiles of each kind of error over the session and over each joint's values."""
     good = np.flatnonzero(~poses.outlier)
+    good = good[:: 1 + len(good) // DRAWN]
     axes = {'session': good + 1.0}
     for k, joint in enumerate(chain.joints):
         axes[f'joint{k}'] = unit_of(joint)[0] * poses.joints[good, k]
@@ -108,25 +111,25 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     for key, values in axes.items():
         edges = np.linspace(values.min(), values.max(), BINS + 1)
         place = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, BINS - 1)
-        order = np.argsort(place, kind='stable')
-        groups = np.split(order, np.cumsum(np.bincount(place, minlength=BINS))[:-1])
         middle = numbers(0.5 * (edges[1:] + edges[:-1]))
         found[key] = {
             kind: {'x': middle}
-            | {when: _quantiles(each, groups) for when, each in errors[kind].items()}
+            | {when: _quantiles(each, place) for when, each in errors[kind].items()}
             for kind in kinds
         }
     return found
 
 
-def _quantiles(values: FloatArray, groups: list[NDArray[np.intp]]) -> list[Any]:
-    """Return the SHARES (3, B) of values (N,) in groups; None where there are none."""
-    table = np.full((len(SHARES), len(groups)), np.nan)
-    for k, group in enumerate(groups):
-        known = values[group]
-        known = known[~np.isnan(known)]
-        if known.size:
-            table[:, k] = np.quantile(known, SHARES)
+def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
+    """Return the SHARES (3, B) of values (N,) in the parts (N,) 0 ... B - 1; None for none."""
+    known = ~np.isnan(values)
+    values, place = values[known], place[known]
+    ordered = values[np.lexsort((values, place))]
+    count = np.bincount(place, minlength=BINS)
+    first = np.cumsum(count) - count
+    ranks = np.round(np.outer(SHARES, np.maximum(count - 1, 0))).astype(int)
+    table = np.full(ranks.shape, np.nan)
+    table[:, count > 0] = ordered[(first + ranks)[:, count > 0]]
     return numbers(table, 4)
 
 

@@ -16,6 +16,7 @@ from calib_ros.cli.main import main
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report import explorer
 from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
@@ -228,6 +229,24 @@ def test_the_first_printed_page_is_the_certificate(wide):
     page.emulate_media(media='screen')
     page.set_viewport_size({'width': 1280, 'height': 800})
     assert height < 1016
+
+
+def test_many_poses_are_cells_and_bands(chromium, tmp_path, monkeypatch):
+    monkeypatch.setattr(explorer, 'MOST', 30)
+    problem = Problem(load_chain('ur5e'), measured())
+    found = identify(problem)
+    path = tmp_path / 'report.html'
+    poses = poses_of(problem, found)
+    path.write_text(render(identification_report(problem, found, poses, Origin())))
+    seen = Seen(chromium, path, 1280)
+    seen.drawn()
+    cells = seen.page.evaluate("document.getElementById('space').data[0].marker.color")
+    assert 0 < len(cells) <= len(poses)
+    bands = seen.page.evaluate("document.getElementById('session').data.map((t) => t.fill)")
+    assert bands.count('tonexty') == 2
+    seen.page.locator('#rows tbody button').last.click()
+    assert 'Picked' in seen.page.inner_text('#picked')
+    seen.end()
 
 
 def test_a_refused_result_on_a_telephone(chromium, tmp_path):

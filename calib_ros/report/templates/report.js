@@ -50,7 +50,7 @@
   const unpacked = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
   for (const [name, text] of Object.entries(e.arrays)) floats[name] = new Float32Array(unpacked(text));
   const stamps = new BigInt64Array(unpacked(e.stamps)), count = stamps.length;
-  const number = (i) => (e.number ? number(i) : i + 1);
+  const number = (i) => (e.number ? e.number[i] : i + 1);
   const source = (i) => {
     const seconds = String(stamps[i] / 1000000000n);
     return e.lines ? 'line ' + seconds : `${seconds}.${String(stamps[i] % 1000000000n).padStart(9, '0')} s`;
