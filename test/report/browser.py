@@ -14,6 +14,10 @@ def browser_path():
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
+PATIENCE_MS = 300_000
+"""A busy machine draws in software for minutes."""
+
+
 @contextmanager
 def browser():
     from playwright.sync_api import sync_playwright
@@ -22,5 +26,7 @@ def browser():
         started = playwright.chromium.launch(
             executable_path=browser_path(), args=['--no-sandbox', *GRAPHICS]
         )
-        yield started
+        context = started.new_context()
+        context.set_default_timeout(PATIENCE_MS)
+        yield context
         started.close()

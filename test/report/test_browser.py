@@ -76,7 +76,8 @@ class Seen:
     """A page, what it complained about, and what it asked the network for."""
 
     def __init__(self, chromium, path, width):
-        self.page = chromium.new_page(viewport={'width': width, 'height': 800})
+        self.page = chromium.new_page()
+        self.page.set_viewport_size({'width': width, 'height': 800})
         self.faults, self.requests = [], []
         self.page.on('pageerror', lambda error: self.faults.append(str(error)))
         self.page.on('console', self._said)

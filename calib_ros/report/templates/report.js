@@ -3,9 +3,11 @@
   const data = JSON.parse(document.getElementById('data').textContent);
   const narrow = () => window.innerWidth < 600;
   const INK = '#1b1f24', BEFORE = '#d95f02', AFTER = '#1b9e77', OUT = '#b3261e';
-  const hasGL = (() => {
-    try { return !!document.createElement('canvas').getContext('webgl'); } catch (e) { return false; }
-  })();
+  let known;
+  const hasGL = () => {  // asked when it is needed: the first context takes a while
+    if (known === undefined) known = !!document.createElement('canvas').getContext('webgl');
+    return known;
+  };
   const plain = { displayModeBar: false, responsive: true };
   const base = () => ({
     font: { color: INK, family: 'system-ui, sans-serif', size: 13 }, autosize: true,
@@ -17,7 +19,7 @@
   const waiting = new Map();
   const watcher = new IntersectionObserver((seen) => {
     for (const each of seen) if (each.isIntersecting) draw(each.target.id);
-  }, { rootMargin: '300px' });
+  }, { rootMargin: '100px' });
   function draw(id) {
     const work = waiting.get(id);
     if (!work) return;
@@ -250,7 +252,7 @@
   const label = () => names.find(([v]) => v === state.component)[1];
   function series(xs, key, axis) {
     if (e.bins) return bands(e.bins[key][state.component], axis);
-    const type = hasGL && count > 2000 ? 'scattergl' : 'scatter';
+    const type = count > 2000 && hasGL() ? 'scattergl' : 'scatter';
     const one = (when, list, more) => ({
       type, mode: 'markers', x: list.map(xs), y: list.map((i) => value(when, i)), customdata: list,
       text: list.map((i) => source(i)), hovertemplate: '%{text}<br>%{y:.3f}<extra></extra>', ...axis, ...more });
@@ -298,8 +300,10 @@
     Plotly.react('joints', traces, layout, plain).then(() => { byId('joints').removeAllListeners('plotly_click'); clicks('joints'); });
   }
 
-  if (hasGL) later('space', drawSpace);
-  else byId('space').textContent = 'This browser draws nothing in 3-D (no WebGL). The list and the other figures show the same.';
+  later('space', () => {
+    if (hasGL()) drawSpace();
+    else byId('space').textContent = 'This browser draws nothing in 3-D (no WebGL). The list and the other figures show the same.';
+  });
   later('session', drawSession);
   later('joints', drawJoints);
   for (const each of document.querySelectorAll('input[name=when]')) {
