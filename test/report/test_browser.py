@@ -182,6 +182,16 @@ def test_a_row_picks_the_pose_and_a_point_its_row(wide, result):
     assert 'an outlier' in page.inner_text('#picked')
 
 
+@pytest.mark.parametrize('way', ['left', 'right', 'up', 'down'])
+def test_the_arrows_turn_the_view(wide, way):
+    eye = "Object.values(document.getElementById('space').layout.scene.camera.eye)"
+    before = wide.page.evaluate(eye)
+    wide.page.click(f'[data-turn={way}]')
+    after = wide.page.evaluate(eye)
+    assert np.linalg.norm(np.subtract(after, before)) > 0.1
+    assert np.linalg.norm(after) == pytest.approx(np.linalg.norm(before))
+
+
 def test_the_list_shows_the_largest_errors_first_and_outliers_alone(wide):
     page = wide.page
     page.select_option('#sort', 'after')

@@ -142,7 +142,7 @@
 
   function drawSpace() {
     const none = { x: [], y: [], z: [] };
-    const [line, axes] = count ? arm(Math.max(state.picked, 0)) : [none, [none, none, none]];
+    const [line, axes] = count ? arm(state.picked < 0 ? Math.floor(count / 2) : state.picked) : [none, [none, none, none]];
     const wide = { type: 'scatter3d', hoverinfo: 'skip', mode: 'lines', showlegend: false };
     const traces = [
       { type: 'scatter3d', mode: 'markers', name: 'poses', ...dots(), hoverinfo: 'text',
@@ -156,9 +156,9 @@
       { type: 'scatter3d', mode: 'markers', ...at(state.picked < 0 ? [] : [state.picked]), hoverinfo: 'skip',
         marker: { size: 11, symbol: 'circle-open', color: '#000', line: { width: 3 } }, showlegend: false },
     ];
-    const layout = base();
+    const layout = base(), far = narrow() ? 1.9 : 1.35;
     const title = (text) => ({ title: { text: text + ' [m]' } });
-    layout.scene = { aspectmode: 'data', xaxis: title('x'), yaxis: title('y'), zaxis: title('z'), camera: { eye: { x: 1.25, y: -1.25, z: 0.8 } } };
+    layout.scene = { aspectmode: 'data', xaxis: title('x'), yaxis: title('y'), zaxis: title('z'), camera: { eye: { x: 1.2 * far, y: -1.2 * far, z: 0.5 * far } } };
     layout.margin = { l: 0, r: 0, t: 30, b: 0 };
     layout.showlegend = outliers.length > 0;
     Plotly.newPlot('space', traces, layout, plain);
