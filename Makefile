@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test fuzz lint oldest clean
+.PHONY: demo test fuzz lint oldest screenshots clean
 
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
@@ -52,6 +52,10 @@ $(VENV)/%_msgs/installed: $(VENV)/installed test/messages.cmake test/%_msgs/msg/
 	cmake --build $(@D) --target install; } > $(@D)/log 2>&1 \
 	|| { tail $(@D)/log; echo 'needs a C++ compiler: apt install g++'; exit 1; }
 	touch $@
+
+# Pictures of the report for docs/; needs Chromium and CALIB_ROS_DATA.
+screenshots: $(VENV)/installed
+	$(BIN)/python benchmarks/report.py --screenshots docs
 
 clean:
 	rm -rf $(VENV) $(OLDEST) demo build install log *.egg-info

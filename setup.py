@@ -16,6 +16,7 @@ AMENT = (
 )
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
+REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
 
 setup(
     name=NAME,
@@ -25,7 +26,7 @@ setup(
     maintainer='calib_ros maintainers',
     maintainer_email='maintainers@calib-ros.invalid',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed']},
+    package_data={NAME: ['py.typed'], f'{NAME}.report': ['templates/*']},
     python_requires='>=3.10',
     # The lower bounds are those of Ubuntu 24.04; `make oldest` runs with exactly these.
     install_requires=[
@@ -38,12 +39,15 @@ setup(
     extras_require={
         # Not in Ubuntu: the node and tables run without it.
         'bags': [BAGS],
+        # report.html; without it the other files are written.
+        'report': REPORT,
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
         'fuzz': ['atheris'],
         'test': [
             BAGS,
+            *REPORT,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
@@ -51,6 +55,7 @@ setup(
             'hypothesis',
             'kinpy',
             'mypy',
+            'playwright',
             'pytest',
             'pytest-xdist',
             'ros-jazzy-ament-cmake',

@@ -77,7 +77,9 @@ def test_package_xml_names_everything_that_is_imported():
     declared = {element.text for element in package.iter('exec_depend')}
     declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
     keys = {'yaml': 'python3-yaml'}
-    keys |= {name: f'python3-{name}' for name in ('numpy', 'scipy', 'matplotlib')}
+    keys |= {
+        name: f'python3-{name}' for name in ('jinja2', 'matplotlib', 'numpy', 'plotly', 'scipy')
+    }
     sources = [*(ROOT / 'calib_ros').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
     for source in sources:
         for node in ast.walk(ast.parse(source.read_text())):
@@ -93,7 +95,7 @@ def test_rosdep_finds_everything_on_ubuntu():
     """rosdep refuses keys that it would have to install by pip: PEP 668."""
     package = ET.parse(ROOT / 'package.xml').getroot()
     keys = {each.text for each in package if each.tag.endswith('depend')}
-    apt = ('hypothesis', 'matplotlib', 'numpy', 'pytest', 'scipy', 'yaml')
+    apt = ('hypothesis', 'jinja2', 'matplotlib', 'numpy', 'plotly', 'pytest', 'scipy', 'yaml')
     assert keys - JAZZY == {f'python3-{name}' for name in apt}
 
 

@@ -228,6 +228,26 @@ def rms_limits(
     return lower, upper
 
 
+def rms_interval(
+    errors: FloatArray, group: NDArray[np.intp], confidence: float
+) -> tuple[float, float]:
+    """Return the one-sided limits [m] of the RMS of errors (N, 3) over poses like these.
+
+    `group` (N,) are the configurations, of which each counts for one. With a single one nothing
+    is known: (0, inf).
+    """
+    _, place = np.unique(group, return_inverse=True)
+    moments = _moments(errors, place)
+    if len(moments) < 2:
+        return 0.0, np.inf
+    rms = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    if rms == 0.0:
+        return 0.0, 0.0
+    freedom = np.array([_freedom(moments) * len(moments)])
+    lower, upper = rms_limits(rms, freedom, confidence)
+    return float(lower[0]), float(upper[0])
+
+
 def _check(chain: Chain, observations: Observations) -> None:
     """Refuse measurements that the calibration says nothing about."""
     if observations.distances is not None or observations.socket:

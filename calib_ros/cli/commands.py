@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
+    add_identity,
     add_settings,
+    origin_of,
+    page_of,
     results,
     settings_of,
 )
@@ -28,10 +31,12 @@ if TYPE_CHECKING:
 
     from calib_ros.apply.candidates import Visibility
     from calib_ros.apply.design import Design
+    from calib_ros.apply.planning import Plan
     from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.kinematics.se3 import FloatArray
 
-WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png')
+WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
+VERIFICATION_FILES = ('report.html', 'residuals.csv', 'verification.txt')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
 TASK_POSES = 300
 """Random poses at which a plan is to be accurate when no task is given."""
@@ -93,8 +98,9 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
     add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
     add('--world', action='store_true', help='box and tracker are in the world, not in the base')
     add('--seed', type=int, default=0, help='of the random numbers')
-    add('--out', type=Path, metavar='FILE', help='CSV q1..qn to write, in order of visit')
+    add('--out', type=Path, metavar='FILE', help='CSV q1..qn to write, and its report beside it')
     add('--force', action='store_true', help='overwrite --out')
+    add_identity(parser)
     add_settings(parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed'))
 
 
@@ -116,6 +122,7 @@ def _add_workspace(parser: argparse.ArgumentParser) -> None:
     add('--turns', type=int, default=1, help='turns of the task about the vertical to try')
     add('--seed', type=int, default=0, help='of the random numbers')
     add('--force', action='store_true', help='replace the result in --out')
+    add_identity(parser)
 
 
 def _add_calibration(parser: argparse.ArgumentParser) -> None:
@@ -148,6 +155,9 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('--session', help='session of the table')
     add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
     add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+    add('--out', type=Path, help='folder for the report and the residuals')
+    add('--force', action='store_true', help='replace the result in --out')
+    add_identity(parser)
 
 
 def _add_compensate(parser: argparse.ArgumentParser) -> None:
@@ -198,6 +208,7 @@ def _plan(options: argparse.Namespace) -> int:
     from calib_ros.files.waypoints import joints_csv
     from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report.maps import plan_report
 
     _check_plan(options)
     chain = load_chain(options.chain)
@@ -213,21 +224,33 @@ def _plan(options: argparse.Namespace) -> int:
         options.world,
     )
     planned = _plan_tests if options.iso9283 else _plan_measurement
-    joints, words = planned(options, design, visibility, rng)
+    joints, words, plan = planned(options, design, visibility, rng)
     print(words)
     if chain.tool is None:
         x, y, z = ASSUMED_TOOL
         print(f'the tool is unknown: its target is taken to be at {x} {y} {z} m from the flange')
     if options.out is not None:
+        page = _page_beside(options.out)
+        report = plan_report(
+            design.chain,
+            joints,
+            words,
+            origin_of(options, (options.candidates, options.task, options.taken)),
+            plan,
+            options.accuracy,
+        )
+        pages = page_of(report, page.name)
         write_file(options.out, joints_csv(joints), overwrite=options.force)
-        print(f'wrote {options.out}')
+        for text in pages.values():
+            write_file(page, text, overwrite=options.force)
+        print(f'wrote {options.out}' + (f' and {page}' if pages else ''))
     return 0
 
 
 def _plan_measurement(
     options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
-) -> tuple[FloatArray, str]:
-    """Return the poses to measure in the order of visit, and what they promise."""
+) -> tuple[FloatArray, str, Plan | None]:
+    """Return the poses to measure in the order of visit, what they promise, and the plan."""
     import numpy as np
 
     from calib_ros.apply import planning
@@ -258,20 +281,21 @@ def _plan_measurement(
     speeds = np.broadcast_to(options.velocity, size)
     plan = planning.plan(design, candidates, task, count, **choice, velocities=speeds)
     words = planning.in_words(plan, len(candidates), options.accuracy, needed)
-    return plan.joints[plan.visit], words
+    return plan.joints[plan.visit], words, plan
 
 
 def _plan_tests(
     options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
-) -> tuple[FloatArray, str]:
-    """Return the test poses of ISO 9283, and what to do with them."""
+) -> tuple[FloatArray, str, Plan | None]:
+    """Return the test poses of ISO 9283, and what to do with them; there is no plan."""
     from calib_ros.apply.iso9283 import iso_9283_poses
 
     found = iso_9283_poses(design, rng, visibility)
-    return found.joints, (
+    words = (
         f'P1 to P5 of ISO 9283 in a cube of {found.edge:.3f} m, one orientation: go to them in '
         'turn, 30 times, and measure. Collisions are not looked at'
     )
+    return found.joints, words, None
 
 
 def _check_plan(options: argparse.Namespace) -> None:
@@ -287,8 +311,15 @@ def _check_plan(options: argparse.Namespace) -> None:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')
     if options.apart < 0.0 or not all(value > 0.0 for value in options.velocity):
         raise InputError('--apart must not be negative, and each --velocity must be positive')
-    if options.out is not None and options.out.exists() and not options.force:
-        raise InputError(f'{options.out} exists already: choose another name or --force')
+    if options.out is not None and not options.force:
+        for path in (options.out, _page_beside(options.out)):
+            if path.exists():
+                raise InputError(f'{path} exists already: choose another name or --force')
+
+
+def _page_beside(path: Path) -> Path:
+    """Return where the report of a plan is."""
+    return path.with_name(f'{path.stem}.report.html')
 
 
 def _workspace(options: argparse.Namespace) -> int:
@@ -312,6 +343,7 @@ def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
     from calib_ros.files.waypoints import csv_of, joints_csv
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import plots
+    from calib_ros.report.maps import workspace_report
 
     arm = workspace.CalibratedArm.read(options.result, load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
@@ -320,6 +352,7 @@ def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
     words = workspace.in_words(survey)
     if arm.region is not None:
         words += f'\nThe calibration is {arm.region.in_words()}.\n'
+    found = None
     contents: dict[str, str | bytes] = {
         'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
         'workspace.png': plots.workspace_png(survey),
@@ -334,7 +367,16 @@ def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
+    origin = origin_of(options, _calibration_files(options.result))
+    contents |= page_of(workspace_report(arm, survey, origin, found))
     return contents | {'workspace.md': words}
+
+
+def _calibration_files(path: Path) -> tuple[Path, ...]:
+    """Return the files of a calibration, or of the folder of a result, that are read."""
+    if not path.is_dir():
+        return (path,)
+    return tuple(path / name for name in ('calibration.yaml', 'result.json'))
 
 
 def _task(
@@ -367,11 +409,25 @@ def _task(
 
 
 def _verify(options: argparse.Namespace) -> int:
+    from calib_ros.atomic import write_files
+
+    if options.out is None:
+        return _verified(options)[0]
+    with results(options, VERIFICATION_FILES) as folder:
+        status, contents = _verified(options)
+        write_files(folder, contents)
+    return status
+
+
+def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]:
+    """Judge, and print what comes out; return the exit status and the files of --out."""
     from calib_ros.apply.verification import in_words, verify
     from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.files.tables import read_table
     from calib_ros.files.waypoints import read_joints
     from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report.poses import poses_to_verify
+    from calib_ros.report.verified import verification_report
 
     nominal = load_chain(options.chain)
     arm = CalibratedArm.read(options.calibration, nominal)
@@ -380,9 +436,10 @@ def _verify(options: argparse.Namespace) -> int:
     commanded = None
     if options.commanded is not None:
         commanded = read_joints(options.commanded, nominal)
+    sets = (*table.fitted, *table.held_out)
     found = verify(
         arm,
-        (*table.fitted, *table.held_out),
+        sets,
         None if options.tolerance is None else 1e-3 * options.tolerance,
         options.confidence,
         options.new_base,
@@ -391,8 +448,21 @@ def _verify(options: argparse.Namespace) -> int:
     )
     for warning in table.warnings:
         print(f'warning: {warning}', file=sys.stderr)
-    print(in_words(found))
-    return 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
+    words = in_words(found)
+    print(words)
+    status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
+    if options.out is None:
+        return status, {}
+    poses = poses_to_verify(arm.after, sets, found.comparison, table.by_line)
+    origin = origin_of(
+        options, (options.measured, options.commanded, *_calibration_files(options.calibration))
+    )
+    report = verification_report(arm.after, found, poses, origin, table.warnings)
+    contents: dict[str, str | bytes] = {
+        'residuals.csv': poses.table(),
+        'verification.txt': f'{words}\n',
+    }
+    return status, contents | page_of(report)
 
 
 def _compensate(options: argparse.Namespace) -> int:

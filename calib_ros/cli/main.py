@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 # Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -26,7 +27,10 @@ from calib_ros.cli.commands import add_commands
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
+    add_identity,
     add_settings,
+    origin_of,
+    page_of,
     results,
     settings_of,
 )
@@ -38,7 +42,9 @@ deviations 5 % larger, less than their own uncertainty; more may be a part of th
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
+    from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain import Chain
+    from calib_ros.report.page import Origin
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,6 +104,10 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
     identify.add_argument('--force', action='store_true', help='replace the result in --out')
     identify.add_argument('--json', action='store_true', help='print the result as JSON')
+    identify.add_argument(
+        '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
+    )
+    add_identity(identify)
     if 'identify' in given:  # they know numpy, which takes longer than all the rest
         add_settings(identify)
 
@@ -173,28 +183,43 @@ def _add_simulation(parser: argparse.ArgumentParser) -> None:
 def _identify(options: argparse.Namespace) -> int:
     from calib_ros.report import words
 
+    if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
+        raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if options.out is None:
-        result, samples, warnings, _, read = _identified(options)
+        found = _identified(options)
     else:
         with results(options, RESULT_FILES) as folder:
-            result, samples, warnings, configuration, read = _identified(options)
-            _write_result(folder, options.out, result, samples, warnings, configuration)
-    for warning in (*warnings, *result.remarks):
+            found = _identified(options)
+            _write_result(folder, options.out, found, options.tolerance)
+    result = found.result
+    for warning in (*found.warnings, *result.remarks):
         print(f'warning: {warning}', file=sys.stderr)
     if options.json:
-        document = words.as_document(result, samples) | {'warnings': list(warnings)}
-        print(json.dumps(document, indent=2))
+        print(json.dumps(_document(found, options.tolerance), indent=2))
     else:
-        if read:
-            print(read)
+        if found.read:
+            print(found.read)
         print(words.summary(result))
     return 0 if result.accepted else NOT_ACCEPTED
 
 
-def _identified(
-    options: argparse.Namespace,
-) -> tuple[Identification, dict[str, Any], tuple[str, ...], str, str]:
-    """Return a result, what became of the input, warnings, the configuration, what was read."""
+class _Identified(NamedTuple):
+    """A result with its problem, and what became of the input.
+
+    `read` says in words what was read; `lines` tells that stamps are the lines of a table.
+    """
+
+    problem: Problem
+    result: Identification
+    samples: dict[str, Any]
+    warnings: tuple[str, ...]
+    origin: Origin
+    read: str = ''
+    lines: bool = False
+
+
+def _identified(options: argparse.Namespace) -> _Identified:
+    """Return what there is to identify in a table or a bag."""
     from calib_ros.identification.model_choice import identify_model
     from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain_file import load_chain
@@ -216,7 +241,7 @@ def _identified(
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     warnings: tuple[str, ...] = ()
-    read = ''
+    read, lines = '', False
     if options.csv is not None:
         from calib_ros.files.tables import read_table
 
@@ -227,7 +252,7 @@ def _identified(
             (settings.sigma_position, settings.sigma_orientation),
             options.eye_in_hand,
         )
-        warnings = table.warnings
+        warnings, lines = table.warnings, table.by_line
         sockets = 0.05 if options.socket_distance is None else options.socket_distance
         problem = Problem(
             chain,
@@ -252,13 +277,16 @@ def _identified(
         replayed = replay(options.bag, session)
         warnings = replayed.warnings
         result = session.identify()
+        problem = session.problem_of(session.usable)
         account = session.account()
         read = f'{replayed}; {account}'
         counts = {'recorded': replayed.recorded, 'read': replayed.read}
         samples = counts | account.as_document()
         lost = replayed.refusals(account, options.largest_loss)
         result = replace(result, refusals=(*result.refusals, *lost))
-    return result, samples, warnings, words.configuration_yaml(options.chain, settings), read
+    configuration = words.configuration_yaml(options.chain, settings)
+    origin = origin_of(options, (options.csv, options.bag), configuration)
+    return _Identified(problem, result, samples, warnings, origin, read, lines)
 
 
 def _sessions(options: argparse.Namespace) -> tuple[str, ...]:
@@ -301,7 +329,7 @@ def _csv2bag(options: argparse.Namespace) -> int:
 
 def _export(options: argparse.Namespace) -> int:
     from calib_ros.atomic import write_files
-    from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports
+    from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
     from calib_ros.files.vendors import VENDOR_FILES, vendor_files
     from calib_ros.files.waypoints import read_joints
     from calib_ros.kinematics.chain_file import (
@@ -322,7 +350,7 @@ def _export(options: argparse.Namespace) -> int:
     urdf = ''
     if options.urdf is not None:
         urdf = read_text(options.urdf)
-        text = corrected_urdf(urdf, chain, **links)
+        text = corrected_urdf(urdf, chain, **links) + urdf_foot(chain)
         found = (*found, Export(f'{options.urdf.stem}{CORRECTED_URDF}', text, 0.0))
     elif Path(options.chain).suffix in URDF_SUFFIXES:
         urdf = read_text(Path(options.chain))
@@ -373,6 +401,7 @@ def _demo(options: argparse.Namespace) -> int:
     from calib_ros.files.bags import replay
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import words
+    from calib_ros.report.page import Origin, inputs_of
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.settings import Settings
 
@@ -386,8 +415,14 @@ def _demo(options: argparse.Namespace) -> int:
         replay(bag, session)
         result = session.identify()
         configuration = words.configuration_yaml(options.chain, session.settings)
-        document = session.account().as_document()
-        _write_result(folder, options.out, result, document, (), configuration)
+        found = _Identified(
+            session.problem_of(session.usable),
+            result,
+            session.account().as_document(),
+            (),
+            Origin(inputs_of([bag]), settings=configuration),
+        )
+        _write_result(folder, options.out, found)
         against = words.against_truth(result, load_chain(truth))
     print(f'1. simulated: {options.out / "bag"}, an arm with known errors ({truth.name})')
     print(f'2. replayed: {session.account()}')
@@ -428,36 +463,53 @@ def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> P
 RESULT_FILES = (
     'calibration.yaml',
     'result.json',
+    'report.html',
     'report.md',
+    'residuals.csv',
     'before_after.png',
     'settings.yaml',
 )
 
 
+def _document(found: _Identified, tolerance: float | None) -> dict[str, Any]:
+    """Return the content of result.json; `tolerance` is the wanted error [mm]."""
+    from calib_ros.report import words
+
+    document = words.as_document(found.result, found.samples)
+    document |= {'warnings': list(found.warnings), 'tolerance_mm': tolerance}
+    return document | {'origin': found.origin.document()}
+
+
 def _write_result(
     folder: Path,
     out: Path,
-    result: Identification,
-    samples: dict[str, Any],
-    warnings: tuple[str, ...],
-    configuration: str,
+    found: _Identified,
+    tolerance: float | None = None,
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
 
     A chain that was accepted earlier, in `out`, is kept under another name when this result is
-    not: it does not belong to the files beside it any more.
+    not: it does not belong to the files beside it any more. `tolerance` is the wanted error [mm].
     """
     from calib_ros.atomic import write_files
     from calib_ros.report import words
     from calib_ros.report.plots import before_after_png
+    from calib_ros.report.poses import poses_of
+    from calib_ros.report.reports import identification_report
 
-    document = words.as_document(result, samples) | {'warnings': list(warnings)}
+    problem, result, samples, warnings, origin, _, lines = found
+    document = _document(found, tolerance)
+    poses = poses_of(problem, result, lines)
     contents: dict[str, str | bytes] = {
         'result.json': json.dumps(document, indent=2) + '\n',
         'report.md': words.markdown(result, samples, warnings),
+        'residuals.csv': poses.table(),
         'before_after.png': before_after_png(result),
-        'settings.yaml': configuration,
+        'settings.yaml': origin.settings,
     }
+    wanted = None if tolerance is None else 1e-3 * tolerance
+    report = identification_report(problem, result, poses, origin, warnings, wanted)
+    contents |= page_of(report)
     earlier = out / 'calibration.yaml'
     if result.accepted:
         contents['calibration.yaml'] = words.calibration_yaml(result)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from calib_ros.atomic import whole_folder
 
 if TYPE_CHECKING:
+    from calib_ros.report.page import Origin, Report
     from calib_ros.settings import Settings
 
 NOT_ACCEPTED = 3
@@ -64,3 +66,39 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContex
     --force. Other files stay in the folder.
     """
     return whole_folder(options.out, names, overwrite=options.force)
+
+
+def add_identity(parser: argparse.ArgumentParser) -> None:
+    """Add the options by which a report says what it is of."""
+    for name, text in (
+        ('operator', 'who measured, for the report'),
+        ('serial', 'serial number of the robot, for the report'),
+        ('device', 'measuring device and its serial number, for the report'),
+    ):
+        parser.add_argument(f'--{name}', default='', metavar='NAME', help=text)
+
+
+def origin_of(
+    options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
+) -> Origin:
+    """Return whence a result comes: the options, and the files that were read."""
+    from calib_ros.report.page import Origin, inputs_of
+
+    chain = Path(options.chain)
+    known = (*inputs, chain if chain.is_file() else None)
+    told = (options.operator, options.serial, options.device)
+    return Origin(inputs_of(known), *told, settings=settings)
+
+
+def page_of(report: Report, name: str = 'report.html') -> dict[str, str]:
+    """Return a report as the content of a file, by its name; nothing where its extra is missing.
+
+    That is said once.
+    """
+    from calib_ros.report.page import MISSING, render
+
+    text = render(report)
+    if text is None:
+        print(f'note: {MISSING}', file=sys.stderr)
+        return {}
+    return {name: text}

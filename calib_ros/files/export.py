@@ -34,7 +34,7 @@ from calib_ros.identification.leastsquares import Samples, System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import DH_KINDS, Chain, Frame, Joint, JointType
-from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain
+from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash
 from calib_ros.kinematics.se3 import FloatArray
 
 EXACT = 1e-9
@@ -92,17 +92,18 @@ def exports(
     q = chain.random_joints(POSES, rng)
     arm = replace(chain, effects=())
     lost = _distance(chain.forward(q), arm.forward(q)) if chain.effects else 0.0
+    digest = table_hash(chain)
     found = []
     for convention in ('standard', 'modified'):
         form = converted(arm, convention)
         what = f'{convention} Denavit-Hartenberg table'
-        text = _csv(form, what, lost)
+        text = _csv(form, what, lost, digest)
         again = _read_csv(text, form)
         found.append(_checked(f'dh_{convention}.csv', text, arm, again.forward(q), q, lost))
-        text = head(form, what, lost) + dump_chain(form, origin)
+        text = head(form, what, lost, digest) + dump_chain(form, origin)
         again = parse_chain(text)
         found.append(_checked(f'dh_{convention}.yaml', text, arm, again.forward(q), q, lost))
-    text = kinematics_yaml(arm, origin)
+    text = f'# calibrated table {digest}\n' + kinematics_yaml(arm, origin)
     found.append(_checked('kinematics.yaml', text, arm, forward_of(text, arm, q), q, lost))
     region = q if joints is None else np.asarray(joints, dtype=np.float64)
     for name, kinds, what in (
@@ -111,7 +112,8 @@ def exports(
     ):
         best = _approximated(chain, nominal, kinds, region)
         error = _distance(best.forward(region), chain.forward(region))
-        found.append(Export(name, _csv(best, f'{nominal.convention} {what}', error), error))
+        text = _csv(best, f'{nominal.convention} {what}', error, digest)
+        found.append(Export(name, text, error))
     return tuple(found)
 
 
@@ -213,17 +215,25 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
-def head(chain: Chain, what: str, error: float) -> str:
-    """Return the line that says what a file is, and how far [m] from the calibrated arm."""
+def head(chain: Chain, what: str, error: float, digest: str) -> str:
+    """Return the line that says what a file is, and how far [m] from the calibrated arm.
+
+    `digest` is that of the calibrated table, by which the file is known.
+    """
     name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
-    return f'# {name}: {what}; metres and radians; {exact}\n'
+    return f'# {name}: {what}; metres and radians; {exact}; calibrated table {digest}\n'
 
 
-def _csv(chain: Chain, what: str, error: float) -> str:
+def urdf_foot(chain: Chain) -> str:
+    """Return the comment at the end of a corrected URDF, by which it is known."""
+    return f'<!-- calibrated table {table_hash(chain)} -->\n'
+
+
+def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
     """Return the table of a chain with a line that says what it is."""
     text = io.StringIO()
-    text.write(head(chain, what, error))
+    text.write(head(chain, what, error, digest))
     writer = csv.writer(text, lineterminator='\n')
     writer.writerow(ROW)
     for joint in chain.joints:

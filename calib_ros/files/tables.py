@@ -51,7 +51,8 @@ MOST_FRAMES = 100
 class Table(Shown):
     """Samples, and the sets to fit and held out that they make, each with frames of its own.
 
-    `pairs` names the frames of the two sockets of each location.
+    `pairs` names the frames of the two sockets of each location. `by_line` tells that the table
+    has no stamps: a sample's is its line, in seconds.
     """
 
     samples: tuple[Sample, ...]
@@ -59,6 +60,7 @@ class Table(Shown):
     held_out: tuple[Observations, ...]
     pairs: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+    by_line: bool = False
 
     @property
     def world_frame(self) -> str:
@@ -103,7 +105,8 @@ def read_table(
     if not any(not sample.validation for sample in found):
         raise InputError(f'{path} has no rows to fit, only such that are marked test')
     fitted, kept_out = collect(found, sigmas)
-    return Table(tuple(found), fitted, kept_out, reader.pairs(found), warnings)
+    by_line = 'stamp_ns' not in header
+    return Table(tuple(found), fitted, kept_out, reader.pairs(found), warnings, by_line)
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:

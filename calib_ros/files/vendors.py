@@ -37,7 +37,7 @@ from calib_ros.files.export import (
 )
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.chain_file import dump_yaml
+from calib_ros.kinematics.chain_file import dump_yaml, table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.kinematics.urdf_tree import parse_urdf
@@ -161,7 +161,9 @@ def vendor_files(
         q = chain.random_joints(POSES, np.random.default_rng(0))
         shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
         lost = float(np.linalg.norm(shift, axis=1).max())
-        content = head(chain, 'kinematics', lost) + _document(vendor, places, origin, checksum)
+        content = head(chain, 'kinematics', lost, table_hash(chain)) + _document(
+            vendor, places, origin, checksum
+        )
         difference = float(np.abs(forward_of(content, vendor, q) - reference.forward(q)).max())
         if not difference <= EXACT:
             raise ExportError(

@@ -8,6 +8,8 @@ describes it. A URDF is read as a nominal chain.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import os
 import sys
@@ -207,6 +209,20 @@ def nominal_record(nominal: Chain) -> dict[str, Any]:
     """Return the numbers of the chain that a calibration belongs to, row by row."""
     rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
     return {'convention': nominal.convention, 'joints': rows}
+
+
+def table_hash(chain: Chain) -> str:
+    """Return the SHA-256 of the table and effects of a chain, by which its files are known."""
+    rows = [
+        [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
+        for joint in chain.joints
+    ]
+    content = [
+        str(chain.convention),
+        rows,
+        [[name, float(value)] for name, value in chain.effects],
+    ]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def _check_figures(record: dict[str, Any], where: str) -> None:

@@ -19,7 +19,7 @@ from calib_ros.identification.region import Region
 from calib_ros.identification.validation import Comparison, ErrorFigures, Parameter
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
-from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record
+from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record, table_hash
 from calib_ros.sampling.calibration import Calibration
 from calib_ros.settings import Settings
 
@@ -103,6 +103,7 @@ def provenance(result: Identification) -> dict[str, Any]:
         'rms_mm_before': round(before.rms_mm, 6),
         'rms_mm_after': round(after.rms_mm, 6),
         'not_identifiable': list(result.unidentifiable),
+        'table_sha256': table_hash(result.chain),
         'nominal': nominal_record(result.before),
         'region': None if result.region is None else result.region.document(),
     }

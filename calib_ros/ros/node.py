@@ -16,6 +16,7 @@ import textwrap
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,7 +47,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.archive import Archive
 from calib_ros.files.waypoints import read_joints
-from calib_ros.identification.identification import Outlier
+from calib_ros.identification.identification import Identification, Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
 from calib_ros.progress import Progress
@@ -156,13 +157,13 @@ class CalibrationNode(Node):
         self._export = DeferredTrigger(
             self, '~/export', self._answer, self._to_export, self._keeper.export
         )
+        self._save = DeferredTrigger(self, '~/save', self._answer, self._to_save, self._on_save)
         for kind, name, callback in (
             (Trigger, '~/cancel', self._on_cancel),
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/validate', self._on_validate),
             (Trigger, '~/clear', self._on_clear),
-            (Trigger, '~/save', self._on_save),
             (Trigger, '~/load', self._on_load),
             (SetBool, '~/record', self._on_record),
         ):
@@ -184,7 +185,7 @@ class CalibrationNode(Node):
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        working = (self._identify, self._export, self._guide)
+        working = (self._identify, self._save, self._export, self._guide)
         ended = [each.join(JOIN_TIMEOUT) for each in working]
         self._take_messages()
         self.session.finish()
@@ -336,11 +337,24 @@ class CalibrationNode(Node):
         )
         if result.accepted:
             text = words.calibration_yaml(result, given.origin)
-            self._keeper.adopt(result, given.samples, Published(text, given.configuration))
+            page = partial(self._page, given, result)
+            self._keeper.adopt(result, given.samples, Published(text, given.configuration, page))
             self._guide.show(result)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
+
+    def _page(self, given: Snapshot, result: Identification) -> str | None:
+        """Return the report of an identification, None where its extra is missing."""
+        from calib_ros.report.page import Origin, inputs_of, render
+        from calib_ros.report.poses import poses_of
+        from calib_ros.report.reports import identification_report
+
+        journal = given.origin['journal']
+        files = inputs_of([Path(journal)] if journal else [])
+        origin = Origin(files, serial=self._given.serial, settings=given.configuration)
+        poses = poses_of(given.problem, result)
+        return render(identification_report(given.problem, result, poses, origin))
 
     def _on_cancel(self, request: Any) -> tuple[bool, str]:
         return self._progress.cancel()
@@ -373,8 +387,12 @@ class CalibrationNode(Node):
         self.session.recording = bool(request.data)
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
-    def _on_save(self, request: Any) -> tuple[bool, str]:
-        return True, f'saved to {self._keeper.save()}'
+    def _to_save(self) -> Published:
+        self._take_messages()
+        return self._keeper.published
+
+    def _on_save(self, published: Published) -> tuple[bool, str]:
+        return True, f'saved to {", ".join(map(str, self._keeper.save(published)))}'
 
     def _on_load(self, request: Any) -> tuple[bool, str]:
         self._last = f'loaded {self._keeper.load()}'

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 
-from calib_ros.atomic import confined
+from calib_ros.atomic import confined, write_file
 from calib_ros.errors import InputError
 from calib_ros.files.archive import Archive
-from calib_ros.files.export import exports
+from calib_ros.files.export import exports, urdf_foot
 from calib_ros.files.vendors import vendor_files
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.region import region_of_record
@@ -39,10 +39,15 @@ from calib_ros.sampling.sources import parse_sources
 
 
 class Published(NamedTuple):
-    """A calibration as the text of a file, and by which configuration it was made, if known."""
+    """A calibration as the text of a file, and how it was made, if that is known.
+
+    `page` makes the report of its identification, which takes a while; it returns None where
+    that cannot be made.
+    """
 
     text: str
     configuration: str
+    page: Callable[[], str | None] = lambda: None
 
 
 class Exportable(NamedTuple):
@@ -101,11 +106,38 @@ class Keeper:
             self._session.adopt(result, samples)
             self._publish(result.chain, published)
 
-    def save(self) -> Path:
-        """Write the calibration to `target_filename` or a new file; return its path."""
+    @property
+    def published(self) -> Published:
+        """Return the calibration to save.
+
+        Raises
+        ------
+        InputError
+            When there is none.
+
+        """
         if not self._published.text:
             raise InputError('there is no accepted calibration to save: call ~/identify first')
-        return self._archive.save(*self._published, self._named('target_filename'))
+        return self._published
+
+    def save(self, published: Published) -> list[Path]:
+        """Write a calibration to `target_filename` or a new file, and its report beside it.
+
+        Returns the paths. Without the report the calibration is saved all the same.
+        """
+        path = self._archive.save(
+            published.text, published.configuration, self._named('target_filename')
+        )
+        written = [path]
+        try:
+            page = published.page()
+            if page is not None:
+                report = path.with_suffix('.html')
+                write_file(report, page)
+                written.append(report)
+        except Exception as err:  # whatever is wrong with the page, the calibration is saved
+            self._node.get_logger().warning(f'the report of {path} is not written: {err}')
+        return written
 
     def at_start(self) -> tuple[Path | None, bool]:
         """Return which calibration there is to load, and whether it shall be at the start."""
@@ -152,7 +184,8 @@ class Keeper:
         forms += vendor_files(found.chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
-            files['corrected.urdf'] = corrected_urdf(self._urdf, found.chain, **links)
+            text = corrected_urdf(self._urdf, found.chain, **links)
+            files['corrected.urdf'] = text + urdf_foot(found.chain)
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:

@@ -196,6 +196,10 @@ def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth, exe
         assert saved.success
         assert str(target) in saved.message
         assert target.read_text() == texts[0].data
+        report = target.with_suffix('.html')
+        assert str(report) in saved.message
+        assert 'Accepted' in report.read_text()
+        assert record['table_sha256'] in report.read_text()
         again = cell.call('save')
         assert not again.success
         assert 'exists already' in again.message

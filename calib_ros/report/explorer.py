@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The poses as the page shows them: one by one, or above MOST in bins, cells and quantiles."""
+
+from __future__ import annotations
+
+import base64
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.escapes import one_line
+from calib_ros.kinematics.chain import DH_KINDS, Chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report.figures import numbers, unit_of
+from calib_ros.report.poses import FITTED, JUDGED, REPEATED, Poses
+
+MOST = 20_000
+"""Poses that are shown one by one."""
+LARGEST = 300
+"""Poses of the largest errors, and outliers, that are listed of more."""
+BINS = 60
+"""Parts of the session, and of each joint's values, whose quantiles are shown."""
+CELLS = 24
+"""Cells along the longest edge of the workspace."""
+DRAWN = 20_000
+"""Poses from which quantiles are taken, evenly spread over the session."""
+SHARES = (0.05, 0.5, 0.95)
+ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
+
+
+def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
+    """Return the poses as plain values; errors in mm and mrad, positions in m."""
+    many = len(poses) > MOST
+    rows = _worst(poses) if many else np.arange(len(poses))
+    shown = poses.select(rows)
+    kinds = [['length', 'position error [mm]']]
+    kinds += [[axis, f'position error along {axis} [mm]'] for axis in 'xyz']
+    kinds += [['angle', 'orientation error [mrad]']] if poses.oriented else []
+    before = 1e3 * np.linalg.norm(poses.before[poses.judged], axis=1)
+    return {
+        'joints': [one_line(name) for name in chain.joint_names],
+        'show': [list(unit_of(joint)) for joint in chain.joints],
+        'convention': str(chain.convention),
+        'table': [
+            [float(getattr(j, k)) for k in DH_KINDS] + [j.sign, j.type != 'revolute']
+            for j in chain.joints
+        ],
+        'tools': poses.tools.tolist(),
+        'reach': float(np.linalg.norm(poses.position, axis=1).max()),
+        'largest': float(np.quantile(before, 0.98)) if before.size else 1.0,
+        'total': len(poses),
+        'oriented': poses.oriented,
+        'kinds': kinds,
+        'number': (rows + 1).tolist() if many else None,
+        'lines': poses.lines,
+        'stamps': base64.b64encode(shown.stamps_ns.astype('<i8').tobytes()).decode(),
+        'roles': list(ROLES.values()),
+        'role': [list(ROLES).index(role) for role in shown.role.tolist()],
+        'outlier': shown.outlier.astype(int).tolist(),
+        'set': shown.set.tolist(),
+        'arrays': {
+            'joints': _packed(shown.joints),
+            'position': _packed(shown.position),
+            'before': _packed(1e3 * shown.before),
+            'after': _packed(1e3 * shown.after),
+            'turned_before': _packed(_values(shown, 'angle', 'before')),
+            'turned_after': _packed(_values(shown, 'angle', 'after')),
+            'size': _packed(shown.size),
+        },
+        'bins': _bins(chain, poses, [kind for kind, _ in kinds]) if many else None,
+        'cells': _cells(poses) if many else None,
+    }
+
+
+def _packed(values: FloatArray) -> str:
+    return base64.b64encode(values.astype('<f4').tobytes()).decode()
+
+
+def _worst(poses: Poses) -> NDArray[np.intp]:
+    """Return the rows of the largest errors after, and of the largest outliers, in order."""
+    error = np.linalg.norm(poses.after, axis=1)
+    good = np.argsort(np.where(poses.outlier, -1.0, error))[-LARGEST:]
+    gross = np.argsort(np.where(poses.outlier, error, -1.0))[-LARGEST:]
+    return np.union1d(good[~poses.outlier[good]], gross[poses.outlier[gross]])
+
+
+def _values(poses: Poses, kind: str, when: str) -> FloatArray:
+    """Return an error (N,) [mm or mrad] by the name of a kind."""
+    if kind == 'angle':
+        return 1e3 * np.asarray(np.linalg.norm(getattr(poses, f'turned_{when}'), axis=1))
+    errors = 1e3 * getattr(poses, when)
+    if kind == 'length':
+        return np.asarray(np.linalg.norm(errors, axis=1))
+    return np.asarray(errors[:, 'xyz'.index(kind)])
+
+
+def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
+    """Return quantiles of each kind of error over the session and over each joint's values."""
+    good = np.flatnonzero(~poses.outlier)
+    good = good[:: 1 + len(good) // DRAWN]
+    axes = {'session': good + 1.0}
+    for k, joint in enumerate(chain.joints):
+        axes[f'joint{k}'] = unit_of(joint)[0] * poses.joints[good, k]
+    chosen = poses.select(good)
+    errors = {
+        kind: {when: _values(chosen, kind, when) for when in ('before', 'after')} for kind in kinds
+    }
+    found: dict[str, Any] = {}
+    for key, values in axes.items():
+        edges = np.linspace(values.min(), values.max(), BINS + 1)
+        place = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, BINS - 1)
+        middle = numbers(0.5 * (edges[1:] + edges[:-1]))
+        found[key] = {
+            kind: {'x': middle}
+            | {when: _quantiles(each, place) for when, each in errors[kind].items()}
+            for kind in kinds
+        }
+    return found
+
+
+def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
+    """Return the SHARES (3, B) of values (N,) in the parts (N,) 0 ... B - 1; None for none."""
+    known = ~np.isnan(values)
+    values, place = values[known], place[known]
+    ordered = values[np.lexsort((values, place))]
+    count = np.bincount(place, minlength=BINS)
+    first = np.cumsum(count) - count
+    ranks = np.round(np.outer(SHARES, np.maximum(count - 1, 0))).astype(int)
+    table = np.full(ranks.shape, np.nan)
+    table[:, count > 0] = ordered[(first + ranks)[:, count > 0]]
+    return numbers(table, 4)
+
+
+def _cells(poses: Poses) -> dict[str, Any]:
+    """Return cubes of the workspace: how many poses, where, their RMS and mean errors."""
+    good = poses.select(~poses.outlier)
+    low = good.position.min(axis=0)
+    edge = max(float(np.ptp(good.position, axis=0).max()) / CELLS, 1e-9)
+    cell = ((good.position - low) / edge).astype(int)
+    number = cell @ (1, CELLS + 1, (CELLS + 1) ** 2)
+    _, index, count = np.unique(number, return_inverse=True, return_counts=True)
+
+    def mean(values: FloatArray) -> FloatArray:
+        columns = np.atleast_2d(values.T)
+        sums = [np.bincount(index, column, len(count)) for column in columns]
+        return np.stack(sums, axis=1) / count[:, np.newaxis]
+
+    found: dict[str, Any] = {'count': count.tolist(), 'position': numbers(mean(good.position), 4)}
+    for when in ('before', 'after'):
+        errors = 1e3 * getattr(good, when)
+        squares = mean((errors**2).sum(axis=1))[:, 0]
+        found[f'rms_{when}'] = numbers(np.sqrt(squares), 4)
+        found[f'mean_{when}'] = numbers(mean(errors), 4)
+    return found

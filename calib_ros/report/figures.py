@@ -1,0 +1,266 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of a report as plotly reads them: plain dictionaries of `data` and `layout`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from scipy import special
+
+from calib_ros.apply.workspace import Survey, rms_map
+from calib_ros.escapes import one_line
+from calib_ros.identification.validation import Parameter
+from calib_ros.kinematics.chain import Chain, Joint, is_length
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report.poses import Poses
+
+Figure: TypeAlias = dict[str, Any]
+BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
+QUANTILES = 400
+"""Points of a curve that stands for any number of poses."""
+BINS = 36
+"""Parts of a joint's range in which poses are counted."""
+
+
+def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
+    """Return an array as lists with so many significant digits; None for NaN."""
+    flat = [None if x != x else float(f'{x:.{digits}g}') for x in values.ravel().tolist()]
+    shaped: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
+    return shaped
+
+
+def label(name: str) -> str:
+    """Return a name of others for plotly, which reads some tags."""
+    return one_line(name).replace('&', '&amp;').replace('<', '&lt;')
+
+
+def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:
+    """Return the share of poses with at most a given position error (N,)."""
+    share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
+    data = [
+        {
+            'type': 'scatter',
+            'mode': 'lines',
+            'name': name,
+            'x': numbers(np.quantile(errors, share)),
+            'y': numbers(100.0 * share),
+            'line': {'color': colour, 'dash': dash},
+        }
+        for name, errors, colour, dash in (
+            ('before', before_mm, BEFORE, 'dash'),
+            ('after', after_mm, AFTER, 'solid'),
+        )
+    ]
+    layout = {
+        'xaxis': {'title': {'text': 'position error [mm]'}, 'rangemode': 'tozero'},
+        'yaxis': {'title': {'text': 'poses with at most this error [%]'}, 'range': [0, 100]},
+    }
+    return {'data': data, 'layout': layout}
+
+
+def against_noise(poses: Poses) -> Figure:
+    """Return the quantiles of residuals in stated sigmas against those of a normal law."""
+    chosen = poses.select(poses.judged)
+    data: list[Figure] = []
+    reach = 3.0
+    for name, errors, column, colour, symbol in (
+        ('position', chosen.after, 0, AFTER, 'circle'),
+        ('orientation', chosen.turned_after, 1, '#7570b3', 'diamond'),
+    ):
+        z = (errors / chosen.sigma[:, column, np.newaxis]).ravel()
+        z = z[np.isfinite(z)]
+        if not z.size:
+            continue
+        share = (np.arange(min(QUANTILES, z.size)) + 0.5) / min(QUANTILES, z.size)
+        data.append(
+            {
+                'type': 'scatter',
+                'mode': 'markers',
+                'name': name,
+                'x': numbers(special.ndtri(share)),
+                'y': numbers(np.quantile(z, share)),
+                'marker': {'color': colour, 'symbol': symbol, 'size': 5},
+            }
+        )
+    line: Figure = {'type': 'scatter', 'mode': 'lines', 'name': 'noise as stated'}
+    line |= {'x': [-reach, reach], 'y': [-reach, reach], 'line': {'color': LIMIT, 'dash': 'dot'}}
+    layout = {
+        'xaxis': {'title': {'text': 'expected of pure noise [sigma]'}},
+        'yaxis': {'title': {'text': 'measured [stated sigma]'}},
+    }
+    return {'data': [*data, line], 'layout': layout}
+
+
+def forest(parameters: Sequence[Parameter], lengths: bool, limit: float) -> Figure | None:
+    """Return offsets with their 95 % intervals, of lengths [mm] or of angles [mrad].
+
+    `limit` [m or rad] is that of common sense: drawn where it comes near.
+    """
+    found = [p for p in parameters if p.std is not None and is_length(p.name) == lengths]
+    if not found:
+        return None
+    unit = 'mm' if lengths else 'mrad'
+    offsets = 1e3 * np.array([p.offset for p in found])
+    widths = 1e3 * np.array([p.half_width() or 0.0 for p in found])
+    reach = 1.1 * float(np.max(np.abs(offsets) + widths, initial=1e-3))
+    names = [label(p.name) for p in found]
+    dots = {
+        'type': 'scatter',
+        'mode': 'markers',
+        'name': 'offset and 95 % interval',
+        'x': numbers(offsets),
+        'y': names,
+        'error_x': {'type': 'data', 'array': numbers(widths), 'color': AFTER, 'thickness': 2},
+        'marker': {'color': AFTER, 'size': 8},
+        'hovertemplate': f'%{{y}}: %{{x:.4f}} {unit}<extra></extra>',
+    }
+    lines = [{'x0': 0.0, 'x1': 0.0, 'line': {'color': LIMIT, 'width': 1}}]
+    if 1e3 * limit < 3.0 * reach:
+        reach = max(reach, 1.1e3 * limit)
+        edge = {'color': '#b3261e', 'width': 2, 'dash': 'dash'}
+        lines += [{'x0': x, 'x1': x, 'line': edge} for x in (-1e3 * limit, 1e3 * limit)]
+    shape = {'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1}
+    layout = {
+        'xaxis': {'title': {'text': f'offset from nominal [{unit}]'}, 'range': [-reach, reach]},
+        'yaxis': {'autorange': 'reversed', 'automargin': True},
+        'shapes': [shape | each for each in lines],
+        'margin': {'l': 170, 'r': 16, 't': 30, 'b': 50},
+        'showlegend': True,
+    }
+    return {'data': [dots], 'layout': layout}
+
+
+def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
+    """Return the correlations of fitted parameters (P, P) as a heat map."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    mesh = {
+        'type': 'heatmap',
+        'x': list(map(label, names)),
+        'y': list(map(label, names)),
+        'z': numbers(covariance / np.outer(scale, scale), 3),
+        'zmin': -1,
+        'zmax': 1,
+        'colorscale': 'RdBu',
+        'reversescale': True,
+        'colorbar': {'title': {'text': 'correlation'}, 'thickness': 12},
+        'hovertemplate': '%{y} and %{x}: %{z:.2f}<extra></extra>',
+    }
+    layout = {
+        'xaxis': {'tickfont': {'size': 10}, 'automargin': True},
+        'yaxis': {'autorange': 'reversed', 'tickfont': {'size': 10}, 'automargin': True},
+        'margin': {'l': 130, 'r': 16, 't': 20, 'b': 90},
+    }
+    return {'data': [mesh], 'layout': layout}
+
+
+def unit_of(joint: Joint) -> tuple[float, str, int]:
+    """Return how joint values are shown: factor, unit and decimals."""
+    return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
+
+
+def range_of(joint: Joint) -> tuple[float, float]:
+    """Return the range of a joint [rad or m]: its limits, else those that are drawn from."""
+    reach = np.pi if joint.type == 'revolute' else 0.5
+    lower = -reach if joint.lower is None else joint.lower
+    return lower, reach if joint.upper is None else joint.upper
+
+
+def coverage(chain: Chain, joints: FloatArray) -> tuple[Figure, tuple[tuple[str, ...], ...]]:
+    """Return how often joint values (N, n) lie where in the range of each, and a table."""
+    counts = np.zeros((len(chain.joints), BINS))
+    labels, rows = [], []
+    for k, joint in enumerate(chain.joints):
+        factor, unit, digits = unit_of(joint)
+        lower, upper = range_of(joint)
+        low, high = float(joints[:, k].min()), float(joints[:, k].max())
+        lower, upper = min(lower, low), max(upper, high)
+        counts[k] = np.histogram(joints[:, k], BINS, (lower, upper))[0]
+        ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}'
+        labels.append(f'{label(joint.name)}: {ends}')
+        used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
+        share = 100.0 * float(np.mean(counts[k] > 0))
+        rows.append((joint.name, ends, used, f'{share:.0f} %'))
+    shown = np.where(counts > 0, counts, np.nan)
+    mesh = {
+        'type': 'heatmap',
+        'x': numbers(100.0 * (np.arange(BINS) + 0.5) / BINS, 4),
+        'y': labels,
+        'z': numbers(shown),
+        'colorscale': 'Viridis',
+        'reversescale': True,
+        'colorbar': {'title': {'text': 'poses'}, 'thickness': 12},
+        'hovertemplate': '%{y}<br>%{z} poses<extra></extra>',
+    }
+    layout = {
+        'xaxis': {'title': {'text': 'place in the range of the joint [%]'}, 'range': [0, 100]},
+        'yaxis': {'autorange': 'reversed', 'automargin': True},
+        'margin': {'l': 130, 'r': 16, 't': 20, 'b': 50},
+    }
+    return {'data': [mesh], 'layout': layout}, tuple(rows)
+
+
+def error_map(survey: Survey) -> Figure:
+    """Return the RMS of what a calibration removes and of what remains by radius and height."""
+    x, y, z = survey.positions.T
+    parts = [('removed by the calibration', survey.removed)]
+    if not np.isnan(survey.remaining).any():
+        parts.append(('expected to remain', survey.remaining))
+    largest = 1e3 * max(float(np.quantile(errors, 0.99)) for _, errors in parts)
+    data: list[Figure] = []
+    layout: Figure = {'grid': {'rows': 1, 'columns': len(parts), 'pattern': 'independent'}}
+    for k, (label, errors) in enumerate(parts):
+        end = str(k + 1) if k else ''
+        radius, height, rms = rms_map(np.hypot(x, y), z, 1e3 * errors)
+        data.append(
+            {
+                'type': 'heatmap',
+                'x': numbers(0.5 * (radius[1:] + radius[:-1])),
+                'y': numbers(0.5 * (height[1:] + height[:-1])),
+                'z': numbers(rms.T, 3),
+                'zmin': 0,
+                'zmax': largest,
+                'xaxis': f'x{end}',
+                'yaxis': f'y{end}',
+                'colorscale': 'Viridis',
+                'reversescale': True,
+                'showscale': k == 0,
+                'colorbar': {'title': {'text': 'RMS [mm]'}, 'thickness': 12},
+                'hovertemplate': 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm<extra></extra>',
+            }
+        )
+        layout[f'xaxis{end}'] = {'title': {'text': f'radius [m]<br>{label}'}}
+        layout[f'yaxis{end}'] = {} if k else {'title': {'text': 'height [m]'}}
+    layout['margin'] = {'l': 60, 'r': 16, 't': 20, 'b': 70}
+    return {'data': data, 'layout': layout}
+
+
+def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | None) -> Figure:
+    """Return the error that 1, 2, ... K planned poses promise [m], and so many random ones."""
+    count = np.arange(1, len(accuracy) + 1)
+    data = []
+    for name, errors, colour, dash in (
+        ('planned', accuracy, AFTER, 'solid'),
+        ('at random', at_random, BEFORE, 'dash'),
+    ):
+        known = np.isfinite(errors)
+        data.append(
+            {
+                'type': 'scatter',
+                'mode': 'lines+markers',
+                'name': name,
+                'x': count[known].tolist(),
+                'y': numbers(1e3 * errors[known]),
+                'line': {'color': colour, 'dash': dash},
+            }
+        )
+    layout: Figure = {
+        'xaxis': {'title': {'text': 'poses measured'}},
+        'yaxis': {'title': {'text': 'predicted RMS error [mm]'}, 'type': 'log'},
+    }
+    if wanted_mm is not None:
+        line = {'type': 'line', 'xref': 'paper', 'x0': 0, 'x1': 1, 'y0': wanted_mm}
+        layout['shapes'] = [line | {'y1': wanted_mm, 'line': {'color': LIMIT, 'dash': 'dot'}}]
+    return {'data': data, 'layout': layout}

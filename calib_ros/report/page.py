@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A report as one HTML file that needs nothing else: no network, no files beside it.
+
+jinja2 and plotly's JavaScript are imported here only; `render` returns None where they are not
+installed. All text of others is escaped by the template.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import calib_ros
+from calib_ros.escapes import one_line
+from calib_ros.report.advice import Advice
+
+State: TypeAlias = Literal['good', 'bad', 'open', 'info']
+MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
+MISSING = (
+    'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
+    'or apt install python3-jinja2 python3-plotly)'
+)
+BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a reader sees first: 'good', 'bad', 'open' (undecided) or 'info', and words.
+
+    `gain` are the figures before and after.
+    """
+
+    state: State
+    heading: str
+    text: tuple[str, ...] = ()
+    gain: str = ''
+
+
+@dataclass(frozen=True)
+class Section:
+    """Words, a figure of plotly (`data` and `layout`), a table, or some of them."""
+
+    name: str
+    title: str
+    text: tuple[str, ...] = ()
+    figure: Mapping[str, Any] | None = None
+    head: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    height: int = 420
+
+
+@dataclass(frozen=True)
+class Input:
+    """A file that was read."""
+
+    name: str
+    size: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Whence a result comes: what only the one who started it knows.
+
+    Attributes
+    ----------
+    inputs : tuple of Input
+    operator, serial, device : str
+        Who measured, which robot, and with which device; empty where not told.
+    settings : str
+        The configuration, with which the same is done again.
+    """
+
+    inputs: tuple[Input, ...] = ()
+    operator: str = ''
+    serial: str = ''
+    device: str = ''
+    settings: str = ''
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values, without the settings, which have a file of their own."""
+        return {name: value for name, value in asdict(self).items() if name != 'settings'}
+
+
+@dataclass(frozen=True)
+class Report:
+    """All that the page shows, in its order."""
+
+    kind: str
+    robot: str
+    verdict: Verdict
+    advice: tuple[Advice, ...] = ()
+    accuracy: Section | None = None
+    steps: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    identity: tuple[tuple[str, str], ...] = ()
+    explorer: Mapping[str, Any] | None = None
+    sections: tuple[Section, ...] = ()
+    inputs: tuple[Input, ...] = ()
+    settings: str = ''
+    software: str = field(default=f'calib_ros {calib_ros.__version__}')
+
+
+def render(report: Report) -> str | None:
+    """Return a report as HTML; None where jinja2 or plotly is not installed."""
+    try:
+        import jinja2
+        from plotly.offline import get_plotlyjs
+
+        plotly = get_plotlyjs()
+    except (ImportError, FileNotFoundError):
+        return None
+    folder = resources.files('calib_ros.report') / 'templates'
+
+    def source(name: str) -> str:
+        return (folder / name).read_text(encoding='utf-8')
+
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(source),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+    )
+    return environment.get_template('report.html.jinja').render(
+        report=report,
+        marks=MARKS,
+        css=source('report.css'),
+        js=source('report.js'),
+        plotly=plotly,
+        data={
+            'figures': {each.name: each.figure for each in report.sections if each.figure},
+            'explorer': report.explorer,
+        },
+    )
+
+
+def _shown(value: object) -> object:
+    """Return a text of others without characters that hide or turn round what follows."""
+    if isinstance(value, str) and not hasattr(value, '__html__'):
+        return '\n'.join(map(one_line, value.split('\n')))
+    return value
+
+
+def input_of(path: Path) -> tuple[Input, ...]:
+    """Return a file, or those of a folder such as a bag, with size and hash."""
+    files = sorted(each for each in path.rglob('*') if each.is_file()) if path.is_dir() else [path]
+    return tuple(
+        Input(str(each.relative_to(path.parent)), each.stat().st_size, _sha256(each))
+        for each in files
+    )
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open('rb') as file:
+        while block := file.read(BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def inputs_of(paths: Sequence[Path | None]) -> tuple[Input, ...]:
+    """Return the files at all paths that are given."""
+    return tuple(each for path in paths if path is not None for each in input_of(path))

@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What was measured, pose by pose: where, how far off before and after, and whence.
+
+Positions and errors are in the frame of the arm's base, which sets measured by several devices
+share. Errors are measured minus predicted, of the judged poses by a fit that did not know them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.validation import Comparison
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
+"""Roles: fitted only; in the figures; in the figures at a fitted configuration."""
+WHEN = ('before', 'after')
+BLOCK = 50_000
+"""Rows of a table that are in memory as numbers at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """N poses in the order of their stamps.
+
+    Attributes
+    ----------
+    joints : (N, n)
+        Joint values [rad or m].
+    stamps_ns : (N,)
+    position : (N, 3)
+        Of the target [m] in the arm's base, by the corrected arm.
+    before, after : (N, 3)
+        Error of position [m] in the arm's base; for distances (error, 0, 0).
+    turned_before, turned_after : (N, 3)
+        Error of orientation [rad] in the arm's base; NaN where none was measured.
+    sigma : (N, 2)
+        Stated standard deviation of position [m] and orientation [rad], of one coordinate.
+    role : (N,) str
+        FITTED, JUDGED or REPEATED.
+    outlier : (N,) bool
+    size : (N,)
+        Of the residual in usual errors; NaN where the pose was not fitted.
+    set : (N,)
+        Number of the set of observations, whose tools (S, 4, 4) are `tools`.
+    lines : bool
+        Stamps are the lines of a table, in seconds.
+
+    """
+
+    joints: FloatArray
+    stamps_ns: NDArray[np.int64]
+    position: FloatArray
+    before: FloatArray
+    after: FloatArray
+    turned_before: FloatArray
+    turned_after: FloatArray
+    sigma: FloatArray
+    role: NDArray[np.str_]
+    outlier: NDArray[np.bool_]
+    size: FloatArray
+    set: NDArray[np.intp]
+    tools: FloatArray
+    lines: bool = False
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.joints)
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Return (N,) which poses the figures are about: judged ones without the outliers."""
+        return np.asarray((self.role != FITTED) & ~self.outlier)
+
+    @property
+    def oriented(self) -> bool:
+        """Tell whether any orientation was measured."""
+        return not bool(np.isnan(self.turned_after).all())
+
+    def source(self, row: int) -> str:
+        """Return where a pose comes from: the line of the table, or the stamp [s]."""
+        stamp = int(self.stamps_ns[row])
+        if self.lines:
+            return f'line {stamp // 10**9}'
+        return f'{stamp // 10**9}.{stamp % 10**9:09d} s'
+
+    def select(self, rows: NDArray[np.generic]) -> Poses:
+        """Return some of the poses by a mask or by indices."""
+        arrays = {
+            name: getattr(self, name)[rows]
+            for name in self.__dataclass_fields__
+            if name not in ('tools', 'lines')
+        }
+        return Poses(**arrays, tools=self.tools, lines=self.lines)
+
+    def table(self) -> str:
+        """Return a CSV: a row for each pose, in metres and radians."""
+        names = ['line' if self.lines else 'stamp_ns', 'set', 'role', 'outlier', 'size']
+        names += [f'q{k + 1}' for k in range(self.joints.shape[1])]
+        names += ['x', 'y', 'z', *(f'{when}_{axis}' for when in WHEN for axis in 'xyz')]
+        blocks = [self.joints, self.position, self.before, self.after]
+        if self.oriented:
+            names += [f'{when}_r{axis}' for when in WHEN for axis in 'xyz']
+            blocks += [self.turned_before, self.turned_after]
+        where = self.stamps_ns // 10**9 if self.lines else self.stamps_ns
+        form = ','.join(['%d,%d,%s,%d,%.3f', *('%.9f' for _ in names[5:])])
+        parts = [','.join(names)]
+        for first in range(0, len(self), BLOCK):
+            rows = slice(first, first + BLOCK)
+            heads = (where, self.set, self.role, self.outlier, self.size)
+            columns = [each[rows].tolist() for each in heads]
+            columns += np.column_stack([block[rows] for block in blocks]).T.tolist()
+            text = '\n'.join(form % row for row in zip(*columns, strict=True))
+            parts.append(text.replace('nan', ''))
+        return '\n'.join(parts) + '\n'
+
+
+@dataclass
+class _Parts:
+    """Arrays of the sets, one after the other."""
+
+    chain: Chain
+    sigmas: tuple[float, float]
+    arrays: dict[str, list[NDArray[np.generic]]] = field(default_factory=dict)
+    tools: list[FloatArray] = field(default_factory=list)
+
+    def add(
+        self,
+        sets: Sequence[Observations],
+        comparison: Comparison,
+        role: NDArray[np.str_],
+        sizes: FloatArray,
+    ) -> None:
+        """Take sets with their residuals, one after the other, as `compare` has them."""
+        first = 0
+        for each in sets:
+            rows = slice(first, first + len(each))
+            turn = self.chain.frame(each.base).matrix[:3, :3]
+            reached = self.chain.forward(each.joints, each.approach, each.base, each.tool)
+            origin = self.chain.frame(each.base).matrix[:3, 3]
+            along = np.eye(3) if each.distances is not None else turn
+            before, after = comparison.before, comparison.after
+            sigma = np.tile(self.sigmas, (len(each), 1))
+            if each.covariance is not None:
+                variances = np.diagonal(each.covariances(self.sigmas), axis1=1, axis2=2)
+                sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
+            found = {
+                'joints': each.joints,
+                'stamps_ns': each.stamps_ns,
+                'position': (reached[:, :3, 3] - origin) @ turn,
+                'before': before.position[rows] @ along,
+                'after': after.position[rows] @ along,
+                'turned_before': before.orientation[rows] @ turn,
+                'turned_after': after.orientation[rows] @ turn,
+                'sigma': sigma,
+                'role': role[rows],
+                'outlier': ~comparison.judged[rows],
+                'size': sizes[rows],
+                'set': np.full(len(each), len(self.tools)),
+            }
+            self.tools.append(self.chain.frame(each.tool).matrix)
+            for name, array in found.items():
+                self.arrays.setdefault(name, []).append(array)
+            first += len(each)
+
+    def joined(self, lines: bool) -> Poses:
+        """Return all of them in the order of their stamps."""
+        arrays = {name: np.concatenate(parts) for name, parts in self.arrays.items()}
+        order = np.argsort(arrays['stamps_ns'], kind='stable')
+        ordered = {name: array[order] for name, array in arrays.items()}
+        return Poses(**ordered, tools=np.array(self.tools), lines=lines)
+
+
+def poses_of(problem: Problem, result: Identification, lines: bool = False) -> Poses:
+    """Return all poses of an identification, those to judge on by what did not know them."""
+    parts = _Parts(result.chain, (problem.sigma_position, problem.sigma_orientation))
+    sizes = np.concatenate(result.distances)
+    fitted, judged = result.fitted, result.validation
+    held_out = judged is not None and judged.repeated is not None
+    if judged is None or held_out:
+        role = JUDGED if judged is None else FITTED
+        parts.add(problem.sets, fitted, np.full(len(sizes), role), sizes)
+    else:  # each was left out once
+        parts.add(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)
+    if judged is not None and judged.repeated is not None:
+        unknown = np.full(len(judged.judged), np.nan)
+        parts.add(problem.judging, judged, np.where(judged.repeated, REPEATED, JUDGED), unknown)
+    return parts.joined(lines)
+
+
+def poses_to_verify(
+    chain: Chain, sets: Sequence[Observations], comparison: Comparison, lines: bool = False
+) -> Poses:
+    """Return the poses of new measurements, which all judge."""
+    parts = _Parts(chain, (1e-4, 1e-4 / 0.3))
+    count = len(comparison.judged)
+    parts.add(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))
+    return parts.joined(lines)

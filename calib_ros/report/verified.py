@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the page of a verification says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib_ros.apply.verification import MOST_LINES, Verification
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import table_hash
+from calib_ros.report.advice import SPREAD
+from calib_ros.report.explorer import explorer
+from calib_ros.report.page import Origin, Report, Section, Verdict
+from calib_ros.report.poses import Poses
+from calib_ros.report.reports import (
+    HEAD,
+    ISO_9283,
+    accuracy_rows,
+    coverage,
+    distributions,
+    gain,
+    identity_of,
+)
+
+STATES: dict[str, Verdict] = {
+    'PASS': Verdict('good', 'Passed'),
+    'FAIL': Verdict('bad', 'Failed: the error is beyond the tolerance'),
+    'UNDECIDED': Verdict('open', 'Undecided: more poses are needed'),
+    'JUDGED': Verdict('info', 'Measured: no tolerance was given'),
+}
+NEXT: dict[str, tuple[str, ...]] = {
+    'PASS': ('Keep this page with the calibration. Verify again after a collision or repair.',),
+    'FAIL': (
+        'Check that the measuring device, the target and the robot stand as they did for the '
+        'calibration; if not, use --new-base or --new-tool.',
+        'Check that the correction is active in the controller (--commanded tells).',
+        'Calibrate again with new poses; try --model auto.',
+    ),
+    'UNDECIDED': (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
+    'JUDGED': ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
+}
+
+
+def verification_report(
+    chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
+) -> Report:
+    """Return the report of a verification of a calibrated chain."""
+    share = f'{100.0 * found.confidence:g} %'
+    limits = (
+        f'The RMS position error over poses like these is between {1e3 * found.lower:.3f} mm and '
+        f'{1e3 * found.upper:.3f} mm; each limit holds with {share} confidence.'
+    )
+    wanted: tuple[str, ...] = (
+        () if found.tolerance is None else (f'Tolerance: {1e3 * found.tolerance:g} mm.',)
+    )
+    enough = f'About {found.needed}' if found.needed else 'Not even 10,000'
+    if found.verdict == 'UNDECIDED':
+        wanted += (f'{enough} configurations with the same error would decide.',)
+    notes = _assumed(found)
+    state = STATES[found.verdict]
+    return Report(
+        kind='Verification of a calibrated arm',
+        robot=chain.name,
+        verdict=replace(state, text=(limits, *wanted), gain=gain(found.comparison)),
+        accuracy=Section(
+            'accuracy',
+            'Accuracy before and after the correction',
+            (ISO_9283,),
+            head=HEAD,
+            rows=tuple(accuracy_rows('measured', found.comparison)),
+        ),
+        steps=NEXT[found.verdict],
+        remarks=(*warnings, *notes),
+        identity=identity_of(
+            chain, origin, poses, ('Configurations', str(found.configurations)), table_hash(chain)
+        ),
+        explorer=explorer(chain, poses),
+        sections=(
+            *_by_configuration(found),
+            *distributions(poses),
+            coverage(chain, poses.joints, 'How far each joint was moved'),
+        ),
+        inputs=origin.inputs,
+        settings=origin.settings,
+    )
+
+
+def _assumed(found: Verification) -> tuple[str, ...]:
+    """Return what a verification assumes."""
+    notes = []
+    if found.fitted:
+        notes.append(f'Fitted to these measurements, for both: {" and ".join(found.fitted)}.')
+    if not found.by_program:
+        notes.append(
+            'This is about the calibration. Whether its correction arrives at the arm shows only '
+            'with the program as it was before (--commanded).'
+        )
+    return tuple(notes)
+
+
+def _by_configuration(found: Verification) -> list[Section]:
+    """Return accuracy and repeatability of a few configurations, one by one."""
+    if found.configurations > MOST_LINES:
+        return []
+    rows = []
+    for k in range(found.configurations):
+        before, after = (
+            1e3 * each.position[found.group == k]
+            for each in (found.comparison.before, found.comparison.after)
+        )
+        apart = np.linalg.norm(after - after.mean(axis=0), axis=1)
+        again = f'{apart.mean() + 3.0 * apart.std(ddof=1):.4f}' if len(after) > 1 else ''
+        accuracies = (f'{np.linalg.norm(each.mean(axis=0)):.4f}' for each in (before, after))
+        rows.append((f'P{k + 1}', str(len(after)), *accuracies, again))
+    return [
+        Section(
+            'configurations',
+            'Pose by pose (ISO 9283)',
+            (
+                'AP: position accuracy, of the mean of all cycles. RP: repeatability, '
+                'mean + 3 sigma.',
+            ),
+            head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
+            rows=tuple(rows),
+        )
+    ]

@@ -1,0 +1,280 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pages of reports in a real Chromium: what a reader sees and can do."""
+
+import json
+import os
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from browser import browser, browser_path
+from measured import measured, rows_of, write_csv
+
+from calib_ros.cli.main import main
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report import explorer
+from calib_ros.report.page import Origin, render
+from calib_ros.report.poses import poses_of
+from calib_ros.report.reports import identification_report
+
+pytestmark = pytest.mark.skipif(
+    browser_path() is None and 'CI' not in os.environ,
+    reason='no Chromium here: apt install chromium (in CI it is required)',
+)
+
+CONTRAST = """() => {
+  const curve = (v) => (v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+  const channel = (v) => curve(v / 255);
+  const light = (c) => 0.2126 * channel(c[0]) + 0.7152 * channel(c[1]) + 0.0722 * channel(c[2]);
+  const parts = (text) => text.match(/[\\d.]+/g).map(Number);
+  const found = [];
+  for (const each of document.querySelectorAll('body *')) {
+    const own = [...each.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
+    if (!own || each.disabled || !each.checkVisibility()) continue;
+    const style = getComputedStyle(each);
+    const ink = parts(each instanceof SVGElement ? style.fill : style.color);
+    let under = [255, 255, 255];
+    for (let e = each; e; e = e.parentElement) {
+      const c = parts(getComputedStyle(e).backgroundColor);
+      if (c.length < 4 || c[3] > 0) { under = c; break; }
+    }
+    const [a, b] = [light(ink), light(under)].sort((x, y) => y - x);
+    const ratio = (a + 0.05) / (b + 0.05);
+    if (ratio < 4.5) found.push([each.tagName, each.textContent.slice(0, 40), ratio]);
+  }
+  return found;
+}"""
+REACHED = """() => [...document.querySelectorAll('button, select, input, summary, .scroll, pre')]
+  .filter((e) => e.checkVisibility() && !e.disabled && e.type !== 'radio')
+  .map((e, k) => { e.dataset.k = k; return k; }).length"""
+
+
+@pytest.fixture(scope='module')
+def result(tmp_path_factory):
+    """Return the folder of a result with an outlier."""
+    folder = tmp_path_factory.mktemp('browser')
+    rows = rows_of(measured())
+    rows[3]['x'] += 0.02
+    table = write_csv(folder / 'measured.csv', rows)
+    out = folder / 'out'
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out)]
+    assert main([*arguments, '--operator', 'A. Smith', '--tolerance', '0.5']) == 0
+    return out
+
+
+@pytest.fixture(scope='module')
+def chromium():
+    with browser() as started:
+        yield started
+
+
+class Seen:
+    """A page, what it complained about, and what it asked the network for."""
+
+    def __init__(self, chromium, path, width):
+        self.page = chromium.new_page()
+        self.page.set_viewport_size({'width': width, 'height': 800})
+        self.faults, self.requests = [], []
+        self.page.on('pageerror', lambda error: self.faults.append(str(error)))
+        self.page.on('console', self._said)
+        self.page.on('request', lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+
+    def _said(self, message):
+        if message.type == 'error':
+            self.faults.append(message.text)
+
+    def drawn(self):
+        """Draw all figures, as printing does."""
+        self.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        self.page.wait_for_function(
+            "[...document.querySelectorAll('.plot')].every((e) => e.querySelector('.main-svg'))"
+        )
+
+    @property
+    def overflow(self):
+        return self.page.evaluate('document.documentElement.scrollWidth - innerWidth')
+
+    def end(self):
+        self.page.close()
+        assert self.faults == []
+        assert [
+            url for url in self.requests if not url.startswith(('file:', 'data:', 'blob:'))
+        ] == []
+        assert sum(url.startswith('file:') for url in self.requests) == 1
+
+
+@pytest.fixture(scope='module')
+def wide(chromium, result):
+    seen = Seen(chromium, result / 'report.html', 1280)
+    seen.drawn()
+    yield seen
+    seen.end()
+
+
+def test_the_numbers_are_those_of_the_result(wide, result):
+    document = json.loads((result / 'result.json').read_text())
+    text = wide.page.inner_text('main')
+    for when in ('before', 'after'):
+        assert f'{document["validation"][when]["rms_mm"]:.3f} mm (' in text
+        for which in ('fitted', 'validation'):
+            for name in ('rms_mm', 'mean_mm', 'max_mm', 'mean_plus_3_sigma_mm', 'rms_mrad'):
+                assert f'{document[which][when][name]:.3f}' in text
+    assert 'Accepted, and within the tolerance' in wide.page.inner_text('.verdict')
+    assert 'line 5' in wide.page.inner_text('section[aria-label^="Outliers"]')
+
+
+def test_all_text_can_be_read(wide):
+    assert wide.page.evaluate(CONTRAST) == []
+    assert wide.overflow <= 0
+
+
+def test_the_switch_colours_the_points_by_the_error_before(wide):
+    colours = "document.getElementById('space').data[0].marker.color"
+    after = wide.page.evaluate(colours)
+    wide.page.check('input[value=before]')
+    before = wide.page.evaluate(colours)
+    assert len(before) == len(after) == 39
+    assert np.mean(before) > 5.0 * np.mean(after)
+    wide.page.check('input[value=after]')
+    assert wide.page.evaluate(colours) == after
+
+
+def test_the_slider_scales_the_vectors(wide):
+    ends = (
+        "(() => { const t = document.getElementById('space').data[2]; return t.x[1] - t.x[0]; })()"
+    )
+    slider = wide.page.locator('#scale')
+    slider.focus()
+    first = wide.page.evaluate(ends)
+    slider.press('End')
+    assert wide.page.evaluate(ends) / first == pytest.approx(10.0, rel=0.01)
+    assert wide.page.inner_text('#scale-value').startswith('1000 ')
+
+
+def test_a_row_picks_the_pose_and_a_point_its_row(wide, result):
+    page = wide.page
+    page.click('#next')
+    button = page.locator('#rows tbody button').first
+    assert button.inner_text() == '13'
+    button.focus()
+    button.press('Enter')
+    assert page.inner_text('#rows tr.picked button') == '13'
+    tip, there = page.evaluate(
+        '(() => { const c = window.calibRos; const T = c.frames(12).at(-1);'
+        ' return [[T[0][3], T[1][3], T[2][3]], c.position(12)]; })()'
+    )
+    assert tip == pytest.approx(there, abs=1e-6)  # what the page draws is the arm
+    mark = page.evaluate(
+        "(() => { const t = document.getElementById('space').data[7]; return [t.x, t.y, t.z]; })()"
+    )
+    assert np.ravel(mark) == pytest.approx(there)
+    page.evaluate(
+        "document.getElementById('space').emit('plotly_click',"
+        ' {points: [{customdata: 3, curveNumber: 1}]})'
+    )
+    assert page.inner_text('#rows tr.picked button') == '4'
+    assert 'line 5' in page.inner_text('#picked')
+    assert 'an outlier' in page.inner_text('#picked')
+
+
+@pytest.mark.parametrize('way', ['left', 'right', 'up', 'down'])
+def test_the_arrows_turn_the_view(wide, way):
+    eye = "Object.values(document.getElementById('space').layout.scene.camera.eye)"
+    before = wide.page.evaluate(eye)
+    wide.page.click(f'[data-turn={way}]')
+    after = wide.page.evaluate(eye)
+    assert np.linalg.norm(np.subtract(after, before)) > 0.1
+    assert np.linalg.norm(after) == pytest.approx(np.linalg.norm(before))
+
+
+def test_the_list_shows_the_largest_errors_first_and_outliers_alone(wide):
+    page = wide.page
+    page.select_option('#sort', 'after')
+    assert page.inner_text('#rows tbody tr:first-child button') == '4'
+    shown = [float(cell) for cell in page.locator('#rows tbody td:nth-child(5)').all_inner_texts()]
+    assert shown == sorted(shown, reverse=True)
+    page.check('#only')
+    assert page.locator('#rows tbody tr').count() == 1
+    page.uncheck('#only')
+
+
+def test_the_components_are_chosen(wide):
+    page = wide.page
+    page.select_option('#component', 'angle')
+    page.wait_for_function(
+        "document.getElementById('session').layout.yaxis.title.text.includes('mrad')"
+    )
+    texts = page.locator('#joints .xtitle').all_text_contents()
+    assert 'shoulder_pan_joint' in ' '.join(texts)
+
+
+def test_the_keyboard_reaches_everything(wide):
+    page = wide.page
+    page.evaluate('document.activeElement.blur(); window.scrollTo(0, 0)')
+    wanted = page.evaluate(REACHED)
+    reached = set()
+    for _ in range(2 * wanted):
+        page.keyboard.press('Tab')
+        found = page.evaluate('document.activeElement.dataset.k')
+        reached.add(found)
+        if len(reached - {None}) == wanted:
+            break
+    assert len(reached - {None}) == wanted
+
+
+def test_the_first_printed_page_is_the_certificate(wide):
+    page = wide.page
+    page.emulate_media(media='print')
+    page.set_viewport_size({'width': 688, 'height': 1000})  # A4 without its margins
+    height = page.evaluate("document.querySelector('.certificate').offsetHeight")
+    assert page.is_visible('.signatures')
+    assert not page.is_visible('.controls')
+    text = page.inner_text('.certificate')
+    assert 'A. Smith' in text
+    assert re.search('[0-9a-f]{64}', text)
+    page.emulate_media(media='screen')
+    page.set_viewport_size({'width': 1280, 'height': 800})
+    assert height < 1016
+
+
+def test_many_poses_are_cells_and_bands(chromium, tmp_path, monkeypatch):
+    monkeypatch.setattr(explorer, 'MOST', 30)
+    problem = Problem(load_chain('ur5e'), measured())
+    found = identify(problem)
+    path = tmp_path / 'report.html'
+    poses = poses_of(problem, found)
+    path.write_text(render(identification_report(problem, found, poses, Origin())))
+    seen = Seen(chromium, path, 1280)
+    seen.drawn()
+    cells = seen.page.evaluate("document.getElementById('space').data[0].marker.color")
+    assert 0 < len(cells) <= len(poses)
+    bands = seen.page.evaluate("document.getElementById('session').data.map((t) => t.fill)")
+    assert bands.count('tonexty') == 2
+    seen.page.locator('#rows tbody button').last.click()
+    assert 'Picked' in seen.page.inner_text('#picked')
+    seen.end()
+
+
+def test_a_refused_result_on_a_telephone(chromium, tmp_path):
+    rows = measured(chain=load_chain('ur5e'), count=40)
+    noise = np.random.default_rng(3).normal(0, 1e-3, (40, 3))
+    problem = Problem(load_chain('ur5e'), replace(rows, positions=rows.positions + noise))
+    found = identify(problem)
+    assert not found.accepted
+    path = tmp_path / 'report.html'
+    path.write_text(
+        render(identification_report(problem, found, poses_of(problem, found), Origin()))
+    )
+    seen = Seen(chromium, path, 400)
+    seen.drawn()
+    assert seen.overflow <= 0
+    assert seen.page.evaluate(CONTRAST) == []
+    assert 'Not accepted' in seen.page.inner_text('.verdict')
+    box = seen.page.locator('text=What to do:').first.bounding_box()
+    assert box['y'] < 800.0  # without scrolling
+    seen.end()

@@ -1,0 +1,419 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pages of reports, without a browser."""
+
+import ast
+import base64
+import csv
+import hashlib
+import inspect
+import io
+import json
+import re
+import sys
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from measured import TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
+from plotly import graph_objects
+
+from calib_ros.apply.verification import verify
+from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.cli.main import main
+from calib_ros.files.export import exports
+from calib_ros.identification import steps, validation
+from calib_ros.identification.identification import identify
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.report import advice, explorer
+from calib_ros.report.maps import workspace_report
+from calib_ros.report.page import Input, Origin, Report, Verdict, render
+from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
+from calib_ros.report.reports import identification_report
+from calib_ros.report.verified import verification_report
+
+EMPTY = Report('kind', 'robot', Verdict('info', 'heading'), identity=(('a', 'b'),))
+HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, the text that is seen, and the data of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.words, self._inside = [], [], []
+        self.data = None
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in ('meta', 'link', 'input', 'br'):
+            self._inside.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        self._inside.pop()
+
+    def handle_data(self, text):
+        tag, attributes = self._inside[-1] if self._inside else ('', {})
+        if attributes.get('id') == 'data':
+            self.data = json.loads(text)
+        elif tag not in ('script', 'style'):
+            self.words.append(' '.join(text.split()))
+
+    @property
+    def text(self):
+        return ' '.join(self.words)
+
+
+def problem_of(count=TRAIN, chain=UR, **more):
+    rows = measured(count=count + TEST)
+    held_out = rows.select(np.arange(count, count + TEST))
+    return Problem(chain, rows.select(np.arange(count)), held_out, **more)
+
+
+@pytest.fixture(scope='module')
+def solved():
+    problem = problem_of()
+    return problem, identify(problem)
+
+
+def report_of(problem, result, **more):
+    poses = poses_of(problem, result)
+    return identification_report(problem, result, poses, Origin(), **more)
+
+
+def page_of(report):
+    return Page(render(report))
+
+
+def figures_of(page):
+    return page.data['figures']
+
+
+def test_the_figures_are_those_of_the_result(solved):
+    _, result = solved
+    page = page_of(report_of(*solved))
+    for which in (result.fitted, result.validation):
+        for figures in which.figures:
+            for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
+                assert f'{value:.3f}' in page.text
+    assert table_hash(result.chain) in page.text
+    assert page.text.index('Accepted') < page.text.index('Accuracy before and after')
+
+
+def test_poses_are_those_judged_and_their_errors_make_the_figures(solved):
+    problem, result = solved
+    poses = poses_of(problem, result)
+    assert len(poses) == TRAIN + TEST
+    assert (poses.role == JUDGED).sum() == TEST
+    for errors, figures in zip(
+        (poses.before, poses.after), result.validation.figures, strict=True
+    ):
+        rms = 1e3 * np.sqrt(np.mean(np.sum(errors[poses.judged] ** 2, axis=1)))
+        assert rms == pytest.approx(figures.rms_mm, rel=1e-12)
+    turned = 1e3 * np.sqrt(np.mean(np.sum(poses.turned_after[poses.judged] ** 2, axis=1)))
+    assert turned == pytest.approx(result.validation.figures[1].rms_mrad, rel=1e-12)
+
+
+def test_cross_validated_poses_have_the_errors_of_the_folds():
+    problem = replace(problem_of(), held_out=None)
+    result = identify(problem)
+    poses = poses_of(problem, result)
+    assert (poses.role == JUDGED).all()
+    rms = 1e3 * np.sqrt(np.mean(np.sum(poses.after**2, axis=1)))
+    assert rms == pytest.approx(result.validation.figures[1].rms_mm, rel=1e-12)
+
+
+def test_residuals_csv_holds_every_pose(solved):
+    poses = poses_of(*solved)
+    rows = list(csv.DictReader(io.StringIO(poses.table())))
+    assert len(rows) == len(poses)
+    assert [int(row['stamp_ns']) for row in rows] == poses.stamps_ns.tolist()
+    after = np.array([[float(row[f'after_{axis}']) for axis in 'xyz'] for row in rows])
+    assert after == pytest.approx(poses.after, abs=1e-9)
+    joints = np.array([[float(row[f'q{k}']) for k in range(1, 7)] for row in rows])
+    assert joints == pytest.approx(poses.joints, abs=1e-9)
+
+
+def test_positions_alone_leave_the_orientation_out():
+    rows = measured(oriented=False, count=60)
+    problem = Problem(UR, rows)
+    result = identify(problem)
+    poses = poses_of(problem, result)
+    assert 'after_rx' not in poses.table()
+    page = page_of(identification_report(problem, result, poses, Origin()))
+    assert 'angle' not in [kind for kind, _ in page.data['explorer']['kinds']]
+
+
+def test_the_page_says_whether_it_is_good_enough(solved):
+    _, result = solved
+    rms = 1e-3 * result.validation.figures[1].rms_mm
+    for tolerance, state, words in (
+        (3.0 * rms, 'good', 'within the tolerance'),
+        (rms, 'open', 'is open'),
+        (0.3 * rms, 'open', 'beyond the tolerance'),
+    ):
+        verdict = report_of(*solved, tolerance=tolerance).verdict
+        assert verdict.state == state
+        assert words in verdict.heading
+    assert f'{1e3 * rms:.3f} mm (' in report_of(*solved).verdict.gain
+
+
+def test_what_others_named_is_text(solved):
+    problem, result = solved
+    names = [f'<b onclick=x>{k}</b>{HOSTILE}'.replace('.', '') for k in range(6)]
+    joints = tuple(replace(j, name=n) for j, n in zip(UR.joints, names, strict=True))
+    chain = replace(UR, name=HOSTILE, joints=joints, parallel=None)
+    problem = problem_of(chain=chain)
+    result = identify(problem)
+    origin = Origin((Input(HOSTILE, 1, HOSTILE),), HOSTILE, HOSTILE, HOSTILE, HOSTILE)
+    poses = poses_of(problem, result)
+    text = render(identification_report(problem, result, poses, origin, warnings=(HOSTILE,)))
+    page = Page(text)
+    assert [tag for tag, _ in page.tags if tag == 'script'] == ['script'] * 3
+    assert not [1 for _, attributes in page.tags if 'onclick' in attributes]
+    assert page.text.count('alert(1)') > 10
+    told = Origin((Input('a', 1, 'b'),), 'c', 'd', 'e', 'f')
+    poses = poses_of(*solved)
+    plain = identification_report(*solved, poses, told, warnings=('g',))
+    plain = replace(plain, advice=advice.advice(['h', 'i']))
+    assert {tag for tag, _ in page.tags} <= {tag for tag, _ in page_of(plain).tags}
+    shown = json.dumps(figures_of(page))
+    assert '<b ' not in shown
+    assert '<script' not in shown
+
+
+def test_a_page_loads_nothing(solved):
+    text = render(report_of(*solved))
+    page = Page(text)
+    for tag, attributes in page.tags:
+        assert not {'src', 'srcset', 'action'} & attributes.keys(), tag
+        assert attributes.get('href', 'data:,') == 'data:,'
+    assert "default-src 'none'" in text
+    assert len(text.encode()) < 8e6
+
+
+def test_every_figure_is_one_that_plotly_knows(solved):
+    arm = CalibratedArm.of(solved[1])
+    found = survey(arm, 500, np.random.default_rng(0))
+    reports = [report_of(*solved), workspace_report(arm, found, Origin())]
+    count = 0
+    for report in reports:
+        for figure in figures_of(page_of(report)).values():
+            graph_objects.Figure(figure)
+            count += 1
+    assert count >= 8
+
+
+def sample_refusals():
+    """Return the texts with which `refusals` and steps refuse, without their figures."""
+    tree = ast.parse(inspect.getsource(validation.refusals))
+    for call in ast.walk(tree):
+        if isinstance(call, ast.Call) and getattr(call.func, 'attr', '') == 'append':
+            parts = [each for each in ast.walk(call) if isinstance(each, ast.Constant)]
+            text = ' '.join(str(each.value) for each in parts)
+            if len(text) > 10:
+                yield text
+    for kind in ('joint', 'tool', 'base'):
+        yield str(steps.Step('x', kind, 0, 4, 5 * 10**9, 1e-3, 'm', 0.9, False))
+
+
+def test_every_refusal_is_told_in_plain_words():
+    found = list(sample_refusals())
+    assert len(found) >= 13
+    for each in advice.advice(found):
+        assert each.heading != advice.OTHER.heading, each.refusal
+        assert each.steps
+        assert each.meaning
+    assert advice.advice(['something new'])[0].refusal == 'something new'
+
+
+def test_a_refused_page_says_why_and_what_to_do():
+    rng = np.random.default_rng(3)
+    rows = measured(chain=UR, count=40)
+    problem = Problem(UR, replace(rows, positions=rows.positions + rng.normal(0, 1e-3, (40, 3))))
+    result = identify(problem)
+    assert not result.accepted
+    page = page_of(report_of(problem, result))
+    where = [
+        page.text.index(words)
+        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy before')
+    ]
+    assert where == sorted(where)
+    for each in advice.advice(result.refusals):
+        assert each.heading in page.text
+        assert each.refusal in page.text
+    assert 'none: not accepted' in page.text
+    assert 'map' not in figures_of(page)
+
+
+def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
+    problem, result = solved
+    poses = poses_of(problem, result)
+    monkeypatch.setattr(explorer, 'MOST', 30)
+    shown = explorer.explorer(result.chain, poses)
+    good = ~poses.outlier
+    assert sum(shown['cells']['count']) == good.sum()
+    squares = np.square(shown['cells']['rms_after']) * shown['cells']['count']
+    rms = 1e3 * np.sqrt(np.mean(np.sum(poses.after[good] ** 2, axis=1)))
+    assert np.sqrt(squares.sum() / good.sum()) == pytest.approx(rms, rel=1e-3)
+    low, middle, high = shown['bins']['joint2']['length']['after']
+    known = [k for k, value in enumerate(middle) if value is not None]
+    assert known
+    assert all(low[k] <= middle[k] <= high[k] for k in known)
+    assert shown['total'] == len(poses)
+
+
+def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
+    _, result = solved
+    count = 500_000
+    rng = np.random.default_rng(0)
+    one = poses_of(*solved)
+    many = one.select(rng.integers(0, len(one), count))
+    many = replace(
+        many, stamps_ns=np.arange(count), after=many.after + rng.normal(0, 1e-5, (count, 3))
+    )
+    shown = explorer.explorer(result.chain, many)
+    assert len(shown['role']) <= 2 * explorer.LARGEST
+    report = replace(report_of(*solved), explorer=shown)
+    assert len(render(report).encode()) < 8e6
+    most = one.select(rng.integers(0, len(one), explorer.MOST))
+    report = replace(report, explorer=explorer.explorer(result.chain, most))
+    assert len(render(report).encode()) < 8e6
+
+
+def test_a_verification_has_its_verdict_first(solved):
+    problem, result = solved
+    sets = (problem.held_out,)
+    found = verify(CalibratedArm.of(result), sets, 1e-3)
+    poses = poses_to_verify(result.chain, sets, found.comparison)
+    page = page_of(verification_report(result.chain, found, poses, Origin()))
+    assert page.text.index('Passed') < page.text.index('Accuracy before')
+    assert f'{1e3 * found.upper:.3f} mm' in page.text
+    assert len(page.data['explorer']['role']) == TEST
+
+
+def test_exported_files_carry_the_hash_of_the_table(solved):
+    _, result = solved
+    digest = table_hash(result.chain)
+    assert parse_chain(dump_chain(result.chain)) is not None
+    assert table_hash(parse_chain(dump_chain(result.chain))) == digest
+    assert digest != table_hash(UR)
+    for each in exports(result.chain, UR):
+        assert digest in each.content, each.name
+
+
+@pytest.fixture
+def table(tmp_path):
+    return write_csv(tmp_path / 'measured.csv', rows_of(measured()))
+
+
+def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
+    out = tmp_path / 'out'
+    told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
+    assert main([*arguments, '--tolerance', '5']) == 0
+    page = Page((out / 'report.html').read_text())
+    digest = hashlib.sha256(table.read_bytes()).hexdigest()
+    for text in ('A. Smith', 'tracker 7', '0012', digest, 'tolerance of 5 mm'):
+        assert text in page.text
+    assert page.data['explorer']['lines']
+    document = json.loads((out / 'result.json').read_text())
+    assert document['origin']['operator'] == 'A. Smith'
+    assert document['origin']['inputs'][0]['sha256'] == digest
+    assert document['tolerance_mm'] == 5.0
+    assert (
+        f'table_sha256: {re.search("[0-9a-f]{64}", page.text)[0]}'
+        in (out / 'calibration.yaml').read_text()
+    )
+
+
+def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'jinja2', None)
+    out = tmp_path / 'out'
+    assert main(['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out)]) == 0
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert 'calib_ros[report]' in said
+    names = {path.name for path in out.iterdir()}
+    assert 'report.html' not in names
+    assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
+
+
+@pytest.mark.parametrize('wrong', ['0', '-1', 'nan', 'inf'])
+def test_a_tolerance_that_makes_no_sense_is_refused(table, capsys, wrong):
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', f'--tolerance={wrong}']
+    assert main(arguments) == 1
+    assert '--tolerance must be positive' in capsys.readouterr().err
+
+
+def test_the_other_commands_write_their_pages(table, tmp_path):
+    out = str(tmp_path / 'out')
+    new = write_csv(tmp_path / 'new.csv', rows_of(measured(seed=8, count=12), held_out=0))
+    assert main(['identify', '--csv', str(table), '--chain', 'ur5e', '--out', out]) == 0
+    verified, mapped, planned = (tmp_path / name for name in ('verified', 'map', 'plan.csv'))
+    judged = ['--calibration', out, '--tolerance', '1', '--out', str(verified)]
+    assert main(['verify', str(new), '--chain', 'ur5e', *judged]) == 0
+    assert 'Passed' in Page((verified / 'report.html').read_text()).text
+    assert (verified / 'residuals.csv').read_text().count('\n') == 13
+    arguments = ['workspace', out, '--chain', 'ur5e', '--poses', '500', '--out', str(mapped)]
+    assert main(arguments) == 0
+    assert 'Errors over the workspace' in Page((mapped / 'report.html').read_text()).text
+    arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
+    assert main(arguments) == 0
+    page = Page((tmp_path / 'plan.report.html').read_text())
+    assert 'Poses to go' in page.text
+    assert main(arguments) == 1
+    assert main([*arguments, '--force']) == 0
+
+
+@settings(max_examples=5)
+@given(st.text(min_size=1))
+def test_any_operator_is_text(operator):
+    page = page_of(replace(EMPTY, identity=(('Operator', operator),)))
+    assert {tag for tag, _ in page.tags} == {tag for tag, _ in page_of(EMPTY).tags}
+
+
+def packed(text):
+    return np.frombuffer(base64.b64decode(text), '<f4')
+
+
+def test_the_arrays_of_a_page_are_the_poses(solved):
+    problem, result = solved
+    poses = poses_of(problem, result)
+    arrays = page_of(report_of(problem, result)).data['explorer']['arrays']
+    assert packed(arrays['after']).reshape(-1, 3) == pytest.approx(1e3 * poses.after, rel=1e-6)
+    assert packed(arrays['joints']).reshape(-1, 6) == pytest.approx(poses.joints, rel=1e-6)
+    true = TRUE.forward(poses.joints)[:, :3, 3]
+    base = result.chain.frame('base').matrix
+    there = poses.position @ base[:3, :3].T + base[:3, 3]
+    assert np.linalg.norm(there - true, axis=1).max() < 2e-3
+
+
+def test_distances_and_outliers_have_pages():
+    rows = measured(count=80)
+    shifted = rows.positions.copy()
+    shifted[7] += 0.02
+    plain = replace(rows, positions=shifted)
+    wire = Observations(
+        rows.stamps_ns + 7,
+        rows.joints,
+        rows.positions,
+        rows.rotations,
+        np.zeros(80, bool),
+        distances=np.linalg.norm(rows.positions - [1.0, 1.0, 0.5], axis=1),
+        base='base_wire',
+    )
+    problem = Problem(UR, plain, more=(wire,))
+    result = identify(problem)
+    poses = poses_of(problem, result)
+    assert len(poses) == 160
+    assert poses.outlier.sum() == len(result.outliers) > 0
+    page = page_of(identification_report(problem, result, poses, Origin()))
+    assert 'Outliers: ' in page.text
+    assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
