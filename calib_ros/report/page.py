@@ -127,7 +127,7 @@ def render(report: Report) -> str | None:
         finalize=_shown,
         trim_blocks=True,
     )
-    return environment.get_template('report.html.jinja').render(
+    page: str = environment.get_template('report.html.jinja').render(
         report=report,
         marks=MARKS,
         css=source('report.css'),
@@ -138,6 +138,7 @@ def render(report: Report) -> str | None:
             'explorer': report.explorer,
         },
     )
+    return page
 
 
 def _shown(value: object) -> object:
