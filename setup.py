@@ -16,6 +16,7 @@ AMENT = (
 )
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
+XLSX = 'openpyxl>=3.1.2'
 
 setup(
     name=NAME,
@@ -38,12 +39,15 @@ setup(
     extras_require={
         # Not in Ubuntu: the node and tables run without it.
         'bags': [BAGS],
+        # Workbooks as tables.
+        'xlsx': [XLSX],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
         'fuzz': ['atheris'],
         'test': [
             BAGS,
+            XLSX,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
@@ -68,6 +72,7 @@ setup(
         (SHARE, ['package.xml']),
         (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
+        (f'{SHARE}/config/tables', glob('config/tables/*.yaml')),
         (f'{SHARE}/security', glob('security/*.xml')),
         (f'{SHARE}/launch', glob('launch/*.launch.py')),
     ],

@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
+    add_layout,
     add_settings,
+    foreign_of,
     results,
     settings_of,
 )
@@ -148,6 +150,7 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('--session', help='session of the table')
     add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
     add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+    add_layout(parser)
 
 
 def _add_compensate(parser: argparse.ArgumentParser) -> None:
@@ -376,7 +379,8 @@ def _verify(options: argparse.Namespace) -> int:
     nominal = load_chain(options.chain)
     arm = CalibratedArm.read(options.calibration, nominal)
     sessions = tuple(options.session.split(',')) if options.session else ()
-    table = read_table(options.measured, len(nominal.joints), sessions)
+    foreign = foreign_of(options, nominal)
+    table = read_table(options.measured, len(nominal.joints), sessions, foreign=foreign)
     commanded = None
     if options.commanded is not None:
         commanded = read_joints(options.commanded, nominal)
