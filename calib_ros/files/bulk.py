@@ -78,9 +78,11 @@ class _Bulk:
         self._header = set(columns.header)
         _require(not self._header & set(ROW_BY_ROW))
         self._count = len(columns.lines)
-        self._order = np.arange(self._count)
+        self._order, self._all = np.arange(self._count), True
+        self._numbers = self._read(joints)
         self._session = self._codes('session')
         self._order = self._of_sessions(sessions)
+        self._all = len(self._order) == self._count and len(sessions) < 2
         self._session = (self._session[0][self._order], self._session[1])
         angles = self._block('q', joints)
         _require(angles is not None and not np.isnan(angles).any())
@@ -96,7 +98,7 @@ class _Bulk:
         self._delay = self._values(('delay',))
         for name in ('count', 'spread'):  # of no use here, but not to be nonsense either
             if name in self._header:
-                _require(self._columns.blank(name).all() or self._values((name,)) is not None)
+                self._values((name,))
         if 'count' in self._header and not self._columns.blank('count').any():
             _require(self._columns.integers('count') is not None)
 
@@ -176,17 +178,23 @@ class _Bulk:
         world = from_cell(frame_id[1][frame_id[0][first[0]]]) if len(first) else ''
         return tuple(fitted), tuple(held_out), world
 
+    def _read(self, joints: int) -> dict[str, FloatArray]:
+        """Return all columns of numbers (N,)."""
+        names = [f'{letter}{k + 1}' for letter in 'qsva' for k in range(joints)]
+        names += [*POSITION, *QUATERNION, 'distance', *COVARIANCE, 'delay', 'count', 'spread']
+        names = [name for name in names if name in self._header]
+        _require(names)
+        found = self._columns.numbers(names)
+        _require(found is not None)
+        assert found is not None
+        return dict(zip(names, found.T, strict=True))
+
     def _codes(self, name: str) -> tuple[NDArray[np.intp], list[str]]:
         """Return the number (N,) of each row's text, and the texts in order of appearance."""
-        if name not in self._header or self._columns.blank(name).all():
+        if name not in self._header:
             return np.zeros(len(self._order), dtype=np.intp), ['']
-        known: dict[str, int] = {}
-        texts = self._columns.texts(name)
-        numbers = np.fromiter(
-            (known.setdefault(text, len(known)) for text in texts), np.intp, self._count
-        )
-        _require(len(known) <= self._count)
-        return numbers[self._order], list(known)
+        numbers, words = self._columns.codes(name)
+        return numbers if self._all else numbers[self._order], words
 
     def _of_sessions(self, sessions: Sequence[str]) -> NDArray[np.intp]:
         """Return the rows of the sessions asked for, session by session."""
@@ -209,10 +217,9 @@ class _Bulk:
         if not set(names) & self._header:
             return None
         _require(set(names) <= self._header)
-        found = self._columns.numbers(names)
-        _require(found is not None)
-        assert found is not None
-        found = found[self._order]
+        found = np.column_stack([self._numbers[name] for name in names])
+        if not self._all:
+            found = found[self._order]
         nothing = np.isnan(found)
         _require((nothing.all(axis=1) == nothing.any(axis=1)).all())
         if nothing.all():
@@ -308,7 +315,13 @@ class _Bulk:
 
 def _distinct(codes: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.intp]]:
     """Return the different rows of (N, C) in order of appearance, and which (N,) each row is."""
-    _, first, number = np.unique(codes, axis=0, return_index=True, return_inverse=True)
+    sizes = codes.max(axis=0, initial=0) + 1
+    if np.prod(sizes.astype(np.float64)) > 2**62:
+        raise _UnusualError
+    joined = np.ravel_multi_index(tuple(codes.T), tuple(sizes.tolist()))
+    if not joined.any():
+        return codes[:1], np.zeros(len(codes), dtype=np.intp)
+    _, first, number = np.unique(joined, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty(len(order), dtype=np.intp)
     rank[order] = np.arange(len(order))

@@ -12,7 +12,7 @@ import io
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -85,15 +85,15 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         text, coding = _text(path)
         if coding:
             notes.append(f'the text is taken for {coding}')
-        text = '\n'.join(
-            '' if layout.comment and line.lstrip().startswith(layout.comment) else line
-            for line in re.split('\r\n|\r|\n', text)
-        )
+        if '\r' in text:
+            text = text.replace('\r\n', '\n').replace('\r', '\n')
+        if layout.comment:
+            text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
         separator = layout.cut or _separator(path, text, notes)
         if separator == ' ':
             text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
             text = re.sub(r'[ \t]+', ' ', text)
-        rows = _cells(path, '\n'.join(text.split('\n')[: ABOVE + SAMPLE]), separator)
+        rows = _cells(path, '\n'.join(text.split('\n', ABOVE + SAMPLE)[:-1] or [text]), separator)
     decimal = layout.decimal or _decimal(rows, separator, notes)
     at, header = _header(path, rows, names, known)
     used = [header.index(n) for n in names if not n.startswith('#') and n in header]
@@ -106,23 +106,14 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     columns = None
     start = rows[first][0]
     if text:
-        body = text.split('\n')[start - 1 :]
-        joined = '\n'.join(body)
+        body = text.split('\n', start - 1)[-1]
         if decimal == ',':
-            joined = joined.replace(',', '.')
-        numbers = separator.join(f'#{k + 1}' for k in range(width))
-        columns = regular(f'{numbers}\n{joined}', separator)
+            body = body.replace(',', '.')
+        numbers = [f'#{k + 1}' for k in range(width)]
+        columns = regular(body, separator, numbers, start - 1)
         if columns is None:
             rows = _cells(path, text, separator)
             first = next(k for k, (line, _) in enumerate(rows) if line >= start)
-        else:
-            columns = TextColumns(
-                columns.header,
-                columns.lines + (start - 2),
-                columns._rows,
-                columns._lengths,
-                separator,
-            )
     if columns is None:
         columns = _ragged(path, rows[first:], max(width, len(header)), decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
@@ -193,7 +184,8 @@ def _cell(value: object) -> str:
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
     """Return the separator by which most lines have the same number of cells, more than one."""
-    lines = [line for line in text.split('\n')[: ABOVE + SAMPLE] if line.strip()][-SAMPLE:]
+    lines = [line for line in text.split('\n', ABOVE + SAMPLE)[: ABOVE + SAMPLE] if line.strip()]
+    lines = lines[-SAMPLE:]
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most = ',', 0
@@ -304,7 +296,8 @@ def _ragged(
     filled = [[*cells, *[''] * (width - len(cells))] for _, cells in rows]
     if decimal == ',':
         filled = [[cell.replace(',', '.') for cell in row] for row in filled]
-    names = tuple(f'#{k + 1}' for k in range(width))
-    lengths = np.array([[len(cell) for cell in row] for row in filled], dtype=np.int32)
-    lines = np.array([line for line, _ in rows], dtype=np.intp)
-    return TextColumns(names, lines, [SEPARATOR.join(row) for row in filled], lengths, SEPARATOR)
+    names = [f'#{k + 1}' for k in range(width)]
+    found = regular('\n'.join(SEPARATOR.join(row) for row in filled), SEPARATOR, names)
+    if found is None:
+        raise InputError(f'cannot read {path}: it holds quotes or zeros within cells')
+    return replace(found, lines=np.array([line for line, _ in rows], dtype=np.intp))
