@@ -321,7 +321,7 @@ def _measured_only(made: MadeColumns) -> tuple[MadeColumns, str]:
     good = ~np.isnan(np.column_stack(measured)).all(axis=1)
     if good.all():
         return made, ''
-    kept = [bool(each) for each in good]
+    kept: list[bool] = np.asarray(good).tolist()
     lines = made.lines[~good].tolist()
     shown = ', '.join(map(str, lines[:MOST_LINES]))
     more = f' and {len(lines) - MOST_LINES} more' if len(lines) > MOST_LINES else ''

@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,12 @@ def read_text(path: Path) -> str:
 def shipped_robots() -> dict[str, Path]:
     """Return the chain files that come with calib_ros, by name."""
     return shared_files('robots')
+
+
+@cache
+def shipped_chains() -> tuple[Chain, ...]:
+    """Return the chains that come with calib_ros."""
+    return tuple(load_chain(name) for name in shipped_robots())
 
 
 def shared_files(folder: str) -> dict[str, Path]:
