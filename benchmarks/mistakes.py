@@ -13,8 +13,8 @@ with 24 of their rows.
 
 The second tries the suspects on simulated sets without any of these mistakes, whether or not their
 errors are suspicious, and prints how many were named: of arms with errors (a third of them ten
-times larger than usual), few or many poses or positions, gross errors in up to 30 % of them, and of
-such that nothing explains: noise of decimetres, joint values of other poses.
+times larger than usual), few or many poses or positions, gross errors in up to 30 % of them, and
+of such that nothing explains: noise of decimetres, joint values of other poses.
 """
 
 import argparse
@@ -80,9 +80,7 @@ def joints(change):
 
 def turned(change):
     """Return a change of the observations by one of their quaternions."""
-    return lambda each: replace(
-        each, rotations=se3.from_quat(change(se3.to_quat(each.rotations)))
-    )
+    return lambda each: replace(each, rotations=se3.from_quat(change(se3.to_quat(each.rotations))))
 
 
 def later(each):
@@ -305,7 +303,9 @@ def clean_set(seed):
         seen = replace(seen, joints=rng.permutation(seen.joints))
     elif kind == 'inverted' and oriented:
         seen = replace(seen.inverted(), inverse=bool(rng.random() < 0.5)).inverted()
-    return Problem(chain, seen), f'{chain.name}, {count} {"poses" if oriented else "points"}, {kind}'
+    return Problem(
+        chain, seen
+    ), f'{chain.name}, {count} {"poses" if oriented else "points"}, {kind}'
 
 
 def of_clean_sets(count):

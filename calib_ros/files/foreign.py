@@ -167,6 +167,7 @@ class _Table:
     ) -> dict[str, Expression]:
         """Return the expressions with what the header calls by our names, or the chain's."""
         kept = {}
+        absent = []
         for ours, each in expressions.items():
             missing = [name for name in each.names if self._sheet.number(name) is None]
             if not missing:
@@ -176,6 +177,10 @@ class _Table:
                     f'{self._path} has no column {", ".join(missing)} for {ours}; it has '
                     f'{", ".join(each for each in self._sheet.header if each)}'
                 )
+            else:
+                absent.append(f'{ours} ({", ".join(missing)})')
+        if 0 < len(absent) <= MOST_LINES:  # `q*=A*` stands for as many as there are
+            self.notes.append(f'it has no {", ".join(absent)}: left out')
         lower = [name.lower() for name in self._sheet.header]
         guessed = []
         for name, ours in own.items():
