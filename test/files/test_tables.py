@@ -235,9 +235,10 @@ KINDS = {
     'split': SPLIT,
     'windows': POINTS.replace('\n', '\r\n'),
     'blank lines': POSES.replace('\n', '\n\n'),
-    'mixed': """stamp_ns,device,target,q1,q2,x,y,z,qx,qy,qz,qw,distance,eye_in_hand,split,s1,s2,v1,v2
-5,left,,1,0,1,0,0,,,,,,,,1,-3,,
-4,left,a,2,0,2,0,0,0.5,-0.5,0.5,0.5,,,test,,,0.1,0.2
+    'mixed': "stamp_ns,device,target,q1,q2,x,y,z,qx,qy,qz,qw,distance,eye_in_hand,split,"
+    + """v1,v2,s1,s2
+5,left,,1,0,1,0,0,,,,,,,,,,1,-3
+4,left,a,2,0,2,0,0,0.5,-0.5,0.5,0.5,,,test,0.1,0.2,,
 5,,a,3,0,,,,,,,,7.5,,,,,,
 5,cam,a,4,0,4,0,0,0,0,0,1,,1,train,,,,
 3,left,,5,0,5,0,0,,,,,,,,,,,
