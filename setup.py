@@ -17,6 +17,7 @@ AMENT = (
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
+XLSX = 'openpyxl>=3.1.2'
 
 setup(
     name=NAME,
@@ -41,6 +42,8 @@ setup(
         'bags': [BAGS],
         # report.html; without it the other files are written.
         'report': REPORT,
+        # Workbooks as tables.
+        'xlsx': [XLSX],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
@@ -48,6 +51,7 @@ setup(
         'test': [
             BAGS,
             *REPORT,
+            XLSX,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
@@ -74,6 +78,7 @@ setup(
         (SHARE, ['package.xml']),
         (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
+        (f'{SHARE}/config/tables', glob('config/tables/*.yaml')),
         (f'{SHARE}/security', glob('security/*.xml')),
         (f'{SHARE}/launch', glob('launch/*.launch.py')),
     ],

@@ -17,6 +17,8 @@ QUATERNION_TOLERANCE = 1e-3
 LARGEST = 1e6
 """Largest number [m or rad] that is measured or set; some devices send the largest float for
 none."""
+LARGEST_RATE = 1e12
+"""Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
 LONGEST_NAME = 200
 LARGEST_STAMP = 2**63 - 1
 SMALLEST_SIGMA, LARGEST_SIGMA = 1e-9, 1e6

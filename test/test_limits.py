@@ -288,7 +288,7 @@ def test_many_rows_that_were_taken_back_take_no_longer_than_others(tmp_path):
     rows = [f'{k},0,0,1,2,3,{split}' for k in range(20_000) for split in ('', 'removed')]
     path = tmp_path / 'table.csv'
     path.write_text('\n'.join(['stamp_ns,q1,q2,x,y,z,split', *rows, '1,0,0,1,2,3,']))
-    assert len(read_table(path, 2).samples) == 1
+    assert len(read_table(path, 2).fitted[0]) == 1
 
 
 def test_too_many_devices_are_refused(tmp_path):

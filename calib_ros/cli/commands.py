@@ -18,7 +18,9 @@ from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
     add_identity,
+    add_layout,
     add_settings,
+    foreign_of,
     origin_of,
     page_of,
     results,
@@ -158,6 +160,7 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('--out', type=Path, help='folder for the report and the residuals')
     add('--force', action='store_true', help='replace the result in --out')
     add_identity(parser)
+    add_layout(parser)
 
 
 def _add_compensate(parser: argparse.ArgumentParser) -> None:
@@ -432,7 +435,8 @@ def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]
     nominal = load_chain(options.chain)
     arm = CalibratedArm.read(options.calibration, nominal)
     sessions = tuple(options.session.split(',')) if options.session else ()
-    table = read_table(options.measured, len(nominal.joints), sessions)
+    foreign = foreign_of(options, nominal)
+    table = read_table(options.measured, len(nominal.joints), sessions, foreign=foreign)
     commanded = None
     if options.commanded is not None:
         commanded = read_joints(options.commanded, nominal)

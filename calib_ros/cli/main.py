@@ -28,7 +28,9 @@ from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
     add_identity,
+    add_layout,
     add_settings,
+    foreign_of,
     origin_of,
     page_of,
     results,
@@ -36,6 +38,11 @@ from calib_ros.cli.options import (
 )
 from calib_ros.errors import CalibrationError, InputError, shortened
 
+LAYOUT = (
+    *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
+    *('rotation_vector', 'inverse', 'shift', 'separator', 'decimal', 'sheet', 'joints'),
+)
+"""Options of tables of others."""
 LARGEST_LOSS = 0.1
 """Share of the messages of a bag that may be lost. As many fewer samples at random make standard
 deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
@@ -108,6 +115,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
     )
     add_identity(identify)
+    add_layout(identify)
     if 'identify' in given:  # they know numpy, which takes longer than all the rest
         add_settings(identify)
 
@@ -117,6 +125,13 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     simulate.add_argument('bag', type=Path, help='folder of the bag to write')
     add_chain(simulate)
     _add_simulation(simulate)
+
+    convert = command('import', _import, 'write a table of others as one of ours')
+    convert.add_argument('table', type=Path, help='CSV, text in columns, or .xlsx')
+    convert.add_argument('--chain', help='chain file, URDF or robot: names and kinds of joints')
+    convert.add_argument('--out', type=Path, required=True, help='CSV to write')
+    convert.add_argument('--force', action='store_true', help='overwrite --out')
+    add_layout(convert)
 
     csv2bag = command('csv2bag', _csv2bag, 'write a table of measured poses as a bag')
     csv2bag.add_argument('csv', type=Path, help='the table')
@@ -231,7 +246,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
     useless = (
         ('joint_topics', 'sources', 'joint_names', 'frame_id')
         if options.csv
-        else ('session', 'eye_in_hand', 'socket_distance')
+        else ('session', 'eye_in_hand', 'socket_distance', *LAYOUT)
     )
     for name in useless:
         if getattr(options, name):
@@ -251,6 +266,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
             _sessions(options),
             (settings.sigma_position, settings.sigma_orientation),
             options.eye_in_hand,
+            foreign_of(options, chain),
         )
         warnings, lines = table.warnings, table.by_line
         sockets = 0.05 if options.socket_distance is None else options.socket_distance
@@ -298,6 +314,27 @@ def _simulate(options: argparse.Namespace) -> int:
 
     truth = _write_simulation(load_chain(options.chain), options, options.bag)
     print(f'wrote {options.bag} and the true chain {truth}')
+    return 0
+
+
+def _import(options: argparse.Namespace) -> int:
+    from calib_ros.atomic import write_file
+    from calib_ros.files.foreign import Foreign, as_csv
+    from calib_ros.files.layouts import Layout
+    from calib_ros.files.tables import table_of
+    from calib_ros.kinematics.chain_file import load_chain
+
+    if options.out.exists() and not options.force:
+        raise InputError(f'{options.out} exists already: choose another name or --force')
+    chain = None if options.chain is None else load_chain(options.chain)
+    foreign = foreign_of(options, chain) or Foreign(Layout(), chain)
+    columns, notes = foreign.convert(options.table)
+    for note in notes:
+        print(f'note: {note}', file=sys.stderr)
+    table_of(columns, options.table)  # refuses what no table of ours may hold
+    text = as_csv(columns)
+    write_file(options.out, text, overwrite=options.force)
+    print(f'wrote {options.out}: {len(columns.lines)} rows of {text.partition(chr(10))[0]}')
     return 0
 
 

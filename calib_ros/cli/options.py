@@ -13,8 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.atomic import whole_folder
+from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
+    from calib_ros.files.foreign import Foreign
+    from calib_ros.kinematics.chain import Chain
     from calib_ros.report.page import Origin, Report
     from calib_ros.settings import Settings
 
@@ -44,6 +47,52 @@ def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> 
             default=[] if many else item.default,
             help=item.metadata['text'],
         )
+
+
+def add_layout(parser: argparse.ArgumentParser) -> None:
+    """Add the options that say how a table of others is laid out (docs/tables.md)."""
+    group = parser.add_argument_group('tables of others (docs/tables.md)')
+    add = group.add_argument
+    add('--preset', default='', metavar='NAME', help='a layout by name, or your own .yaml')
+    add(
+        '--columns',
+        action='append',
+        default=[],
+        metavar='OURS=THEIRS,...',
+        help='q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints',
+    )
+    add('--length', default='', help='unit of lengths: m, cm, mm, um, in')
+    add('--angle', default='', help='unit of angles, joint values included: rad, deg')
+    add('--joint-angle', default='', help='unit of joint values where it is another one')
+    add('--euler', default='', metavar='ZYX', help='rx ry rz are Euler angles; zyx: fixed axes')
+    add('--quaternion', default='', metavar='wxyz', help='order of qx qy qz qw, else xyzw')
+    add('--rotation-vector', action='store_true', help='rx ry rz are a rotation vector')
+    add('--inverse', action='store_true', help='the poses are those of the device in the target')
+    add('--shift', type=int, default=0, metavar='ROWS', help='joint values stand so much below')
+    add('--separator', default='', help='comma, semicolon, tab or space; guessed if not given')
+    add('--decimal', default='', help='point or comma; guessed if not given')
+    add('--sheet', default='', help='of a workbook (.xlsx), else its first')
+    add('--joints', type=Path, metavar='FILE', help='log of the joint values, row by row')
+    add('--joints-preset', default='', metavar='NAME', help='layout of that log')
+
+
+def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
+    """Return how to read a table of others, None where nothing says that it is one."""
+    names = [*('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector')]
+    names += ['inverse', 'shift', 'separator', 'decimal', 'sheet']
+    given = {name: getattr(options, name) for name in names}
+    if not (any(given.values()) or options.preset or options.columns or options.joints):
+        return None
+    from calib_ros.files.foreign import Foreign
+    from calib_ros.files.layouts import Layout, layout_of
+
+    given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
+    if options.joints_preset and options.joints is None:
+        raise InputError('--joints-preset is of use with --joints FILE only')
+    units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
+    log = layout_of(options.joints_preset, (), {} if options.joints_preset else units)
+    layout = layout_of(options.preset, options.columns, given)
+    return Foreign(layout, chain, options.joints, log if options.joints else Layout())
 
 
 def settings_of(options: argparse.Namespace) -> Settings:

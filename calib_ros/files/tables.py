@@ -11,6 +11,7 @@ one table.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,17 @@ import numpy as np
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.escapes import from_cell, to_cell
+from calib_ros.files.bulk import (
+    COVARIANCE,
+    FLAGS,
+    MOST_FRAMES,
+    POSITION,
+    QUATERNION,
+    UPPER,
+    observations_of,
+)
+from calib_ros.files.columns import MadeColumns, regular
+from calib_ros.files.foreign import Foreign, refuse_separator
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
@@ -27,6 +39,7 @@ from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, Row, decoded, read_bytes, read_rows
 from calib_ros.values import (
     LARGEST,
+    LARGEST_RATE,
     LARGEST_SIGMA,
     QUATERNION_TOLERANCE,
     cell_integer,
@@ -34,38 +47,26 @@ from calib_ros.values import (
     covariance_fault,
 )
 
-POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
-UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
-COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
-FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 SPLITS = ('', 'train', 'test', 'removed')
 MOST_LINES = 5
 """Lines that an error names."""
-LARGEST_RATE = 1e12
-"""Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
-MOST_FRAMES = 100
-"""Sessions, devices and targets of a table."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table(Shown):
-    """Samples, and the sets to fit and held out that they make, each with frames of its own.
+    """The sets to fit and held out, each with frames of its own.
 
-    `pairs` names the frames of the two sockets of each location. `by_line` tells that the table
-    has no stamps: a sample's is its line, in seconds.
+    `pairs` names the frames of the two sockets of each location, `world_frame` is the first frame
+    of measurements that the table names, if any. `by_line` tells that the table has no stamps: a
+    sample's is its line, in seconds.
     """
 
-    samples: tuple[Sample, ...]
     fitted: tuple[Observations, ...]
     held_out: tuple[Observations, ...]
     pairs: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+    world_frame: str = ''
     by_line: bool = False
-
-    @property
-    def world_frame(self) -> str:
-        """Return the first frame of measurements that the table names, if any."""
-        return next((sample.frame_id for sample in self.samples if sample.frame_id), '')
 
 
 def read_table(
@@ -74,8 +75,9 @@ def read_table(
     sessions: Sequence[str] = (),
     sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
     eye_in_hand: bool = False,
+    foreign: Foreign | None = None,
 ) -> Table:
-    """Read a CSV.
+    """Read a CSV, or a table in any other layout.
 
     Parameters
     ----------
@@ -89,6 +91,8 @@ def read_table(
         Standard deviations [m, rad] of poses seen by a camera on the flange.
     eye_in_hand : bool
         All poses are those of a fixed target in a camera on the flange.
+    foreign : Foreign, optional
+        How to read a table that others have written.
 
     Raises
     ------
@@ -97,21 +101,74 @@ def read_table(
         measurements of one device in different frames. The message names the line.
 
     """
-    header, rows, warnings = _read(path, columns(joints))
+    if foreign is not None:
+        made, warnings = foreign.convert(path)
+        return table_of(made, path, joints, sessions, sigmas, eye_in_hand, warnings)
+    text, warnings = _read(path, columns(joints))
+    columns_of = regular(text)
+    if columns_of is not None:
+        found = observations_of(columns_of, joints, sessions, sigmas, eye_in_hand)
+        if found is not None:
+            fitted, held_out, world_frame = found
+            by_line = 'stamp_ns' not in columns_of.header
+            return Table(fitted, held_out, (), warnings, world_frame, by_line)
+    header, rows = read_rows(text, path)
+    return _by_rows(path, joints, header, rows, sessions, sigmas, eye_in_hand, warnings)
+
+
+def table_of(
+    made: MadeColumns,
+    path: Path,
+    joints: int | None = None,
+    sessions: Sequence[str] | None = None,
+    sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
+    eye_in_hand: bool = False,
+    warnings: tuple[str, ...] = (),
+) -> Table:
+    """Return the table of columns that were converted; the arguments are those of `read_table`.
+
+    By default all sessions, and as many joints as there are columns for them.
+    """
+    if joints is None:
+        joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.header)
+    if sessions is None:
+        sessions = tuple(dict.fromkeys(made.words.get('session', ())))
+    found = observations_of(made, joints, sessions, sigmas, eye_in_hand)
+    if found is not None:
+        fitted, held_out, world_frame = found
+        by_line = 'stamp_ns' not in made.header
+        return Table(fitted, held_out, (), warnings, world_frame, by_line)
+    header, rows = made.header, made.rows()
+    return _by_rows(path, joints, header, rows, sessions, sigmas, eye_in_hand, warnings)
+
+
+def _by_rows(
+    path: Path,
+    joints: int,
+    header: Sequence[str],
+    rows: list[tuple[int, Row]],
+    sessions: Sequence[str],
+    sigmas: tuple[float, float],
+    eye_in_hand: bool,
+    warnings: tuple[str, ...],
+) -> Table:
+    """Return the table read row by row, which names what is wrong."""
     reader = _Reader(path, joints, header)
     samples = reader.samples(_of_sessions(path, header, rows, sessions))
     reader.refuse_different_frames(samples)
-    found = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples]
-    if not any(not sample.validation for sample in found):
+    taken = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples]
+    if not any(not sample.validation for sample in taken):
         raise InputError(f'{path} has no rows to fit, only such that are marked test')
-    fitted, kept_out = collect(found, sigmas)
+    fitted, held_out = collect(taken, sigmas)
     by_line = 'stamp_ns' not in header
-    return Table(tuple(found), fitted, kept_out, reader.pairs(found), warnings, by_line)
+    world_frame = next((sample.frame_id for sample in taken if sample.frame_id), '')
+    return Table(fitted, held_out, reader.pairs(taken), warnings, world_frame, by_line)
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
     """Return the samples of a journal, of which there may be none, and warnings."""
-    header, rows, warnings = _read(path, columns(joints))
+    text, warnings = _read(path, columns(joints))
+    header, rows = read_rows(text, path)
     return _Reader(path, joints, header).samples(rows), warnings
 
 
@@ -175,11 +232,13 @@ class _Reader:
             needed.append('location')
         missing = [name for name in needed if name not in self._header]
         if missing:
+            refuse_separator(path, header)
             expected = ', '.join([*needed[:joints], *POSITION])
             raise InputError(
                 f'{path} has no column {", ".join(missing)}; expected {expected} '
                 f'and, with orientation, {", ".join(QUATERNION)} as well (or '
-                f'distance, or location and socket); found {", ".join(header) or "nothing"}'
+                f'distance, or location and socket); found {", ".join(header) or "nothing"}. '
+                'Columns of other names: --columns q1=NAME,x=NAME,...'
             )
 
     def samples(self, rows: Sequence[tuple[int, Row]]) -> tuple[Sample, ...]:
@@ -349,18 +408,16 @@ def _in_words(lines: Sequence[int]) -> str:
     return f'line{"s" if len(lines) > 1 else ""} {shown}{more}'
 
 
-def _read(
-    path: Path, journal: Sequence[str]
-) -> tuple[Sequence[str], list[tuple[int, Row]], tuple[str, ...]]:
-    """Return header, rows with their lines, and warnings; `journal` is the header of one."""
+def _read(path: Path, journal: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+    """Return the text of a table, and warnings; `journal` is the header of one."""
     data = whole = read_bytes(path, LARGEST_TABLE, InputError)
     if data.startswith(','.join(journal).encode()):
         whole = data[: data.rfind(b'\n') + 1]
-    header, rows = read_rows(decoded(whole, str(path), InputError), path)
+    text = decoded(whole, str(path), InputError)
     if len(whole) < len(data):
         line = whole.count(b'\n') + 1
-        return header, rows, (f'{path}: line {line} was cut off and is left out',)
-    return header, rows, ()
+        return text, (f'{path}: line {line} was cut off and is left out',)
+    return text, ()
 
 
 def _of_sessions(

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.errors import InputError, TooFewObservationsError
-from calib_ros.identification import identifiability, suspicions
+from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior, considered, posterior_of
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
@@ -310,7 +310,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         step=step,
         remarks=remarks(problem, step, coarse),
     )
-    return suspicions.remarked(problem, result)
+    return mistakes.remarked(problem, suspicions.remarked(problem, result))
 
 
 @dataclass(frozen=True, eq=False)

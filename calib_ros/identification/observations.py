@@ -66,6 +66,8 @@ class Observations(Shown):
     socket : bool
         The target, a ball, sat in a socket of unknown place: it was at the origin of the world all
         the time, and the world's axes are those of the arm's base.
+    inverse : bool
+        The poses were the other way round before: of a fixed target in a camera on the flange.
 
     """
 
@@ -83,6 +85,7 @@ class Observations(Shown):
     base: str = 'base'
     tool: str = 'tool'
     socket: bool = False
+    inverse: bool = False
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""
@@ -165,7 +168,13 @@ class Observations(Shown):
             jacobian[:, :3, 3:] = -turned @ se3.skew(self.positions)
             jacobian[:, 3:, 3:] = -turned
             covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-        return replace(self, positions=positions, rotations=turned, covariance=covariance)
+        return replace(
+            self,
+            positions=positions,
+            rotations=turned,
+            covariance=covariance,
+            inverse=not self.inverse,
+        )
 
     def covariances(self, sigmas: tuple[float, float]) -> FloatArray:
         """Return (N, 6, 6) the covariances, by `sigmas` [m, rad] where a measurement brought none.

@@ -115,6 +115,16 @@ def _start_one(
     return robust_fit(best, determined, system, loss).fit.chain
 
 
+def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:
+    """Yield the chain with base and tool for poses, positions or a socket, in closed form."""
+    if observations.socket:
+        yield _in_socket(chain, observations)
+        return
+    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
+    for rotation in _closed_form(chain, arm, observations):
+        yield _complete(chain, arm, observations, rotation)
+
+
 def _in_socket(chain: Chain, observations: Observations) -> Chain:
     """Return the chain with its base moved, not turned, so that the tool stays at the origin.
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +36,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import FRAME_KINDS, Chain, is_length
-from calib_ros.kinematics.chain_file import load_chain, shipped_robots
+from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -137,11 +136,6 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     return f'{growth}check the scale of the measuring device, and the temperature', False
 
 
-@lru_cache(maxsize=1)
-def _shipped() -> tuple[Chain, ...]:
-    return tuple(load_chain(name) for name in shipped_robots())
-
-
 def _sister(problem: Problem, result: Identification) -> str:
     """Return in words which shipped robot is much nearer to the arm found than the nominal."""
     if not any(
@@ -156,7 +150,7 @@ def _sister(problem: Problem, result: Identification) -> str:
     joints = problem.sets[0].joints[_few(len(problem.sets[0]))]
     nominal = _apart(problem.chain, result.chain, joints)
     found = []
-    for each in _shipped():
+    for each in shipped_chains():
         if [joint.type for joint in each.joints] == types:
             found.append((_apart(each, result.chain, joints), each.name))
     distance, name = min(found, default=(np.inf, ''))

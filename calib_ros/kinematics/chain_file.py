@@ -15,6 +15,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,18 @@ def read_text(path: Path) -> str:
 
 
 def shipped_robots() -> dict[str, Path]:
-    """Return the chain files that come with calib_ros, by name.
+    """Return the chain files that come with calib_ros, by name."""
+    return shared_files('robots')
+
+
+@cache
+def shipped_chains() -> tuple[Chain, ...]:
+    """Return the chains that come with calib_ros."""
+    return tuple(load_chain(name) for name in shipped_robots())
+
+
+def shared_files(folder: str) -> dict[str, Path]:
+    """Return the YAML files in a folder of `config` that come with calib_ros, by name.
 
     Looked for in the share folders of the ROS workspaces in use, in that of the Python
     environment, and in the source tree.
@@ -81,7 +93,7 @@ def shipped_robots() -> dict[str, Path]:
     prefixes = [Path(p) for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     shares = [prefix / 'share' / 'calib_ros' for prefix in (*prefixes, Path(sys.prefix))]
     for share in (*shares, Path(__file__).parents[2]):
-        found = sorted((share / 'config' / 'robots').glob('*.yaml'))
+        found = sorted((share / 'config' / folder).glob('*.yaml'))
         if found:
             return {path.stem: path for path in found}
     return {}

@@ -137,7 +137,7 @@ def test_what_was_taken_back_is_left_out_and_can_be_taken_again(tmp_path):
     found, _ = read_journal(tmp_path / 'cell.csv', JOINTS)
     assert [(each.stamp_ns, each.count) for each in found] == [(1, 1), (2, 7)]
     table = read_table(tmp_path / 'cell.csv', JOINTS)
-    assert [each.stamp_ns for each in table.samples] == [1, 2]
+    assert table.fitted[0].stamps_ns.tolist() == [1, 2]
     assert len((tmp_path / 'cell.csv').read_text().splitlines()) == 7
 
 

@@ -1,9 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.files import tables
+from calib_ros.files.bulk import COVARIANCE
 from calib_ros.files.tables import read_table
 
 POINTS = """q1,q2,x,y,z
@@ -223,3 +227,65 @@ def test_a_table_without_frames_has_none(tmp_path):
     path = tmp_path / 'cell.csv'
     path.write_text(POINTS)
     assert read_table(path, 2).world_frame == ''
+
+
+KINDS = {
+    'points': POINTS,
+    'poses': POSES,
+    'split': SPLIT,
+    'windows': POINTS.replace('\n', '\r\n'),
+    'blank lines': POSES.replace('\n', '\n\n'),
+    'mixed': "stamp_ns,device,target,q1,q2,x,y,z,qx,qy,qz,qw,distance,eye_in_hand,split,"
+    + """v1,v2,s1,s2
+5,left,,1,0,1,0,0,,,,,,,,,,1,-3
+4,left,a,2,0,2,0,0,0.5,-0.5,0.5,0.5,,,test,0.1,0.2,,
+5,,a,3,0,,,,,,,,7.5,,,,,,
+5,cam,a,4,0,4,0,0,0,0,0,1,,1,train,,,,
+3,left,,5,0,5,0,0,,,,,,,,,,,
+""",
+    'covariances': 'q1,q2,x,y,z,qx,qy,qz,qw,'
+    + ','.join(COVARIANCE)
+    + '\n1,2,3,4,5,0,0,0,1'
+    + ',' * 21
+    + '\n1,2,3,4,5,0,0,0,1,2,0.5,0,0,0,0,2,0,0,0,0,2,0,0,0,2,0,0,2,0,2'
+    + '\n1,2,3,4,5,,,,,2,0,0,0,0,0,2,0,0,0,0,2,0,0,0,0,0,0,0,0,0'
+    + '\n1,2,3,4,5,,,,' + ',0' * 21 + '\n',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('eye_in_hand', [False, True])
+def test_columns_make_the_same_as_rows(tmp_path, monkeypatch, kind, eye_in_hand):
+    if eye_in_hand and kind not in ('poses', 'blank lines'):
+        pytest.skip('a camera on the flange measures poses')
+    path = tmp_path / 'cell.csv'
+    path.write_bytes(KINDS[kind].encode())
+    fast = read_table(path, 2, eye_in_hand=eye_in_hand)
+    used = []
+    monkeypatch.setattr(tables, 'observations_of', lambda *arguments: used.append(1))
+    slow = read_table(path, 2, eye_in_hand=eye_in_hand)
+    assert used
+    for name in ('fitted', 'held_out'):
+        assert len(getattr(fast, name)) == len(getattr(slow, name))
+        for one, other in zip(getattr(fast, name), getattr(slow, name), strict=True):
+            for item in fields(one):
+                found, expected = getattr(one, item.name), getattr(other, item.name)
+                np.testing.assert_array_equal(found, expected, item.name)
+    assert fast.world_frame == slow.world_frame
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_regular_tables_are_read_by_columns(tmp_path, monkeypatch, kind):
+    path = tmp_path / 'cell.csv'
+    path.write_bytes(KINDS[kind].encode())
+    monkeypatch.setattr(tables, '_by_rows', None)
+    assert read_table(path, 2).fitted
+
+
+def test_sessions_are_read_by_columns(tmp_path, monkeypatch):
+    path = tmp_path / 'cell.csv'
+    path.write_text(SESSIONS)
+    monkeypatch.setattr(tables, '_by_rows', None)
+    found = read_table(path, 2, ('B', 'A')).fitted
+    assert [each.positions[:, 0].tolist() for each in found] == [[2.0], [1.0, 3.0]]
+    assert [each.base for each in found] == ['base', 'base_A']

@@ -1,0 +1,339 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which mistakes are named, on measured robots spoilt in each way, and how often none is one.
+
+    CALIB_ROS_DATA=FOLDER python benchmarks/mistakes.py [--only SET] [--rows N] [--json]
+    python benchmarks/mistakes.py --clean 1000
+
+The first prints the table of docs/mistakes.md. A cell holds `named` where the mistake is named
+first, `or` where it is among two or three that explain the same, `same` where it makes no
+difference that matters (the typical error as given is below FACTOR times that of the clean set),
+`-` where a set cannot have it, and else what was said.
+
+The second tries the suspects on simulated sets without any of these mistakes, whether or not their
+errors are suspicious, and prints how many were named: of arms with errors (a third of them ten
+times larger than usual), few or many poses or positions, gross errors in up to 30 % of them, and
+of such that nothing explains: noise of decimetres, joint values of other poses.
+"""
+
+import argparse
+import json
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.files.tables import read_table
+from calib_ros.identification import mistakes
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain, shipped_robots
+
+DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[2] / 'shared' / 'data'))
+SETS = (
+    ('ur10_ipa_leica', 'B', 'chain.yaml'),
+    ('ur5_jacobi_lasertracker', 'grid', 'chain.yaml'),
+    ('wam7_jacobi_lasertracker', 'grid', 'chain.yaml'),
+    ('positioner_2axis_pose', 'all', 'chain.yaml'),
+    ('fr3_camera_eyeinhand', 'all', 'chain.yaml'),
+    ('mukca_sockets', 'panda_1', 'chain_panda.yaml'),
+    ('mukca_sockets', 'kuka_14', 'chain_iiwa14.yaml'),
+)
+FACTOR = 3.4
+"""Ratio of typical errors below which a mistake makes no difference that could be told."""
+OTHERS = {'ur10': 'ur5e', 'ur5': 'ur10e', 'iiwa': 'franka_fr3', 'wam': 'kuka_iiwa14'}
+
+
+def problem_of(name, session, chain_name):
+    """Return the problem of a data set, with its held-out rows."""
+    chain = load_chain(DATA / name / chain_name)
+    table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
+    return Problem(
+        chain,
+        table.fitted[0],
+        table.held_out,
+        more=table.fitted[1:],
+        separations=tuple((*pair, 0.05) for pair in table.pairs),
+    )
+
+
+def changed(problem, change):
+    """Return a problem with all its observations changed."""
+    return replace(
+        problem,
+        observations=change(problem.observations),
+        more=tuple(map(change, problem.more)),
+        held_out=tuple(map(change, problem.judging)),
+    )
+
+
+def joints(change):
+    """Return a change of the observations by one of their joint values."""
+    return lambda each: replace(each, joints=change(each.joints))
+
+
+def turned(change):
+    """Return a change of the observations by one of their quaternions."""
+    return lambda each: replace(each, rotations=se3.from_quat(change(se3.to_quat(each.rotations))))
+
+
+def later(each):
+    """Return observations with the joint values of the next row."""
+    count = len(each)
+    last = replace(each.select(np.arange(count - 1)), joints=each.joints[1:])
+    return replace(last, covariance=None)
+
+
+def mixed_up(problem):
+    """Return a problem whose rows, held-out ones included, have the next row's joint values."""
+    sets = []
+    for each in problem.sets:
+        same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
+        parts = (each, *same)
+        order = np.argsort(np.concatenate([e.stamps_ns for e in parts]))
+        names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
+        whole = {n: np.concatenate([getattr(e, n) for e in parts])[order] for n in names}
+        sets.append(later(replace(each, **whole, covariance=None, delay=None)))
+    return replace(problem, observations=sets[0], more=tuple(sets[1:]), held_out=None)
+
+
+def spoilt(problem):
+    """Yield mistakes: group, words that name it, and the problem with it (None: cannot be)."""
+    chain = problem.chain
+    count = len(chain.joints)
+    names = chain.joint_names
+    seen = problem.observations
+    oriented, measured = bool(seen.oriented.all()), not seen.socket
+
+    def with_(change, can=True):
+        return changed(problem, change) if can else None
+
+    def both(each, size, angle=1.0):
+        return replace(each, positions=size * each.positions, joints=angle * each.joints)
+
+    for unit, size in mistakes.SCALES.items():
+        yield (
+            unit,
+            f'positions are in {unit},',
+            with_(lambda e, size=size: both(e, 1.0 / size), measured),
+        )
+    yield 'degrees', 'in degrees,', with_(joints(np.degrees))
+    yield (
+        'mm and degrees',
+        'in mm, not metres and the joint values in degrees',
+        with_(lambda e: both(e, 1e3, 180.0 / np.pi), measured),
+    )
+    yield (
+        'wxyz',
+        'are w x y z',
+        with_(turned(lambda q: q[:, [3, 0, 1, 2]]), measured and oriented),
+    )
+    yield (
+        'xyzw read as wxyz',
+        'are x y z w',
+        with_(turned(lambda q: q[:, [1, 2, 3, 0]]), measured and oriented),
+    )
+    yield (
+        'transposed',
+        'transposed',
+        with_(
+            lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)), measured and oriented
+        ),
+    )
+    yield (
+        'inverse pose, eye in hand not given',
+        'world in the target',
+        with_(lambda e: replace(e.inverted(), inverse=False), measured and oriented),
+    )
+    yield (
+        'eye in hand given needlessly',
+        'not on the flange',
+        with_(lambda e: e.inverted(), measured and oriented),
+    )
+    yield 'left-handed', 'left-handed', with_(mistakes._mirrored, measured)
+    for k in range(count):
+        signs = np.ones(count)
+        signs[k] = -1.0
+        yield (
+            'sign of a joint',
+            f'{names[k]} counts the other way',
+            with_(joints(lambda q, signs=signs: signs * q)),
+        )
+        for degrees in (90, -90, 180):
+            zero = np.zeros(count)
+            zero[k] = np.radians(degrees)
+            yield (
+                f'zero off by {abs(degrees)}',
+                f'{names[k]} has its zero {abs(degrees)}',
+                with_(joints(lambda q, zero=zero: q + zero)),
+            )
+        for j in range(max(0, k - 1), k):
+            order = np.arange(count)
+            order[[j, k]] = k, j
+            yield (
+                'joints swapped',
+                f'{names[j]} and {names[k]} are swapped',
+                with_(joints(lambda q, order=order: q[:, order])),
+            )
+    for k in range(1, count):
+        for sign in (1.0, -1.0):
+            matrix = np.eye(count)
+            matrix[k, k - 1] = sign
+            yield (
+                'joints coupled',
+                f'{names[k]} is not given against {names[k - 1]}',
+                with_(joints(lambda q, matrix=matrix: q @ matrix.T)),
+            )
+    other = 'modified' if chain.convention == 'standard' else 'standard'
+    yield (
+        'standard and modified DH',
+        f'in the {chain.convention} convention',
+        replace(problem, chain=replace(chain, convention=other, parallel=None)),
+    )
+    if count > 2 and not any(key in chain.name for key in ('wam', 'iiwa')):
+        right = 'franka' if count == 7 else chain.name.partition('_')[0]
+        wrong = 'kuka_iiwa14' if count == 7 else OTHERS[right]
+        yield 'another robot', f'the arm is a {right}', replace(problem, chain=load_chain(wrong))
+    elif 'iiwa' in chain.name:
+        yield 'another robot', 'kuka_iiwa14', replace(problem, chain=load_chain('franka_fr3'))
+    yield 'a row later', 'the measurement that they belong to', mixed_up(problem)
+
+
+def fewer(problem, count):
+    """Return the problem with a part of its rows."""
+
+    def some(each):
+        index = np.linspace(0, len(each) - 1, min(count, len(each))).round().astype(int)
+        return each.select(np.unique(index))
+
+    return changed(problem, some)
+
+
+def typical(problem):
+    """Return the typical error of a problem as it is given [m]."""
+    sets = tuple(each for each in problem.sets if each.distances is None)
+    few = tuple(mistakes._few(each) for each in sets)
+    trial = mistakes._tried(problem.chain, few)
+    if trial is None:
+        return np.inf
+    return min(trial.error, mistakes._polished(problem, trial).error)
+
+
+def verdict(problem, words, clean):
+    """Return what a mistake leads to, in a word, and in a sentence if it is not named."""
+    found = mistakes.explained(problem)
+    if found is None:
+        if typical(problem) < FACTOR * clean:
+            return 'same', ''
+        return 'MISSED', f'{words}: nothing said'
+    said = [each.what for each in found.suspects]
+    if words in said[0]:
+        return 'named', ''
+    if any(words in each for each in said):
+        return 'or', ''
+    return 'OTHER', f'{words}: {"; ".join(said)}'
+
+
+def of_real_robots(only, rows, as_json):
+    """Print which mistakes are named on measured robots, by all rows or some."""
+    table, columns, wrong = {}, [], []
+    for name, session, chain in SETS:
+        column = f'{name.partition("_")[0]} {session}'
+        if only and only not in column:
+            continue
+        problem = problem_of(name, session, chain)
+        problem = fewer(problem, rows) if rows else problem
+        columns.append(column)
+        found = mistakes.explained(problem)
+        table.setdefault('nothing', {})[column] = ['silent' if found is None else str(found)]
+        clean = typical(problem)
+        for group, words, bad in spoilt(problem):
+            cell = table.setdefault(group, {}).setdefault(column, [])
+            if bad is None or (rows and group == 'a row later'):
+                continue
+            word, sentence = verdict(bad, words, clean)
+            cell.append(word)
+            if sentence:
+                wrong.append(f'{column}: {sentence}')
+    if as_json:
+        print(json.dumps({'table': table, 'wrong': wrong}, indent=2))
+        return
+    print(f'| mistake | {" | ".join(columns)} |')
+    print('|---' * (len(columns) + 1) + '|')
+    for group, cells in table.items():
+        texts = []
+        for column in columns:
+            words = cells.get(column, [])
+            counts = {word: words.count(word) for word in dict.fromkeys(words)}
+            one = len(words) == 1
+            texts.append(', '.join(w if one else f'{n} {w}' for w, n in counts.items()) or '-')
+        print(f'| {group} | {" | ".join(texts)} |')
+    for line in wrong:
+        print(line)
+
+
+def clean_set(seed):
+    """Return a simulated problem without any mistake that has a name, and what it is."""
+    rng = np.random.default_rng(seed)
+    names = sorted(shipped_robots())
+    chain = load_chain(names[rng.integers(len(names))])
+    size = 10.0 if rng.random() < 0.33 else 1.0
+    cell = Cell(length_error=5e-4 * size, angle_error=1e-3 * size)
+    count = int(rng.choice([10, 15, 30, 60]))
+    q = chain.random_joints(count, rng)
+    if rng.random() < 0.5:  # about a point, as with a camera or a tracker's line of sight
+        q = q[:1] + rng.uniform(0.1, 0.8) * (q - q[:1])
+    oriented = bool(rng.random() < 0.6)
+    noise = float(rng.choice([2e-5, 2e-4, 1e-3]))
+    seen = measure(faulty(chain, cell, rng), q, rng, noise, 3.0 * noise, oriented)
+    kind = rng.choice(['plain', 'plain', 'gross', 'noise', 'shuffled', 'inverted'])
+    if kind == 'gross':
+        bad = rng.random(count) < rng.uniform(0.05, 0.3)
+        seen.positions[bad] += rng.normal(scale=0.05, size=(int(bad.sum()), 3))
+    elif kind == 'noise':
+        seen = replace(seen, positions=seen.positions + rng.normal(scale=0.2, size=(count, 3)))
+    elif kind == 'shuffled':
+        seen = replace(seen, joints=rng.permutation(seen.joints))
+    elif kind == 'inverted' and oriented:
+        seen = replace(seen.inverted(), inverse=bool(rng.random() < 0.5)).inverted()
+    return Problem(
+        chain, seen
+    ), f'{chain.name}, {count} {"poses" if oriented else "points"}, {kind}'
+
+
+def of_clean_sets(count):
+    """Print how many clean sets have a mistake named; return their number."""
+    alarms = 0
+    begin = time.process_time()
+    for seed in range(count):
+        problem, what = clean_set(seed)
+        found = mistakes.explained(problem)
+        if found is not None:
+            alarms += 1
+            print(f'{seed}: {what}: {found}')
+    each = (time.process_time() - begin) / max(count, 1)
+    print(f'{alarms} false alarms in {count} sets without a mistake, {1e3 * each:.0f} ms each')
+    return alarms
+
+
+def main():
+    """Print the table, or the false alarms."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('--clean', type=int, metavar='N', help='simulated sets without a mistake')
+    parser.add_argument('--only', default='', metavar='SET', help='columns with this in the name')
+    parser.add_argument('--rows', type=int, default=0, help='rows of each set, else all')
+    parser.add_argument('--json', action='store_true')
+    options = parser.parse_args()
+    if options.clean is not None:
+        of_clean_sets(options.clean)
+    else:
+        of_real_robots(options.only, options.rows, options.json)
+
+
+if __name__ == '__main__':
+    main()

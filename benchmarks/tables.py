@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How long a table of measurements takes to read, beside numpy.loadtxt of the same rows.
+
+    python benchmarks/tables.py [--rows 500000] [--json]
+
+CPU time of this process, the best of some runs. `loadtxt` makes one array of the columns of
+numbers and looks at nothing else; `read_table` makes observations of it: sets by session, device,
+target and split, rotations of quaternions, every number within its limits. `foreign` is the same
+table in millimetres and degrees with decimal commas.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Layout
+from calib_ros.files.tables import read_table
+
+JOINTS = 6
+RUNS = 3
+
+
+def tables_of(folder, rows):
+    """Write tables of so many rows; return their paths and columns of numbers by name."""
+    rng = np.random.default_rng(0)
+    joints, positions = rng.uniform(-3.0, 3.0, (rows, JOINTS)), rng.uniform(-2.0, 2.0, (rows, 3))
+    quat = rng.normal(size=(rows, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    names = [f'q{k + 1}' for k in range(JOINTS)]
+    kinds = {
+        'position': ([*names, 'x', 'y', 'z'], np.hstack([joints, positions]), ',', '%.9f'),
+        'pose': (
+            [*names, 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'],
+            np.hstack([joints, positions, quat]),
+            ',',
+            '%.9f',
+        ),
+        'foreign': (
+            [*names, 'x', 'y', 'z'],
+            np.hstack([np.degrees(joints), 1e3 * positions]),
+            ';',
+            '%.6f',
+        ),
+    }
+    for kind, (header, values, separator, form) in kinds.items():
+        path = folder / f'{kind}.csv'
+        with path.open('w') as file:
+            file.write(separator.join(['id', 'split', *header]) + '\n')
+            for k in range(0, rows, 10_000):
+                part = values[k : k + 10_000].tolist()
+                line = separator.join(['%d', 'train', *[form] * len(header)])
+                lines = [line % (k + i, *row) for i, row in enumerate(part)]
+                text = '\n'.join(lines) + '\n'
+                file.write(text.replace('.', ',') if separator == ';' else text)
+        yield kind, path, range(2, 2 + len(header))
+
+
+def cpu(run):
+    """Return the least CPU time [s] of some runs."""
+    best = np.inf
+    for _ in range(RUNS):
+        begin = time.process_time()
+        run()
+        best = min(best, time.process_time() - begin)
+    return best
+
+
+def main():
+    """Print a line for each kind of table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('--rows', type=int, default=500_000)
+    parser.add_argument('--json', action='store_true')
+    options = parser.parse_args()
+    foreign = Foreign(Layout(length='mm', angle='deg', separator='semicolon', decimal=','))
+    found = []
+    with tempfile.TemporaryDirectory() as folder:
+        for kind, path, use in tables_of(Path(folder), options.rows):
+            how = foreign if kind == 'foreign' else None
+            ours = cpu(lambda path=path, how=how: read_table(path, JOINTS, foreign=how))
+            plain = path
+            if kind == 'foreign':
+                plain = path.with_name('plain.csv')
+                plain.write_text(path.read_text().replace(',', '.').replace(';', ','))
+            theirs = cpu(
+                lambda plain=plain, use=use: np.loadtxt(
+                    plain, delimiter=',', skiprows=1, usecols=use
+                )
+            )
+            row = {'table': kind, 'rows': options.rows, 'read_table_s': ours, 'loadtxt_s': theirs}
+            found.append(row | {'ratio': ours / theirs})
+            if not options.json:
+                print(
+                    f'{kind:9} {options.rows} rows: read_table {ours:.2f} s, loadtxt {theirs:.2f} '
+                    f's, ratio {ours / theirs:.2f}'
+                )
+    if options.json:
+        print(json.dumps(found, indent=2))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,492 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""From a table that others have written to the columns of ours, described in docs/tables.md.
+
+Rotations. XYZ are turns about the axes as turned before, R = Rx(r1) Ry(r2) Rz(r3); xyz about fixed
+ones, which is ZYX in the other order. Standard deviations s of Euler angles make the covariance
+J diag(s^2) J' of the rotation about the device's axes: the columns of J are the axes about which
+the angles turn, e1, R1 e2, R1 R2 e3. For a rotation vector v it is J_l(v), for quaternions the
+standard deviations are those about the device's axes.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.bulk import COVARIANCE, UPPER
+from calib_ros.files.columns import MadeColumns
+from calib_ros.files.layouts import (
+    ANGLES,
+    IN_TURN,
+    LENGTHS,
+    NUMBERS,
+    POSITION,
+    QUATERNION,
+    SIGMAS,
+    TURNS,
+    WORDS,
+    Expression,
+    Layout,
+)
+from calib_ros.files.sheets import Sheet, read_sheet
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.values import QUATERNION_TOLERANCE
+
+MEASURED = (*POSITION, 'distance')
+UNITS = {
+    'millimeters': 'mm',
+    'centimeters': 'cm',
+    'meters': 'm',
+    'micrometers': 'um',
+    'inches': 'in',
+    **{unit: unit for unit in LENGTHS},
+}
+MOST_LINES = 5
+"""Lines that a note names."""
+
+
+def refuse_separator(path: Path, header: Sequence[str]) -> None:
+    """Say how to read a table whose cells are not separated by commas."""
+    for name, mark in (('semicolon', ';'), ('tab', '\t')):
+        if any(mark in cell for cell in header):
+            raise InputError(
+                f'the cells of {path} are separated by {name}s: give --separator {name} (and, '
+                'where they differ, --decimal comma, --columns, --length, --angle), or convert it '
+                'with calib_ros import'
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Foreign:
+    """How to read a table of others, and the log of joint values beside it, if that is another.
+
+    `chain` gives the number of joints, their names, and which are prismatic. Without it, it is as
+    many as there are columns for them, all revolute.
+    """
+
+    layout: Layout
+    chain: Chain | None = None
+    log: Path | None = None
+    log_layout: Layout = field(default_factory=Layout)
+
+    def convert(self, path: Path) -> tuple[MadeColumns, tuple[str, ...]]:
+        """Return our columns of a table, and what was guessed and left out, in words."""
+        table = _Table(path, self.layout, self.chain, self.log is None)
+        values, words, lines = table.values(), table.words(), table.lines
+        notes = table.notes
+        if self.log is not None:
+            log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
+            joints = log.values()
+            if len(log.lines) != len(lines):
+                raise InputError(
+                    f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: each '
+                    'measurement needs the row of its joint values'
+                )
+            values = {**joints, **values}
+            notes += [*log.notes, f'row by row, {self.log} holds the joint values of {path}']
+        made = MadeColumns(lines, values, words)
+        if self.layout.shift:
+            made = _shifted(made, self.layout.shift)
+        made, left_out = _measured_only(made)
+        if left_out:
+            notes.append(left_out)
+        return _finished(made, self.layout, path), tuple(f'{path}: {note}' for note in notes)
+
+
+def as_csv(columns: MadeColumns) -> str:
+    """Return the text of a table; numbers are exact."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator='\n')
+    names = sorted(columns.header, key=_place)
+    writer.writerow(names)
+    writer.writerows(zip(*(columns.texts(name) for name in names), strict=True))
+    return out.getvalue()
+
+
+def _place(name: str) -> tuple[int, int]:
+    letter, digits = name[0], name[1:]
+    if letter in 'qsva' and digits.isdigit():
+        return 1 + 'qsva'.index(letter), int(digits)
+    order = ('session', 'split', 'stamp_ns', *POSITION, *QUATERNION, 'distance', *COVARIANCE)
+    rank = order.index(name) if name in order else len(order)
+    return (0 if rank < 3 else 5), rank
+
+
+class _Table:
+    """One table while it is converted."""
+
+    def __init__(
+        self, path: Path, layout: Layout, chain: Chain | None, joints: bool, alone: bool = False
+    ) -> None:
+        self._path, self._layout, self._chain = path, layout, chain
+        most = 50 if chain is None else len(chain.joints)
+        self._ours = {
+            ours: theirs
+            for ours, theirs in layout.columns.items()
+            if not (ours[1:].isdigit() and ours[0] in 'qsva' and int(ours[1:]) > most)
+            and (joints or not re.fullmatch('[qsva][0-9]+', ours))
+            and (not alone or re.fullmatch('[qsva][0-9]+', ours))
+        }
+        expressions = {
+            ours: Expression.parse(theirs)
+            for ours, theirs in self._ours.items()
+            if ours not in WORDS
+        }
+        self._optional = {
+            name
+            for ours, each in expressions.items()
+            if chain is None and re.fullmatch('[qsva][0-9]+', ours)
+            for name in each.names
+        }
+        needed = [n for each in expressions.values() for n in each.names]
+        needed += [_bare(self._ours[ours]) for ours in WORDS if ours in self._ours]
+        if chain is None:
+            first = expressions.get('q1')
+            firsts = set() if first is None else set(first.names)
+            needed = [n for n in needed if n not in self._optional or n in firsts]
+        own = _own_names(chain, joints, alone)
+        self._sheet: Sheet = read_sheet(path, layout, list(dict.fromkeys(needed)), list(own))
+        self.notes = list(self._sheet.notes)
+        self._expressions = self._completed(expressions, own)
+        self.lines = self._sheet.columns.lines
+
+    def _completed(
+        self, expressions: dict[str, Expression], own: dict[str, str]
+    ) -> dict[str, Expression]:
+        """Return the expressions with what the header calls by our names, or the chain's."""
+        kept = {}
+        absent = []
+        for ours, each in expressions.items():
+            missing = [name for name in each.names if self._sheet.number(name) is None]
+            if not missing:
+                kept[ours] = each
+            elif not set(missing) <= self._optional:
+                raise InputError(
+                    f'{self._path} has no column {", ".join(missing)} for {ours}; it has '
+                    f'{", ".join(each for each in self._sheet.header if each)}'
+                )
+            else:
+                absent.append(f'{ours} ({", ".join(missing)})')
+        if 0 < len(absent) <= MOST_LINES:  # `q*=A*` stands for as many as there are
+            self.notes.append(f'it has no {", ".join(absent)}: left out')
+        lower = [name.lower() for name in self._sheet.header]
+        guessed = []
+        for name, ours in own.items():
+            if ours in kept or ours in self._ours or lower.count(name.lower()) != 1:
+                continue
+            if ours in WORDS:
+                self._ours[ours] = f'#{lower.index(name.lower()) + 1}'
+                continue
+            kept[ours] = Expression.parse(f'#{lower.index(name.lower()) + 1}')
+            if name != ours:
+                guessed.append(f'{ours} = {name}')
+        if guessed:
+            self.notes.append(f'by the names of the joints, {", ".join(guessed)}')
+        if self._chain is not None and any(re.fullmatch('q[0-9]+', ours) for ours in kept):
+            missing = [
+                f'q{k + 1}' for k in range(len(self._chain.joints)) if f'q{k + 1}' not in kept
+            ]
+            if missing:
+                raise InputError(
+                    f'{self._path} has no column for {", ".join(missing)}: name it by --columns '
+                    f'{missing[0]}=NAME; it has '
+                    f'{", ".join(each for each in self._sheet.header if each)}'
+                )
+        return kept
+
+    def words(self) -> dict[str, list[str]]:
+        """Return the texts that are taken over."""
+        found = {}
+        for ours in WORDS:
+            if ours in self._ours:
+                number = self._sheet.number(_bare(self._ours[ours]))
+                assert number is not None
+                found[ours] = self._sheet.columns.texts(number)
+        return found
+
+    def values(self) -> dict[str, FloatArray]:
+        """Return our columns in m and rad."""
+        names = list(dict.fromkeys(n for each in self._expressions.values() for n in each.names))
+        numbers = [self._sheet.number(name) for name in names]
+        ids = [each for each in numbers if each is not None]
+        read = self._sheet.columns.numbers(ids) if ids else np.zeros((len(self.lines), 0))
+        if read is None:
+            self._refuse(names, ids)
+        assert read is not None
+        columns = dict(zip(names, read.T, strict=True))
+        units = self._units()
+        found = {}
+        for ours, each in self._expressions.items():
+            value = np.broadcast_to(each.of(columns), len(self.lines)) * self._factor(ours, units)
+            if np.isinf(value).any():
+                line = self.lines[int(np.argmax(np.isinf(value)))]
+                raise InputError(f'{self._path}, line {line}: {ours} = {each.text} is infinite')
+            found[ours] = value
+        return found
+
+    def _refuse(self, names: Sequence[str], ids: Sequence[str]) -> None:
+        """Name the first cell that is no number."""
+        for name, number in zip(names, ids, strict=True):
+            for line, cell in zip(self.lines, self._sheet.columns.texts(number), strict=True):
+                try:
+                    good = not cell or bool(np.isfinite(float(cell)))
+                except ValueError:
+                    good = False
+                if not good:
+                    raise InputError(
+                        f'{self._path}, line {line}: {name} must be a number, not {cell!r}'
+                    )
+        raise InputError(f'{self._path}: a number in {", ".join(names)} cannot be read')
+
+    def _units(self) -> tuple[str, str, str]:
+        """Return the units of lengths, angles and joint values."""
+        layout = self._layout
+        length, angle = layout.length, layout.angle
+        for cells in self._sheet.above:
+            if 'Length Units' in cells[:-1]:
+                unit = UNITS.get(cells[cells.index('Length Units') + 1].lower(), '')
+                if unit and unit != length:
+                    self.notes.append(f'lengths are in {unit}, as its head says')
+                length = unit or length
+        names = set(self._expressions)
+        assumed = []
+        if not length and names & {*POSITION, 'distance'}:
+            assumed.append('lengths in m (--length)')
+        if not angle and names & {*TURNS, *IN_TURN}:
+            assumed.append('angles in rad (--angle)')
+        joint = layout.joint_angle or angle
+        if not joint and 'q1' in names:
+            assumed.append('joint values in rad (--joint-angle)')
+        if assumed:
+            self.notes.append(f'units are not given, taken are {", ".join(assumed)}')
+        return length or 'm', angle or 'rad', joint or 'rad'
+
+    def _factor(self, ours: str, units: tuple[str, str, str]) -> float:
+        length, angle, joint = LENGTHS[units[0]], ANGLES[units[1]], ANGLES[units[2]]
+        if ours in (*POSITION, 'distance', *SIGMAS[:3]):
+            return length
+        if ours in (*TURNS, *IN_TURN, *SIGMAS[3:]):
+            return 1.0 if self._layout.rotation_vector and not self._layout.angle else angle
+        if ours[0] in 'qva' and ours[1:].isdigit():
+            chain = self._chain
+            prismatic = chain is not None and chain.joints[int(ours[1:]) - 1].type == 'prismatic'
+            return length if prismatic else joint
+        return 1.0
+
+
+def _bare(name: str) -> str:
+    return name[1:-1] if name.startswith('{') and name.endswith('}') else name
+
+
+def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]:
+    """Return what each name in a header stands for when nothing is said."""
+    found: dict[str, str] = {}
+    if joints:
+        count = 50 if chain is None else len(chain.joints)
+        found = {f'{letter}{k}': f'{letter}{k}' for letter in 'qsva' for k in range(1, count + 1)}
+        if chain is not None:
+            found |= {name: f'q{k + 1}' for k, name in enumerate(chain.joint_names)}
+    if not alone:
+        found |= {name: name for name in (*NUMBERS, *WORDS) if name not in TURNS + IN_TURN}
+        found |= {name: name for name in TURNS + IN_TURN}
+    return found
+
+
+def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
+    """Return the columns with each measurement beside the joint values so many rows below."""
+    count = len(made.lines)
+    if abs(shift) >= count:
+        raise ConfigError(f'--shift {shift} leaves none of {count} rows')
+    here = slice(max(0, -shift), count - max(0, shift))
+    there = slice(max(0, shift), count - max(0, -shift))
+    moved = {
+        name: value[there if name[0] in 'qsva' and name[1:].isdigit() else here]
+        for name, value in made.values.items()
+    }
+    return MadeColumns(made.lines[here], moved, {k: v[here] for k, v in made.words.items()})
+
+
+def _measured_only(made: MadeColumns) -> tuple[MadeColumns, str]:
+    """Return the rows in which anything was measured, and what is left out, in words."""
+    measured = [made.values[name] for name in MEASURED if name in made.values]
+    if not measured:
+        return made, ''
+    good = ~np.isnan(np.column_stack(measured)).all(axis=1)
+    if good.all():
+        return made, ''
+    kept: list[bool] = np.asarray(good).tolist()
+    lines = made.lines[~good].tolist()
+    shown = ', '.join(map(str, lines[:MOST_LINES]))
+    more = f' and {len(lines) - MOST_LINES} more' if len(lines) > MOST_LINES else ''
+    values = {name: value[good] for name, value in made.values.items()}
+    words = {
+        name: [word for word, keep in zip(texts, kept, strict=True) if keep]
+        for name, texts in made.words.items()
+    }
+    return (
+        MadeColumns(made.lines[good], values, words),
+        f'nothing was measured in line{"s" if len(lines) > 1 else ""} {shown}{more}: left out',
+    )
+
+
+def _finished(made: MadeColumns, layout: Layout, path: Path) -> MadeColumns:
+    """Return the columns with quaternions for rotations, covariances for standard deviations."""
+    values, words = dict(made.values), dict(made.words)
+    time = values.pop('time', None)
+    if time is not None:
+        if np.isnan(time).any() or np.abs(time).max(initial=0.0) > 9e9:
+            line = made.lines[int(np.argmax(~(np.abs(time) <= 9e9)))]
+            raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
+        words['stamp_ns'] = [str(round(each * 1e9)) for each in time.tolist()]
+    rotation, axes = _rotations(values, layout, path, made)
+    sigmas = [values.pop(name, None) for name in SIGMAS]
+    for name in (*TURNS, *IN_TURN):
+        values.pop(name, None)
+    covariance = _covariance(sigmas, axes, path)
+    if layout.inverse:
+        if rotation is None or not set(POSITION) <= set(values):
+            raise ConfigError('--inverse needs poses with their rotations')
+        given = np.column_stack([values[name] for name in POSITION])
+        count = len(made.lines)
+        turned = Observations(
+            np.arange(count),
+            np.zeros((count, 1)),
+            given,
+            rotation,
+            np.ones(count, bool),
+            covariance,
+        ).inverted()
+        values |= dict(zip(POSITION, turned.positions.T, strict=True))
+        rotation, covariance = turned.rotations, turned.covariance
+    if rotation is not None:
+        values |= dict(zip(QUATERNION, se3.to_quat(rotation).T, strict=True))
+    if covariance is not None:
+        rows, columns = np.transpose(UPPER)
+        values |= dict(zip(COVARIANCE, covariance[:, rows, columns].T, strict=True))
+    return MadeColumns(made.lines, values, words)
+
+
+def _rotations(
+    values: dict[str, FloatArray], layout: Layout, path: Path, made: MadeColumns
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns that standard deviations are
+    about; None where there are none.
+    """
+    if set(QUATERNION) & set(values):
+        return _from_quaternions(values, layout, path, made)
+    three = [name for name in (TURNS, IN_TURN) if set(name) & set(values)]
+    if not three:
+        for name in ('euler', 'rotation_vector', 'quaternion'):
+            if getattr(layout, name):
+                raise ConfigError(
+                    f'{path}: {name.replace("_", " ")} is given, but no columns: --columns '
+                    'rx=NAME,ry=NAME,rz=NAME (or qx, qy, qz, qw)'
+                )
+        return None, None
+    names = three[0]
+    missing = [name for name in names if name not in values]
+    if missing or len(three) > 1:
+        raise ConfigError(f'{path}: give rx, ry, rz or r1, r2, r3, all three; missing {missing}')
+    angles = np.column_stack([values[name] for name in names])
+    _require_whole(angles, path, made, ', '.join(names))
+    if layout.rotation_vector:
+        rotation = se3.exp_rotation(angles)
+        return rotation, _left_jacobians(angles)
+    if not layout.euler:
+        raise ConfigError(
+            f'{path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, zyx, ...) or '
+            '--rotation-vector'
+        )
+    letters = layout.euler
+    if names == TURNS:
+        if len(set(letters.upper())) < 3:
+            raise ConfigError(
+                f'with --euler {letters} an axis comes twice: give r1, r2, r3 in its order'
+            )
+        angles = angles[:, ['XYZ'.index(letter) for letter in letters.upper()]]
+    axes = np.zeros((len(angles), 3, 3))
+    turned = np.tile(np.eye(3), (len(angles), 1, 1))
+    order = range(3) if letters.isupper() else range(2, -1, -1)
+    for k in order:
+        unit = 'XYZ'.index(letters[k].upper())
+        axes[:, :, k] = turned[:, :, unit]
+        step = Rotation.from_rotvec(np.eye(3)[unit] * angles[:, k, np.newaxis]).as_matrix()
+        turned = turned @ step
+    if names == TURNS:  # columns in the order of rx, ry, rz
+        axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
+    return turned, axes
+
+
+def _from_quaternions(
+    values: dict[str, FloatArray], layout: Layout, path: Path, made: MadeColumns
+) -> tuple[FloatArray, FloatArray]:
+    """Return rotations, and the device's axes."""
+    missing = [name for name in QUATERNION if name not in values]
+    if missing:
+        raise ConfigError(f'{path}: a quaternion has four columns, missing {", ".join(missing)}')
+    quat = np.column_stack([values[name] for name in QUATERNION])
+    if layout.quaternion == 'wxyz':
+        quat = quat[:, [1, 2, 3, 0]]
+    _require_whole(quat, path, made, 'qx, qy, qz, qw')
+    length = np.linalg.norm(quat, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if len(wrong):
+        raise InputError(
+            f'{path}, line {made.lines[wrong[0]]}: quaternion qx qy qz qw has length '
+            f'{length[wrong[0]]:.6g}, expected 1'
+        )
+    return se3.from_quat(quat), np.tile(np.eye(3), (len(quat), 1, 1))
+
+
+def _require_whole(values: FloatArray, path: Path, made: MadeColumns, names: str) -> None:
+    nothing = np.isnan(values).any(axis=1)
+    if nothing.any():
+        line = made.lines[int(np.argmax(nothing))]
+        raise InputError(f'{path}, line {line}: {names} must be numbers, not blank')
+
+
+def _left_jacobians(vectors: FloatArray) -> FloatArray:
+    """Return J_l(v) (N, 3, 3) of rotation vectors (N, 3) (Chirikjian 2012)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, np.newaxis, np.newaxis]
+    cross = se3.skew(vectors)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
+
+
+def _covariance(
+    sigmas: Sequence[FloatArray | None], axes: FloatArray | None, path: Path
+) -> FloatArray | None:
+    """Return covariances (N, 6, 6) of standard deviations (N,); None where there are none."""
+    place = sigmas[:3]
+    if all(each is None for each in sigmas):
+        return None
+    if any(each is None for each in place):
+        raise ConfigError(f'{path}: standard deviations need sx, sy and sz')
+    turn = [each for each in sigmas[3:] if each is not None]
+    if turn and (len(turn) < 3 or axes is None):
+        raise ConfigError(
+            f'{path}: standard deviations of rotations need srx, sry, srz, and rotations'
+        )
+    position = np.column_stack([each for each in place if each is not None])
+    found = np.zeros((len(position), 6, 6))
+    found[:, :3, :3] = np.square(position)[:, :, np.newaxis] * np.eye(3)
+    if turn:
+        assert axes is not None
+        scaled = axes * np.column_stack(turn)[:, np.newaxis, :]
+        found[:, 3:, 3:] = scaled @ np.swapaxes(scaled, 1, 2)
+    return found

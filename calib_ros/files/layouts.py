@@ -1,0 +1,274 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How a table that others have written is laid out, described in docs/tables.md.
+
+A layout says which of their columns make ours (q1, x, qw ...), as expressions, in which units, and
+how rotations are written. Presets are layouts in YAML files; a user's own goes by its path.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics.chain_file import shared_files
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import parse_yaml, read_text
+
+LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
+"""Metres in units of length."""
+ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}
+"""Radians in units of angle."""
+SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
+POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
+TURNS = ('rx', 'ry', 'rz')
+"""Angles about x, y, z of three different letters, or a rotation vector."""
+IN_TURN = ('r1', 'r2', 'r3')
+"""Euler angles in the order of the letters."""
+SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
+"""Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
+WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')
+"""Texts that are taken over."""
+NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
+MOST_COLUMNS_GIVEN = 400
+LONGEST = 200
+"""Characters of an expression."""
+UNREADABLE = (
+    '"{}" is no expression of columns: give names, {{names with blanks}} or numbers of columns '
+    '(#7) with + - * / and brackets'
+)
+TOKEN = re.compile(
+    r'\s*(?:\{([^{}]+)\}|#([0-9]+)|((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)'
+    r'|([^\W\d]\w*(?:\.\w+)*)|([-+*/()]))\s*'
+)
+"""{any name}, #7 (a column by its number), a number, a plain name, or a sign."""
+
+
+@dataclass(frozen=True)
+class Expression:
+    """A sum, difference, product or quotient of columns and numbers."""
+
+    text: str
+    names: tuple[str, ...]
+    """Columns by their names; `#7` is the seventh."""
+    tree: ast.expr
+
+    @classmethod
+    def parse(cls, text: str) -> Expression:
+        """Read an expression."""
+        names: list[str] = []
+        code, at = '', 0
+        while at < len(text):
+            match = TOKEN.match(text, at)
+            if match is None or len(text) > LONGEST:
+                raise ConfigError(UNREADABLE.format(text))
+            braced, column, number, plain, sign = match.groups()
+            name = braced or plain or (f'#{column}' if column else '')
+            if name and name not in names:
+                names.append(name)
+            code += f' _{names.index(name)} ' if name else number or sign
+            at = match.end()
+        try:
+            tree = ast.parse(code.strip(), mode='eval').body
+            _check(tree)
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as err:
+            raise ConfigError(UNREADABLE.format(text)) from err
+        return cls(text, tuple(names), tree)
+
+    def of(self, columns: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the value (N,) for columns (N,) by name."""
+        with np.errstate(all='ignore'):
+            return np.asarray(_value(self.tree, [columns[name] for name in self.names]))
+
+
+def _check(tree: ast.expr) -> None:
+    if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Add | ast.Sub | ast.Mult | ast.Div):
+        _check(tree.left)
+        _check(tree.right)
+    elif isinstance(tree, ast.UnaryOp) and isinstance(tree.op, ast.UAdd | ast.USub):
+        _check(tree.operand)
+    elif isinstance(tree, ast.Constant):
+        if not isinstance(tree.value, int | float) or isinstance(tree.value, bool):
+            raise ValueError(tree.value)
+    elif not (isinstance(tree, ast.Name) and re.fullmatch('_[0-9]+', tree.id)):
+        raise ValueError(type(tree).__name__)
+
+
+def _value(tree: ast.expr, columns: Sequence[FloatArray]) -> Any:
+    if isinstance(tree, ast.BinOp):
+        left, right = _value(tree.left, columns), _value(tree.right, columns)
+        if isinstance(tree.op, ast.Add):
+            return left + right
+        if isinstance(tree.op, ast.Sub):
+            return left - right
+        return left * right if isinstance(tree.op, ast.Mult) else np.true_divide(left, right)
+    if isinstance(tree, ast.UnaryOp):
+        value = _value(tree.operand, columns)
+        return -value if isinstance(tree.op, ast.USub) else value
+    if isinstance(tree, ast.Constant):
+        return np.float64(float(str(tree.value)))
+    assert isinstance(tree, ast.Name)
+    return columns[int(tree.id[1:])]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How a table is laid out.
+
+    Attributes
+    ----------
+    description, source : str
+        What it is of, and where its form is documented.
+    separator : str
+        Between cells: comma, semicolon, tab or space; guessed when empty.
+    decimal : str
+        '.' or ','; guessed when empty.
+    columns : mapping of str to str
+        Our columns as expressions of theirs.
+    length, angle, joint_angle : str
+        Units of lengths, of Euler angles and rotation vectors, and of joint values.
+    euler : str
+        Letters of the axes: XYZ turned about in turn (intrinsic), xyz fixed ones (extrinsic).
+    quaternion : str
+        Order of the four columns qx qy qz qw, xyzw or wxyz.
+    rotation_vector : bool
+        rx ry rz are a rotation vector.
+    inverse : bool
+        The poses are those of the device in the target's frame.
+    shift : int
+        Joint values stand so many rows below the measurement that they belong to.
+    comment : str
+        How lines begin that say nothing.
+    sheet : str
+        Of a workbook; the first one when empty.
+
+    """
+
+    description: str = ''
+    source: str = ''
+    separator: str = ''
+    decimal: str = ''
+    columns: Mapping[str, str] = field(default_factory=dict)
+    length: str = ''
+    angle: str = ''
+    joint_angle: str = ''
+    euler: str = ''
+    quaternion: str = ''
+    rotation_vector: bool = False
+    inverse: bool = False
+    shift: int = 0
+    comment: str = ''
+    sheet: str = ''
+
+    def __post_init__(self) -> None:
+        """Refuse what no table is like."""
+        for item in fields(self):
+            kind = {'bool': bool, 'int': int, 'str': str}.get(str(item.type))
+            value = getattr(self, item.name)
+            if kind is not None and (
+                not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool)
+            ):
+                raise ConfigError(
+                    f'"{item.name}" of a layout must be a {item.type}, not {value!r}'
+                )
+        for name, known in (
+            ('separator', (*SEPARATORS, *SEPARATORS.values())),
+            ('decimal', ('.', ',')),
+            ('length', LENGTHS),
+            ('angle', ANGLES),
+            ('joint_angle', ANGLES),
+            ('quaternion', ('xyzw', 'wxyz')),
+        ):
+            value = getattr(self, name)
+            if value and value not in known:
+                raise UnknownNameError(name.replace('_', ' '), value, tuple(known))
+        letters = self.euler.upper()
+        if self.euler and (
+            not re.fullmatch('[XYZ]{3}|[xyz]{3}', self.euler)
+            or letters[0] == letters[1]
+            or letters[1] == letters[2]
+        ):
+            raise ConfigError(
+                f'Euler angles must be three axes, ZYX (each about the axis as turned before) or '
+                f'zyx (about fixed axes), not "{self.euler}"'
+            )
+        ways = [name for name in ('euler', 'quaternion', 'rotation_vector') if getattr(self, name)]
+        if len(ways) > 1:
+            raise ConfigError(f'rotations are written one way: give {" or ".join(ways)}')
+        if self.decimal == ',' and self.cut == ',':
+            raise ConfigError('cells cannot be separated by commas that are decimal ones as well')
+        if not isinstance(self.columns, Mapping) or len(self.columns) > MOST_COLUMNS_GIVEN:
+            raise ConfigError(
+                '"columns" of a layout must map our columns to expressions of theirs'
+            )
+        for name in self.columns:
+            if name not in (*NUMBERS, *WORDS) and not re.fullmatch('[qsva][0-9]+', name):
+                raise UnknownNameError('column', name, ('q1', *NUMBERS, *WORDS))
+
+    @property
+    def cut(self) -> str:
+        """Return the character between cells, empty where it is to be guessed."""
+        return SEPARATORS.get(self.separator, self.separator)
+
+
+def presets() -> dict[str, Path]:
+    """Return the layouts that come with calib_ros, by name."""
+    return shared_files('tables')
+
+
+def load_layout(name_or_path: str) -> Layout:
+    """Return a preset, or the layout in a YAML file of the user's."""
+    path = Path(name_or_path)
+    if path.suffix not in ('.yaml', '.yml'):
+        known = presets()
+        if name_or_path not in known:
+            raise UnknownNameError('preset (or path of a .yaml)', name_or_path, sorted(known))
+        path = known[name_or_path]
+    content = parse_yaml(read_text(path), str(path))
+    if not isinstance(content, dict):
+        raise ConfigError(f'{path} must be a mapping of the keys of a layout')
+    known_keys = [item.name for item in fields(Layout)]
+    for key, value in content.items():
+        if key not in known_keys:
+            raise UnknownNameError(f'key in {path}', str(key), known_keys)
+        if key == 'columns' and isinstance(value, dict):
+            content[key] = {str(k): str(v) for k, v in value.items()}
+    try:
+        return Layout(**content)
+    except ConfigError as err:
+        raise ConfigError(f'{path}: {err}') from err
+
+
+def parse_columns(text: str) -> dict[str, str]:
+    """Return the columns of `q1=A1,x={Pos X},...`; `q*=A*` stands for all joints up to 50."""
+    found: dict[str, str] = {}
+    for part in re.split(r',(?![^{]*\})', text):
+        ours, equals, theirs = part.partition('=')
+        ours, theirs = ours.strip(), theirs.strip()
+        if not equals or not ours or not theirs:
+            raise ConfigError(f'columns are given as OURS=THEIRS,..., not "{part.strip()}"')
+        if re.fullmatch(r'[qsva]\*', ours):
+            found |= {f'{ours[0]}{k}': theirs.replace('*', str(k)) for k in range(1, 51)}
+        else:
+            found[ours] = theirs
+    return found
+
+
+def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> Layout:
+    """Return the layout of a preset, if any, with what was given on top."""
+    layout = load_layout(preset) if preset else Layout()
+    changes = {name: value for name, value in given.items() if value}
+    for name in ('euler', 'quaternion', 'rotation_vector'):
+        if name in changes:  # instead of the preset's way
+            layout = replace(layout, euler='', quaternion='', rotation_vector=False)
+    merged = dict(layout.columns)
+    for text in columns:
+        merged |= parse_columns(text)
+    return replace(layout, columns=merged, **changes)

@@ -1,0 +1,303 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of others as text in columns: files and workbooks, whatever is above their rows.
+
+What is guessed (the coding, the separator, the decimal sign, the line of the header) is said.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib_ros.errors import InputError
+from calib_ros.files.columns import TextColumns, regular
+from calib_ros.files.layouts import SEPARATORS, Layout
+from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, read_bytes
+
+ABOVE = 100
+"""Lines above the header at most."""
+UNDER = 3
+"""Lines between the header and the first row at most: units."""
+SAMPLE = 30
+"""Lines by which separators are guessed."""
+SEPARATOR = '\x1f'
+"""Between cells that are no regular text."""
+LARGEST_SHEET = 300_000_000
+"""Bytes of a workbook unpacked."""
+SHEETS = ('.xlsx', '.xlsm')
+DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """The rows of a table, their columns named `#1`, `#2` and so on.
+
+    `header` are the names that the table gives them, `above` the cells of the lines before.
+    """
+
+    header: tuple[str, ...]
+    above: tuple[tuple[str, ...], ...]
+    columns: TextColumns
+    notes: tuple[str, ...]
+
+    def number(self, name: str) -> str | None:
+        """Return `#k` of a column by its name, None where there is none of that name."""
+        if name.startswith('#'):
+            return name if 0 < int(name[1:]) <= len(self.header) else None
+        count = self.header.count(name)
+        if count > 1:
+            where = [k + 1 for k, each in enumerate(self.header) if each == name]
+            shown = ', '.join(f'#{k}' for k in where[:5])
+            raise InputError(
+                f'column "{name}" comes {count} times: name it by its number ({shown})'
+            )
+        return f'#{self.header.index(name) + 1}' if count else None
+
+
+def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
+    """Read a table.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    layout : Layout
+        What is known of it.
+    names : sequence of str
+        Columns by which the header is found: the first line that has all of them.
+    known : sequence of str
+        Where `names` holds none but numbers of columns: names by which to know a header.
+
+    """
+    notes: list[str] = []
+    if path.suffix.lower() in SHEETS:
+        rows = _workbook(path, layout.sheet)
+        text, separator = '', SEPARATOR
+    else:
+        text, coding = _text(path)
+        if coding:
+            notes.append(f'the text is taken for {coding}')
+        if '\r' in text:
+            text = text.replace('\r\n', '\n').replace('\r', '\n')
+        if layout.comment:
+            text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
+        separator = layout.cut or _separator(path, text, notes)
+        if separator == ' ':
+            text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
+            text = re.sub(r'[ \t]+', ' ', text)
+        rows = _cells(path, '\n'.join(text.split('\n', ABOVE + SAMPLE)[:-1] or [text]), separator)
+    decimal = layout.decimal or _decimal(rows, separator, notes)
+    at, header = _header(path, rows, names, known)
+    used = [header.index(n) for n in names if not n.startswith('#') and n in header]
+    used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
+    first = _first(path, rows, at, used, decimal, notes)
+    width = len(rows[first][1])
+    if not header:
+        header = ('',) * width
+    above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
+    columns = None
+    start = rows[first][0]
+    if text:
+        body = text.split('\n', start - 1)[-1]
+        if decimal == ',':
+            body = body.replace(',', '.')
+        numbers = [f'#{k + 1}' for k in range(width)]
+        columns = regular(body, separator, numbers, start - 1)
+        if columns is None:
+            rows = _cells(path, text, separator)
+            first = next(k for k, (line, _) in enumerate(rows) if line >= start)
+    if columns is None:
+        columns = _ragged(path, rows[first:], max(width, len(header)), decimal)
+    header = (*header, *[''] * (len(columns.header) - len(header)))
+    return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
+
+
+def _text(path: Path) -> tuple[str, str]:
+    """Return the text of a file, and what coding it was taken for if that was a guess."""
+    data = read_bytes(path, LARGEST_TABLE, InputError)
+    if data[:2] in (b'\xff\xfe', b'\xfe\xff'):
+        try:
+            return data.decode('utf-16'), ''
+        except UnicodeDecodeError as err:
+            raise InputError(f'cannot read {path}: {err}') from err
+    try:
+        return data.decode('utf-8-sig'), ''
+    except UnicodeDecodeError:
+        pass
+    if b'\0' in data:
+        raise InputError(f'cannot read {path}: it is no text, and no workbook by its name (.xlsx)')
+    return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is no UTF-8'
+
+
+def _workbook(path: Path, name: str) -> list[tuple[int, list[str]]]:
+    """Return the rows of a sheet of a workbook with their numbers."""
+    try:
+        import openpyxl
+    except ImportError as err:
+        raise InputError(
+            f'{path} is a workbook, which needs openpyxl: pip install "calib_ros[xlsx]", or save '
+            'it as CSV'
+        ) from err
+    try:
+        with zipfile.ZipFile(path) as packed:
+            size = sum(each.file_size for each in packed.infolist())
+        if size > LARGEST_SHEET:
+            raise InputError(f'{path} is larger than {LARGEST_SHEET // 10**6} MB when unpacked')
+        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+        if name and name not in book.sheetnames:
+            raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(book.sheetnames)}')
+        sheet = book[name] if name else book.worksheets[0]
+        rows = []
+        for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
+            if len(row) > MOST_COLUMNS:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_COLUMNS}')
+            cells = [_cell(value) for value in row]
+            if any(cells):
+                rows.append((number, cells))
+        book.close()
+    except InputError:
+        raise
+    except Exception as err:  # a broken workbook fails in many ways
+        raise InputError(f'cannot read {path}: {" ".join(str(err).split())}') from err
+    if not rows:
+        raise InputError(f'{path} has no rows')
+    return rows
+
+
+def _cell(value: object) -> str:
+    """Return a cell of a workbook as text; numbers are exact."""
+    if value is None:
+        return ''
+    if isinstance(value, bool):
+        return str(int(value))
+    text = repr(value) if isinstance(value, float) else str(value)
+    return ' '.join(text.replace(SEPARATOR, ' ').split())
+
+
+def _separator(path: Path, text: str, notes: list[str]) -> str:
+    """Return the separator by which most lines have the same number of cells, more than one."""
+    lines = [line for line in text.split('\n', ABOVE + SAMPLE)[: ABOVE + SAMPLE] if line.strip()]
+    lines = lines[-SAMPLE:]
+    if not lines:
+        raise InputError(f'{path} has no rows')
+    best, most = ',', 0
+    for mark in ('\t', ';', ',', ' '):
+        counts = [
+            len(re.split(' +', line.strip())) if mark == ' ' else line.count(mark) + 1
+            for line in lines
+        ]
+        usual = max(set(counts), key=counts.count)
+        agreed = counts.count(usual) if usual > 1 else 0
+        if agreed > 1.2 * most:
+            best, most = mark, agreed
+    name = next(name for name, mark in SEPARATORS.items() if mark == best)
+    if best != ',':
+        notes.append(f'cells are separated by {name}s (--separator)')
+    return best
+
+
+def _decimal(rows: Sequence[tuple[int, Sequence[str]]], separator: str, notes: list[str]) -> str:
+    """Return the decimal sign of the numbers."""
+    if separator == ',':
+        return '.'
+    if any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells):
+        notes.append('numbers have decimal commas (--decimal)')
+        return ','
+    return '.'
+
+
+def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:
+    """Return the cells of all lines that hold any, with the numbers of the lines."""
+    reader = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
+    try:
+        found = []
+        for row in reader:
+            if len(row) > MOST_COLUMNS:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_COLUMNS}')
+            if any(cell.strip() for cell in row):
+                cells = [' '.join(cell.replace(SEPARATOR, ' ').split()) for cell in row]
+                found.append((reader.line_num, cells))
+    except csv.Error as err:
+        raise InputError(f'cannot read {path}: {err}') from err
+    if not found:
+        raise InputError(f'{path} has no rows')
+    return found
+
+
+def _header(
+    path: Path,
+    rows: Sequence[tuple[int, Sequence[str]]],
+    names: Sequence[str],
+    known: Sequence[str],
+) -> tuple[int, tuple[str, ...]]:
+    """Return where the header is among the rows, and its names; -1 where there is none."""
+    wanted = {name for name in names if not name.startswith('#')}
+    low = {name.lower() for name in known}
+    best: tuple[int, set[str]] = (0, wanted)
+    for k, (_, cells) in enumerate(rows[:ABOVE]):
+        missing = wanted - set(cells)
+        if wanted and not missing:
+            return k, tuple(cells)
+        if not wanted and len(low & {cell.lower() for cell in cells}) > 1:
+            return k, tuple(cells)
+        if len(missing) < len(best[1]):
+            best = (k, missing)
+    if not wanted:
+        if names:
+            return -1, ()
+        return 0, tuple(rows[0][1])
+    found = ', '.join(f'"{cell}"' for cell in rows[best[0]][1] if cell)
+    raise InputError(
+        f'{path} has no column {", ".join(sorted(best[1]))}; line {rows[best[0]][0]} has {found}'
+    )
+
+
+def _first(
+    path: Path,
+    rows: Sequence[tuple[int, Sequence[str]]],
+    at: int,
+    used: Sequence[int],
+    decimal: str,
+    notes: list[str],
+) -> int:
+    """Return which row is the first of numbers, after the header and lines of units."""
+    limit = ABOVE if at < 0 else at + 1 + UNDER
+    for k in range(at + 1, min(len(rows), limit + 1)):
+        cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]
+        if not used or any(_is_number(cell, decimal) for cell in cells):
+            if k > at + 1:
+                left = ', '.join(str(line) for line, _ in rows[at + 1 : k][:5])
+                notes.append(f'line {left} holds no numbers and is left out')
+            return k
+    raise InputError(f'{path} has no rows of numbers in the columns that are named')
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    try:
+        float(cell.replace(',', '.') if decimal == ',' else cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _ragged(
+    path: Path, rows: Sequence[tuple[int, Sequence[str]]], width: int, decimal: str
+) -> TextColumns:
+    """Return the columns of rows that may end early or have cells in quotes."""
+    width = max(width, max(len(cells) for _, cells in rows))
+    filled = [[*cells, *[''] * (width - len(cells))] for _, cells in rows]
+    if decimal == ',':
+        filled = [[cell.replace(',', '.') for cell in row] for row in filled]
+    names = [f'#{k + 1}' for k in range(width)]
+    found = regular('\n'.join(SEPARATOR.join(row) for row in filled), SEPARATOR, names)
+    if found is None:
+        raise InputError(f'cannot read {path}: it holds quotes or zeros within cells')
+    return replace(found, lines=np.array([line for line, _ in rows], dtype=np.intp))

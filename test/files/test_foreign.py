@@ -1,0 +1,361 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables that others have written."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib_ros.cli.main import main
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Expression, Layout, load_layout, parse_columns, presets
+from calib_ros.files.tables import read_table
+from calib_ros.kinematics.chain_file import load_chain
+
+DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[3] / 'shared' / 'data'))
+needs_data = pytest.mark.skipif(
+    not DATA.is_dir() and 'CI' not in os.environ,
+    reason=f'no measured robots at {DATA}; set CALIB_ROS_DATA',
+)
+JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
+PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
+TURNED = Rotation.from_rotvec([[0.1, 0.2, 0.3], [-1.0, 0.5, 2.0], [0.2, -0.1, 1.0]])
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(text, name='cell.csv', joints=2, **layout):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return read_table(path, joints, foreign=Foreign(Layout(**layout)))
+
+    return read
+
+
+def text_of(*columns, names, separator=',', above=''):
+    rows = np.column_stack(columns).tolist()
+    lines = [separator.join(names), *(separator.join(map(repr, row)) for row in rows)]
+    return above + '\n'.join(lines) + '\n'
+
+
+def assert_same(table, rotations=TURNED):
+    (found,) = table.fitted
+    np.testing.assert_allclose(found.joints, JOINTS, atol=1e-12)
+    np.testing.assert_allclose(found.positions, PLACES, atol=1e-12)
+    if rotations is not None:
+        np.testing.assert_allclose(found.rotations, rotations.as_matrix(), atol=1e-12)
+
+
+def both_rows(table):
+    sets = (*table.fitted, *table.held_out)
+    order = np.argsort(np.concatenate([each.stamps_ns for each in sets]))
+    names = ('joints', 'positions', 'rotations')
+    return [np.concatenate([getattr(each, name) for each in sets])[order] for name in names]
+
+
+@needs_data
+def test_poses_of_a_leica_as_published(tmp_path):
+    raw = DATA / 'ur10_ipa_leica/raw/measurements_joint_configurations.csv'
+    out = tmp_path / 'out.csv'
+    given = ['import', str(raw), '--preset', 'ipa_leica', '--chain', 'ur10', '--out', str(out)]
+    assert main(given) == 0
+    table, known = read_table(out, 6), read_table(raw.parents[1] / 'uniform.csv', 6, ('B',))
+    for found, expected in zip(both_rows(table), both_rows(known), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    covariance = table.fitted[0].covariance
+    np.testing.assert_allclose(
+        np.sqrt(np.diagonal(covariance[0])[:3]), [3.1674e-5, 1.3252e-5, 3.7622e-6], rtol=1e-12
+    )
+    sigmas = np.radians([0.0011832, 0.0013871, 0.0041345])
+    assert np.trace(covariance[0, 3:, 3:]) == pytest.approx((sigmas**2).sum(), rel=1e-9)
+    foreign = Foreign(load_layout('ipa_leica'), load_chain('ur10'))
+    direct = read_table(raw, 6, foreign=foreign)
+    np.testing.assert_array_equal(direct.fitted[0].covariance, covariance)
+
+
+@needs_data
+def test_targets_and_differences_of_a_tracker_as_published(tmp_path):
+    raw = DATA / 'ur5_jacobi_lasertracker/raw/3D_UR5_uncalibrated_grid_cleaned.csv'
+    columns = 'q*=joint_*,x=x_t+x_dif,y=y_t+y_dif,z=z_t+z_dif'
+    layout = Layout(columns=parse_columns(columns), length='mm', angle='deg')
+    table = read_table(raw, 6, foreign=Foreign(layout, load_chain('ur5e')))
+    known = read_table(raw.parents[1] / 'uniform.csv', 6)
+    for found, expected in zip(both_rows(table), both_rows(known), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+EULER = [a + b + c for a in 'XYZ' for b in 'XYZ' for c in 'XYZ' if a != b and b != c]
+
+
+@pytest.mark.parametrize('letters', [*EULER, *(each.lower() for each in EULER)])
+def test_euler_angles_of_any_order(read, letters):
+    angles = TURNED.as_euler(letters, degrees=True)
+    text = text_of(
+        JOINTS, 1e3 * PLACES, angles, names=['q1', 'q2', 'x', 'y', 'z', 'r1', 'r2', 'r3']
+    )
+    assert_same(read(text, euler=letters, angle='deg', joint_angle='rad', length='mm'))
+    if len(set(letters.upper())) == 3:
+        names = ['q1', 'q2', 'x', 'y', 'z', *(f'r{each.lower()}' for each in letters)]
+        assert_same(read(text_of(JOINTS, PLACES, np.radians(angles), names=names), euler=letters))
+
+
+@pytest.mark.parametrize('letters', ['XYZ', 'zyx', 'ZYZ', 'zxy'])
+def test_standard_deviations_of_euler_angles(read, letters):
+    sigmas = np.array([1e-4, 2e-4, 3e-4])
+    angles = TURNED.as_euler(letters)
+    names = ['q1', 'q2', 'x', 'y', 'z', 'r1', 'r2', 'r3']
+    columns = {'sx': '0.1e-3', 'sy': '0.1e-3', 'sz': '0.2e-3'}
+    columns |= {'srx': '1e-4', 'sry': '2e-4', 'srz': '3e-4'}
+    table = read(text_of(JOINTS, PLACES, angles, names=names), euler=letters, columns=columns)
+    for k, covariance in enumerate(table.fitted[0].covariance):
+        jacobian = np.zeros((3, 3))
+        for i, step in enumerate(1e-6 * np.eye(3)):
+            more = Rotation.from_euler(letters, angles[k] + step)
+            jacobian[:, i] = (more * TURNED[k].inv()).as_rotvec() / 1e-6
+        expected = jacobian @ np.diag(sigmas**2) @ jacobian.T
+        np.testing.assert_allclose(covariance[3:, 3:], expected, rtol=0, atol=1e-12)
+
+
+def test_rotation_vectors_and_quaternions(read):
+    names = ['q1', 'q2', 'x', 'y', 'z', 'rx', 'ry', 'rz']
+    text = text_of(JOINTS, PLACES, TURNED.as_rotvec(), names=names)
+    assert_same(read(text, rotation_vector=True))
+    quat = TURNED.as_quat()[:, [3, 0, 1, 2]]
+    names = ['q1', 'q2', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
+    assert_same(read(text_of(JOINTS, PLACES, quat, names=names), quaternion='wxyz'))
+    inverse = TURNED.inv()
+    text = text_of(JOINTS, -inverse.apply(PLACES), inverse.as_quat(), names=names)
+    assert_same(read(text, inverse=True))
+
+
+@pytest.mark.parametrize(
+    ('separator', 'decimal'), [(';', ','), (';', '.'), ('\t', ','), (' ', '.')]
+)
+def test_separators_and_decimal_commas_are_guessed_and_said(read, separator, decimal):
+    text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'], separator=separator)
+    table = read(text.replace('.', decimal))
+    assert_same(table, None)
+    said = ' '.join(table.warnings)
+    assert '--separator' in said
+    assert ('--decimal' in said) == (decimal == ',')
+    assert 'm (--length)' in said
+    assert 'rad (--joint-angle)' in said
+
+
+def test_cells_in_quotes_windows_text_and_a_byte_order(read):
+    text = text_of(
+        JOINTS,
+        PLACES,
+        names=[
+            'q1',
+            'q2',
+            'x',
+            'y',
+            'z',
+        ],
+    )
+    assert_same(read(text.replace('0.25', '"0.25"').replace('\n', '\r\n')), None)
+    assert_same(read(text.encode('utf-16')), None)
+    named = text.replace('q1', 'Gel\u00e4nk 1')
+    table = read(named.encode('cp1252'), columns={'q1': '{Gel\u00e4nk 1}'})
+    assert_same(table, None)
+    assert 'Windows-1252' in ' '.join(table.warnings)
+
+
+MOTIVE = """Format Version,1.23,Take Name,take,Rotation Type,Quaternion,Length Units,Millimeters
+
+,,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body,Rigid Body
+,,arm,arm,arm,arm,arm,arm,arm,arm
+,,1,1,1,1,1,1,1,1
+,,Rotation,Rotation,Rotation,Rotation,Position,Position,Position,Mean Marker Error
+Frame,Time (Seconds),X,Y,Z,W,X,Y,Z,
+"""
+
+
+def rows_of(*columns):
+    return ''.join(','.join(map(repr, row)) + '\n' for row in np.column_stack(columns).tolist())
+
+
+def exports():
+    """Return faithful copies of documented formats: text, and the log of joint values."""
+    quat, number = TURNED.as_quat(), np.arange(3)
+    log = text_of(np.degrees(JOINTS), names=['A1', 'A2'])
+    motive = rows_of(number, number / 120, quat, 1e3 * PLACES, 0.1 + 0 * number)
+    vicon = 'Objects\n100\n,,Global Angle (Quaternion) arm:arm\nFrame,Sub Frame,RX,RY,RZ,RW,TX,TY,'
+    vicon += 'TZ\n,,,,,,mm,mm,mm\n' + rows_of(number, 0 * number, quat, 1e3 * PLACES)
+    ndi = 'Frame#,PortHandle,TransformStatus,Q0,Qx,Qy,Qz,Tx,Ty,Tz,Error,#Markers\n'
+    ndi += ''.join(
+        f'{k},0A,Enabled,' + ','.join(map(repr, [q[3], *q[:3], *p, 0.1])) + ',4\n'
+        for k, (q, p) in enumerate(zip(quat.tolist(), (1e3 * PLACES).tolist(), strict=True))
+    )
+    sa = '// SpatialAnalyzer\n' + ''.join(
+        f'A,tracker,p{k},' + ','.join(map(repr, (1e3 * p).tolist())) + '\n'
+        for k, p in enumerate(PLACES)
+    )
+    kuka = text_of(
+        *(np.degrees(JOINTS), 1e3 * PLACES, TURNED.as_euler('ZYX', degrees=True)),
+        names=['A1', 'A2', 'X', 'Y', 'Z', 'A', 'B', 'C'],
+    )
+    coupled = np.column_stack([JOINTS, JOINTS[:, 0]])
+    return {
+        'optitrack': (MOTIVE + motive, log),
+        'vicon': (vicon, log),
+        'ndi': (ndi, log),
+        'spatialanalyzer': (sa, log),
+        'kuka_abc': (kuka, None),
+        'abb_pose': (
+            text_of(
+                *(np.degrees(JOINTS), 1e3 * PLACES, quat[:, [3, 0, 1, 2]]),
+                names=['rax_1', 'rax_2', 'x', 'y', 'z', 'q1', 'q2', 'q3', 'q4'],
+            ),
+            None,
+        ),
+        'fanuc_wpr': (
+            text_of(
+                np.degrees(coupled - [0, 0, 1] * JOINTS[:, 1:]),
+                *(1e3 * PLACES, TURNED.as_euler('xyz', degrees=True)),
+                names=['J1', 'J2', 'J3', 'X', 'Y', 'Z', 'W', 'P', 'R'],
+            ),
+            None,
+        ),
+    }
+
+
+@pytest.mark.parametrize('preset', exports())
+def test_exports_of_others(tmp_path, preset):
+    text, log = exports()[preset]
+    (tmp_path / 'table.csv').write_text(text)
+    given = ['import', str(tmp_path / 'table.csv'), '--preset', preset]
+    if log is not None:
+        (tmp_path / 'log.csv').write_text(log)
+        given += ['--joints', str(tmp_path / 'log.csv'), '--joints-preset', 'kuka']
+    out = tmp_path / 'out.csv'
+    assert main([*given, '--out', str(out)]) == 0
+    table = read_table(out, 3 if preset == 'fanuc_wpr' else 2)
+    (found,) = table.fitted
+    np.testing.assert_allclose(found.joints[:, :2], JOINTS, atol=1e-12)
+    np.testing.assert_allclose(found.positions, PLACES, atol=1e-12)
+    if preset == 'fanuc_wpr':
+        np.testing.assert_allclose(found.joints[:, 2], JOINTS[:, 0], atol=1e-12)
+    if preset != 'spatialanalyzer':
+        np.testing.assert_allclose(found.rotations, TURNED.as_matrix(), atol=1e-9)
+
+
+def test_a_log_of_universal_robots(tmp_path):
+    names = [f'actual_q_{k}' for k in range(2)]
+    (tmp_path / 'log.csv').write_text(text_of(JOINTS, names=names, separator=' '))
+    text = text_of(PLACES, names=['x', 'y', 'z'])
+    (tmp_path / 'table.csv').write_text(text)
+    layout = Layout(length='m')
+    foreign = Foreign(layout, None, tmp_path / 'log.csv', load_layout('ur_rtde'))
+    assert_same(read_table(tmp_path / 'table.csv', 2, foreign=foreign), None)
+    (tmp_path / 'table.csv').write_text(text + '1,2,3\n')
+    with pytest.raises(InputError, match=r'has 3 rows, .* has 4'):
+        read_table(tmp_path / 'table.csv', 2, foreign=foreign)
+
+
+def test_every_preset_says_where_its_format_is_documented():
+    assert len(presets()) >= 11
+    for name in presets():
+        layout = load_layout(name)
+        assert layout.description
+        assert layout.source
+        for each in layout.columns.values():
+            Expression.parse(each)
+
+
+def test_presets_of_users_and_their_faults(tmp_path):
+    path = tmp_path / 'mine.yaml'
+    path.write_text('length: mm\ncolumns: {x: 2*A}\n')
+    assert load_layout(str(path)).columns == {'x': '2*A'}
+    for text, error in (
+        ('lenght: mm', UnknownNameError),
+        ('length: ell', ConfigError),
+        ('columns: {w: A}', ConfigError),
+        ('columns: [1]', ConfigError),
+        ('inverse: 3', ConfigError),
+        ('euler: XXY', ConfigError),
+        ('- 1', ConfigError),
+    ):
+        path.write_text(text)
+        with pytest.raises(error):
+            load_layout(str(path))
+    with pytest.raises(UnknownNameError, match='optitrack'):
+        load_layout('optitrak')
+
+
+@pytest.mark.parametrize(
+    'text', ['a**b', 'f(x)', 'a b', '1+', '__import__("os")', '{}', '', 'a;b']
+)
+def test_what_is_no_expression(text):
+    with pytest.raises(ConfigError, match='no expression'):
+        Expression.parse(text)
+
+
+def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
+    text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'])
+    table = read(text + '0,0,,,\n', length='m', angle='rad')
+    assert_same(table, None)
+    assert 'line 5: left out' in ' '.join(table.warnings)
+
+
+def test_joint_values_that_stand_a_row_below(read):
+    joints = np.vstack([[[9.0, 9.0]], JOINTS])
+    places = np.vstack([PLACES, [[9.0, 9.0, 9.0]]])
+    text = text_of(joints, places, names=['q1', 'q2', 'x', 'y', 'z'])
+    assert_same(read(text, shift=1), None)
+
+
+@pytest.mark.parametrize(
+    ('text', 'layout', 'said'),
+    [
+        ('q1;q2;x;y;z\n1;2;3;4;five\n', {}, 'line 2: .* must be a number, not .five'),
+        ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
+        ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
+        (
+            'a,b,a,y,z\n1,2,3,4,5\n',
+            {'columns': {'q1': 'a'}},
+            'comes 2 times: name it by its number',
+        ),
+        ('q1,q2,x,y,z,rx,ry,rz\n1,2,3,4,5,6,7,8\n', {}, 'say what they are, --euler'),
+        ('q1,q2,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,0,0,0,2\n', {}, 'line 2: quaternion'),
+        ('q1,q2,x,y,z\n', {}, 'no rows'),
+        ('', {}, 'no rows'),
+        ('q1,q2,x,y,z\n1,2,3,4,5\n', {'columns': {'x': 'z/0'}}, 'line 2: x = z/0 is infinite'),
+        ('q1,q2,x,y,z\n1,2,3,4,5\n', {'inverse': True}, '--inverse needs poses'),
+        ('q1,q2,x,y,z\n1,2,3,4,5\n', {'length': 'um', 'columns': {'sx': '1'}}, 'sx, sy and sz'),
+    ],
+)
+def test_faults_are_named(read, text, layout, said):
+    with pytest.raises((InputError, ConfigError), match=said):
+        read(text, **layout)
+
+
+def test_a_table_of_semicolons_says_what_to_give(tmp_path, capsys):
+    path = tmp_path / 'cell.csv'
+    path.write_text('q1;q2;x;y;z\n1;2;3;4;5\n')
+    with pytest.raises(InputError, match='separated by semicolons: give --separator semicolon'):
+        read_table(path, 2)
+
+
+def test_workbooks(tmp_path):
+    openpyxl = pytest.importorskip('openpyxl')
+    book = openpyxl.Workbook()
+    book.active.title = 'first'
+    sheet = book.create_sheet('measured')
+    sheet.append(['a title'])
+    sheet.append(['q1', 'q2', 'x', 'y', 'z'])
+    for row in np.column_stack([JOINTS, PLACES]).tolist():
+        sheet.append(row)
+    path = tmp_path / 'cell.xlsx'
+    book.save(path)
+    assert_same(read_table(path, 2, foreign=Foreign(Layout(sheet='measured'))), None)
+    with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
+        read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
+    path.write_bytes(b'no workbook')
+    with pytest.raises(InputError, match='cannot read'):
+        read_table(path, 2, foreign=Foreign(Layout()))

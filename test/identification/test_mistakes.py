@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Mistakes that are named. `benchmarks/mistakes.py` tries all of them on measured robots."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.mistakes import explained
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import load_chain
+
+UR = load_chain('ur10e')
+
+
+def seen_of(chain=UR, seed=1, count=40, oriented=True):
+    rng = np.random.default_rng(seed)
+    true = faulty(chain, Cell(), rng)
+    return measure(true, chain.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+
+
+def joints(change):
+    return lambda each: replace(each, joints=change(each.joints))
+
+
+def turned(order):
+    return lambda each: replace(
+        each, rotations=se3.from_quat(se3.to_quat(each.rotations)[:, order])
+    )
+
+
+def later(each):
+    short = each.select(np.arange(len(each) - 1))
+    return replace(short, joints=each.joints[1:])
+
+
+COUPLED = np.eye(6)
+COUPLED[2, 1] = 1.0
+SIGNS = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+QUARTER = np.array([0.0, 0.0, 0.0, 0.5 * np.pi, 0.0, 0.0])
+SPOILT = {
+    'mm': (lambda e: replace(e, positions=1e3 * e.positions), '--length mm'),
+    'degrees': (joints(np.degrees), '--joint-angle deg'),
+    'both': (
+        lambda e: replace(e, positions=1e3 * e.positions, joints=np.degrees(e.joints)),
+        '--length mm --joint-angle deg',
+    ),
+    'wxyz': (turned([3, 0, 1, 2]), '--quaternion wxyz'),
+    'transposed': (
+        lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)),
+        '--columns qx=-qx,qy=-qy,qz=-qz',
+    ),
+    'inverse': (lambda e: replace(e.inverted(), inverse=False), '--eye-in-hand (or --inverse'),
+    'eye in hand': (lambda e: e.inverted(), 'leave out --eye-in-hand'),
+    'left-handed': (
+        lambda e: replace(
+            e,
+            positions=e.positions * [1, -1, 1],
+            rotations=np.diag([1.0, -1, 1]) @ e.rotations @ np.diag([1.0, -1, 1]),
+        ),
+        'y=-y',
+    ),
+    'sign': (joints(lambda q: SIGNS * q), 'q3=-q3'),
+    'zero': (joints(lambda q: q + QUARTER), 'q4=q4-1.57079632679489'),
+    'swapped': (joints(lambda q: q[:, [0, 1, 2, 4, 3, 5]]), 'q4=q5,q5=q4'),
+    'coupled': (joints(lambda q: q @ COUPLED.T), 'q3=q3-q2'),
+    'shift': (later, '--shift -1'),
+}
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('mistake', SPOILT)
+def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
+    if not oriented and mistake in ('wxyz', 'transposed', 'inverse', 'eye in hand'):
+        pytest.skip('positions have no rotations')
+    change, remedy = SPOILT[mistake]
+    found = explained(Problem(UR, change(seen_of(oriented=oriented))))
+    assert remedy in str(found)
+    assert len(found.suspects) <= 2
+    assert 5.0 * found.so < found.given
+
+
+def test_another_robot_and_the_other_convention_are_named():
+    seen = seen_of()
+    assert '--chain ur10e' in str(explained(Problem(load_chain('ur5e'), seen)))
+    other = replace(UR, convention='modified', parallel=None)
+    assert 'convention: standard' in str(explained(Problem(other, seen)))
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_where_nothing_is_wrong_nothing_is_said(seed):
+    rng = np.random.default_rng(seed)
+    seen = seen_of(seed=seed, oriented=bool(seed % 2))
+    assert explained(Problem(UR, seen)) is None
+    noisy = replace(seen, positions=seen.positions + rng.normal(scale=0.2, size=(40, 3)))
+    assert explained(Problem(UR, noisy)) is None
+    assert explained(Problem(UR, replace(seen, joints=rng.permutation(seen.joints)))) is None
+
+
+def test_a_refusal_begins_with_the_mistake_and_nothing_is_applied():
+    change, remedy = SPOILT['sign']
+    result = identify(Problem(UR, change(seen_of())))
+    assert not result.accepted
+    assert remedy in result.refusals[0]
+    assert len(result.refusals) > 1
+
+
+def test_good_results_are_not_searched(monkeypatch):
+    from calib_ros.identification import mistakes
+
+    monkeypatch.setattr(mistakes, 'explained', None)
+    assert identify(Problem(UR, seen_of())).accepted
