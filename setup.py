@@ -16,6 +16,7 @@ AMENT = (
 )
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
+CAMERA = 'opencv-python-headless>=4.7'
 
 setup(
     name=NAME,
@@ -38,12 +39,15 @@ setup(
     extras_require={
         # Not in Ubuntu: the node and tables run without it.
         'bags': [BAGS],
+        # For photographs; Ubuntu has it as python3-opencv.
+        'camera': [CAMERA],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
         'fuzz': ['atheris'],
         'test': [
             BAGS,
+            CAMERA,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',

@@ -23,6 +23,7 @@ ONLY = {
     **dict.fromkeys(ROS, ('ros.',)),
     'rosbags': ('files.bags',),
     'matplotlib': ('report.plots',),
+    'cv2': ('files.images',),
     'yaml': (
         *('texts', 'kinematics.chain_file', 'files.export', 'files.trajectories'),
         *('files.vendors', 'ros.arguments'),
@@ -83,7 +84,7 @@ def test_no_two_modules_import_each_other():
 
 
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
-    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib']
+    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'cv2']
     apart = ('ros.', 'files.bags', 'report.plots')
     core = [name for name in MODULES if not name.startswith(apart)]
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
+from calib_ros.cli.camera import DETECTIONS, add_camera_commands, add_detections, detected
 from calib_ros.cli.commands import add_commands
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
@@ -81,6 +82,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         action='store_true',
         help='the poses are those of a fixed target in a camera on the flange',
     )
+    add_detections(identify)
     identify.add_argument(
         '--largest-loss',
         type=float,
@@ -140,6 +142,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     export.add_argument('--force', action='store_true', help='replace the result in --out')
 
     add_commands(command, given)
+    add_camera_commands(command)
 
     chain = command('chain', _chain, 'print the chain file of a robot, to read and to edit')
     chain.add_argument('robot', help='URDF, chain file, or a robot by its name (ur10e, ...)')
@@ -188,6 +191,8 @@ def _identify(options: argparse.Namespace) -> int:
         if read:
             print(read)
         print(words.summary(result))
+        for line in words.cameras_in_words(result):
+            print(line)
     return 0 if result.accepted else NOT_ACCEPTED
 
 
@@ -195,29 +200,34 @@ def _identified(
     options: argparse.Namespace,
 ) -> tuple[Identification, dict[str, Any], tuple[str, ...], str, str]:
     """Return a result, what became of the input, warnings, the configuration, what was read."""
+    from calib_ros.files.boards import POSED, posed_arm
     from calib_ros.identification.model_choice import identify_model
     from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import words
 
-    if (options.bag is None) == (options.csv is None):
-        raise InputError('give either a bag or --csv FILE')
-    source = 'table' if options.csv else 'bag'
+    tables = options.csv or options.detections
+    if (options.bag is None) == (tables is None):
+        raise InputError('give either a bag, or --csv FILE, --detections FILE or both')
+    source = 'table' if tables else 'bag'
     useless = (
         ('joint_topics', 'sources', 'joint_names', 'frame_id')
-        if options.csv
-        else ('session', 'eye_in_hand', 'socket_distance')
+        if tables
+        else ('session', 'eye_in_hand', 'socket_distance', *DETECTIONS)
     )
     for name in useless:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
-    chain = load_chain(options.chain)
+    chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
     settings = settings_of(options)
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     warnings: tuple[str, ...] = ()
+    samples: dict[str, Any] = {}
     read = ''
-    if options.csv is not None:
+    if options.detections is not None:
+        result, samples, warnings = detected(options, chain, settings)
+    elif options.csv is not None:
         from calib_ros.files.tables import read_table
 
         table = read_table(
@@ -239,7 +249,7 @@ def _identified(
             **settings.for_problem(),
         )
         result = identify_model(problem, settings.model)
-        samples: dict[str, Any] = {
+        samples = {
             'samples': sum(map(len, table.fitted)),
             'held_out': sum(map(len, table.held_out)),
             'sets': len(table.fitted),

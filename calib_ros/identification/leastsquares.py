@@ -222,11 +222,8 @@ class Samples:
 def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
     """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
 
-    Measured distances give (N, 1), pixels the shortest shift of the point that explains them.
-    Rotation vectors are NaN where none was measured.
+    Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
     """
-    if observations.pixels is not None:
-        return seen_residuals(chain, observations)[1], np.full((len(observations), 3), np.nan)
     delay = chain.frame(observations.base).delay
     then = observations if delay is None else observations.earlier(delay)
     distances = observations.distances
