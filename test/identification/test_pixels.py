@@ -3,10 +3,11 @@
 """Points of a board in images, as measurements of the arm."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
@@ -25,6 +26,7 @@ SIGMA = 0.3
 CAMERA = Camera()
 
 
+@cache
 def scene(seed, on_flange, count=30, noise=SIGMA, exact=False):
     """Return the true chain, and images of the board."""
     rng = np.random.default_rng(seed)
@@ -45,11 +47,12 @@ def error(found, true, seen):
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
+@settings(max_examples=4)
 @given(seed=st.integers(0, 1000))
 def test_the_jacobian_is_that_of_differences(on_flange, seed):
     true, seen = scene(seed, on_flange, 3)
-    chain = true.with_effects(['elbow_joint.sin_1', 'shoulder_lift_joint.gravity_cos_2'][:1])
-    names = [name for name in chain.parameter_names]
+    chain = true.with_effects(['elbow_joint.sin_1'])
+    names = list(chain.parameter_names)
     samples = PixelSamples(seen, 0.5)
     samples.weights = np.random.default_rng(seed).uniform(0.1, 1.0, len(seen))
     rows = samples.rows_of(chain, names)
@@ -85,6 +88,7 @@ def test_few_rows_an_image_have_the_same_normal_matrix(on_flange):
     )
 
 
+@settings(max_examples=8)
 @given(st.integers(0, 10_000), st.booleans())
 def test_an_image_tells_the_pose_of_a_board(seed, on_flange):
     true, seen = scene(seed, on_flange, 4, noise=0.0, exact=True)
@@ -95,7 +99,7 @@ def test_an_image_tells_the_pose_of_a_board(seed, on_flange):
 
 
 def test_images_that_tell_no_pose_are_left_out():
-    true, seen = scene(3, False, 4, noise=0.0, exact=True)
+    _, seen = scene(3, False, 4, noise=0.0, exact=True)
     index, corner = np.divmod(np.arange(len(seen)), len(POINTS))
     line = (index == 1) & (corner >= 6)
     few = (index == 2) & (corner >= 3)
