@@ -27,6 +27,8 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import LENS_KINDS, View, at_the_board, require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 
+BOUNDED = 3.0
+"""Usual residuals that one point counts for at most in the sum of its image."""
 POINTS = 4096
 """Points that are linearised at once."""
 
@@ -128,12 +130,20 @@ class PixelSamples(Samples):
         return pixels / self.sigmas[0], np.full((self.count, 3), np.nan)
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
-        """Yield the residuals of all points, and of all images: what their points share."""
+        """Yield the residuals of all points, and of all images: what their points share.
+
+        No point counts for more than some usual ones in its image.
+        """
         found, _ = self.whitened_residuals(chain)
         yield found, slice(None)
-        root = np.sqrt(np.bincount(self._images))
-        sums = np.add.reduceat(found, self._begins) if self.count else found
-        yield sums / root[:, np.newaxis], self._images
+        if not self.count:
+            return
+        length = np.linalg.norm(found, axis=1, keepdims=True)
+        most = BOUNDED * np.median(length)
+        sums = np.add.reduceat(
+            found * np.minimum(1.0, most / np.maximum(length, 1e-300)), self._begins
+        )
+        yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
     def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Block]:
         """Yield blocks of whole images with about POINTS points."""

@@ -184,7 +184,7 @@ def test_pixels_and_poses_in_one_fit(rng):
     both = identify(Problem(chain, poses, more=[seen], sigma_pixel=SIGMA, sigma_position=5e-5))
     alone = identify(Problem(UR, poses, sigma_position=5e-5))
     assert both.accepted, both.refusals
-    assert both.rank == 36
+    assert both.rank == 30 + 6 + 6
     assert error(both.chain, tracked, seen) < error(alone.chain, tracked, seen)
 
 
