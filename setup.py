@@ -18,6 +18,7 @@ SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
 XLSX = 'openpyxl>=3.1.2'
+CAMERA = 'opencv-python-headless>=4.7'
 
 setup(
     name=NAME,
@@ -44,6 +45,8 @@ setup(
         'report': REPORT,
         # Workbooks as tables.
         'xlsx': [XLSX],
+        # For photographs; Ubuntu has it as python3-opencv.
+        'camera': [CAMERA],
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
@@ -52,6 +55,7 @@ setup(
             BAGS,
             *REPORT,
             XLSX,
+            CAMERA,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',

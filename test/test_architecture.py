@@ -24,6 +24,7 @@ ONLY = {
     'rosbags': ('files.bags',),
     'matplotlib': ('report.plots',),
     **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
+    'cv2': ('files.images',),
     'yaml': (
         *('texts', 'kinematics.chain_file', 'files.export', 'files.trajectories'),
         *('files.vendors', 'ros.arguments'),
@@ -84,7 +85,7 @@ def test_no_two_modules_import_each_other():
 
 
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
-    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly']
+    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'cv2']
     apart = ('ros.', 'files.bags', 'report.plots')
     core = [name for name in MODULES if not name.startswith(apart)]
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
+from calib_ros.cli.camera import DETECTIONS, add_camera_commands, add_detections, detected
 from calib_ros.cli.commands import add_commands
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
@@ -94,6 +95,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         action='store_true',
         help='the poses are those of a fixed target in a camera on the flange',
     )
+    add_detections(identify)
     identify.add_argument(
         '--largest-loss',
         type=float,
@@ -165,6 +167,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     export.add_argument('--force', action='store_true', help='replace the result in --out')
 
     add_commands(command, given)
+    add_camera_commands(command)
 
     chain = command('chain', _chain, 'print the chain file of a robot, to read and to edit')
     chain.add_argument('robot', help='URDF, chain file, or a robot by its name (ur10e, ...)')
@@ -215,6 +218,8 @@ def _identify(options: argparse.Namespace) -> int:
         if found.read:
             print(found.read)
         print(words.summary(result))
+        for line in words.cameras_in_words(result):
+            print(line)
     return 0 if result.accepted else NOT_ACCEPTED
 
 
@@ -235,29 +240,34 @@ class _Identified(NamedTuple):
 
 def _identified(options: argparse.Namespace) -> _Identified:
     """Return what there is to identify in a table or a bag."""
+    from calib_ros.files.boards import POSED, posed_arm
     from calib_ros.identification.model_choice import identify_model
     from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import words
 
-    if (options.bag is None) == (options.csv is None):
-        raise InputError('give either a bag or --csv FILE')
-    source = 'table' if options.csv else 'bag'
+    tables = options.csv or options.detections
+    if (options.bag is None) == (tables is None):
+        raise InputError('give either a bag, or --csv FILE, --detections FILE or both')
+    source = 'table' if tables else 'bag'
     useless = (
         ('joint_topics', 'sources', 'joint_names', 'frame_id')
-        if options.csv
-        else ('session', 'eye_in_hand', 'socket_distance', *LAYOUT)
+        if tables
+        else ('session', 'eye_in_hand', 'socket_distance', *LAYOUT, *DETECTIONS)
     )
     for name in useless:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
-    chain = load_chain(options.chain)
+    chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
     settings = settings_of(options)
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     warnings: tuple[str, ...] = ()
+    samples: dict[str, Any] = {}
     read, lines = '', False
-    if options.csv is not None:
+    if options.detections is not None:
+        problem, result, samples, warnings = detected(options, chain, settings)
+    elif options.csv is not None:
         from calib_ros.files.tables import read_table
 
         table = read_table(
@@ -280,7 +290,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
             **settings.for_problem(),
         )
         result = identify_model(problem, settings.model)
-        samples: dict[str, Any] = {
+        samples = {
             'samples': sum(map(len, table.fitted)),
             'held_out': sum(map(len, table.held_out)),
             'sets': len(table.fitted),
@@ -301,7 +311,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
         lost = replayed.refusals(account, options.largest_loss)
         result = replace(result, refusals=(*result.refusals, *lost))
     configuration = words.configuration_yaml(options.chain, settings)
-    origin = origin_of(options, (options.csv, options.bag), configuration)
+    origin = origin_of(options, (options.csv, options.detections, options.bag), configuration)
     return _Identified(problem, result, samples, warnings, origin, read, lines)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.atomic import whole_folder, write_file
-from calib_ros.errors import InputError, shortened
+from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files.mcap import (
     LARGEST_CHUNK,
     LARGEST_RATIO,
@@ -58,6 +58,7 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 """What the library does not promise: without them, it is asked for the messages itself."""
 BATCH = 2000
 """Messages that are decoded at once."""
+PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 LARGEST_MESSAGE = 65_536
 """Bytes of a message; a joint state of a thousand joints has fewer."""
 ALLOW = 'take the rest all the same with --largest-loss'
@@ -182,6 +183,39 @@ def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSess
         f'{lost}'
     )
     return Replayed(total, found.count, (*session.warnings, damaged))
+
+
+def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
+    """Yield the images of a bag on one topic, with their stamps [ns].
+
+    sensor_msgs/Image and CompressedImage. One that cannot be decoded ends the bag.
+    """
+    if not path.exists():
+        raise InputError(f'there is no bag at {path}')
+    library, deserialise = _rosbag2(), _deserialiser({})
+    with unpacked_files(path) as folder:
+        try:
+            check(folder)
+            reader = library.Reader(folder)
+            reader.open()
+        except Exception as err:  # as in `_replay`
+            raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
+        with closing(reader):
+            found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}
+            if topic and topic not in found:
+                raise UnknownNameError(f'topic of images in {path}', topic, found)
+            if len(found) != 1 and not topic:
+                names = ', '.join(found) or f'{" or ".join(PICTURES)}'
+                problem = 'several topics of images, choose one with --topic' if found else 'no'
+                raise InputError(f'{path} has {problem}: {names}')
+            wanted = [found[topic]] if topic else list(found.values())
+            for connection, _, data in reader.messages(wanted):
+                try:
+                    message = deserialise(data, connection.msgtype)
+                except Exception as err:  # a damaged message fails in many ways
+                    raise InputError(f'{path}: a damaged image on {connection.topic}') from err
+                stamp = message.header.stamp
+                yield stamp.sec * 1_000_000_000 + stamp.nanosec, message
 
 
 def _chosen(

@@ -36,7 +36,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, special
 
-from calib_ros.identification.leastsquares import Samples, System, normal_equations
+from calib_ros.identification.leastsquares import System, normal_equations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -231,15 +231,10 @@ def _lengths(chain: Chain, system: System) -> dict[str, float]:
 def _few(system: System) -> tuple[System, int]:
     """Return the samples without priors, of many every so many, and how many each stands for."""
     share = max(1, -(-system.count // MOST))
-    sets = []
-    for samples in system.sets:
-        few = samples
-        if share > 1:
-            chosen = np.arange(0, samples.count, share)
-            few = Samples(samples.observations.select(chosen), *samples.sigmas)
-            few.weights = None if samples.weights is None else samples.weights[chosen]
-        sets.append(few)
-    return System(tuple(sets), None, system.separations), share
+    sets = system.sets
+    if share > 1:
+        sets = tuple(each.select(np.arange(0, each.count, share)) for each in sets)
+    return System(sets, None, system.separations), share
 
 
 def _solved(

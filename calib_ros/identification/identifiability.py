@@ -16,6 +16,7 @@ from scipy import linalg
 
 from calib_ros.kinematics.chain import FRAME_KINDS, Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.lens import of_lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -92,8 +93,9 @@ def structurally_independent(
     not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
     by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
-    poses: turning the whole cell about it shows nowhere else than in residuals. `extra` returns
-    further equations at a chain.
+    poses: turning the whole cell about it shows nowhere else than in residuals. A board tells its
+    pose in a camera, and images of it from anywhere tell the camera's lens (Zhang 2000). `extra`
+    returns further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -121,6 +123,8 @@ def structurally_independent(
         rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
     if extra is not None:
         rows = np.concatenate([rows, extra(anywhere, names)[0]])
+    lens = [k for k, name in enumerate(names) if of_lens(name)]
+    rows = np.concatenate([rows, np.eye(len(names))[lens]])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
 

@@ -7,7 +7,8 @@ measured one, both in world axes, weighted by the inverse of the measurement's c
 derivative with respect to the parameters is the error model's, with the sign reversed. The
 orientation part leaves out the Jacobian of the logarithm: with equal weights on the three axes
 the gradient does not change, because that Jacobian leaves the residual itself as it is. A measured
-distance has the residual L - |p|, and its derivative is the position's along p.
+distance has the residual L - |p|, and its derivative is the position's along p. Pixels of a board
+have a module of their own (`pixels.py`).
 
 Samples are visited in blocks that fit the cache. A block adds to the normal matrix, which has
 the residual as its last row and column, so memory does not grow with the number of samples.
@@ -22,11 +23,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.lens import at_the_board, of_lens, require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -84,6 +87,12 @@ class Samples:
         self.weights: FloatArray | None = None
         """Square roots of the weights (N,) of a robust loss; None where all count fully."""
 
+    def select(self, index: NDArray[np.generic]) -> Samples:
+        """Return the samples chosen by a mask or by indices, with their weights."""
+        few = type(self)(self.observations.select(index), *self.sigmas)
+        few.weights = None if self.weights is None else self.weights[index]
+        return few
+
     def blocks(
         self, chain: Chain, names: Sequence[str]
     ) -> Iterator[tuple[FloatArray, FloatArray, ErrorModel]]:
@@ -101,12 +110,7 @@ class Samples:
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         nothing = np.zeros((0, 0))
-        joints, velocity = self.joints, None
-        delay = chain.frame(self.observations.base).delay
-        if self.observations.velocity is not None and delay is not None:
-            then = self.observations.earlier(delay)
-            joints = np.ascontiguousarray(then.joints.T)
-            velocity = np.ascontiguousarray(np.asarray(then.velocity).T)
+        joints, velocity = self.moving(chain)
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
             approach = None if self.approach is None else self.approach[:, part]
@@ -132,6 +136,15 @@ class Samples:
                 continue
             turn /= self.sigmas[1]
             yield flat, turn.reshape(len(turn), -1), model
+
+    def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
+        """Return joint values (n, N) at the device's delay, and velocities where it has one."""
+        delay = chain.frame(self.observations.base).delay
+        if self.observations.velocity is None or delay is None:
+            return self.joints, None
+        then = self.observations.earlier(delay)
+        velocity = np.ascontiguousarray(np.asarray(then.velocity).T)
+        return np.ascontiguousarray(then.joints.T), velocity
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the same rows by position and orientation, (P + 1, c, B) each, a block at a time.
@@ -198,6 +211,14 @@ class Samples:
             return position, np.where(self.observations.oriented[:, None], turned, np.nan)
         return position / self.sigmas[0], orientation / self.sigmas[1]
 
+    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
+        """Yield residuals (M, c) in sigma that tell gross errors, and the (N,) row of each sample.
+
+        NaN where nothing was measured.
+        """
+        for part in self.whitened_residuals(chain):
+            yield part, slice(None)
+
 
 def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
     """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
@@ -226,6 +247,36 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
             orientation[part] = orientation_error(measured, axes).T
     orientation[~oriented] = np.nan
     return position, orientation
+
+
+def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m]."""
+    camera = observations.camera
+    lens = require_lens(chain.frame(camera).lens, camera)
+    delay = chain.frame(observations.base).delay
+    then = observations if delay is None else observations.earlier(delay)
+    first = np.flatnonzero(np.diff(then.images, prepend=-1))
+    assert then.pixels is not None
+    assert then.points is not None
+    q = np.ascontiguousarray(then.joints[first].T)
+    came = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
+    axes, origin = chain.trace(chain.effective(q, came), base=then.base, tool=then.tool)
+    origin = np.broadcast_to(origin, (3, len(first)))
+    axes = [np.broadcast_to(axis, (3, len(first))) for axis in axes]
+    pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
+    for start in range(0, len(then), BLOCK):
+        part = slice(start, start + BLOCK)
+        owner = then.images[part]
+        seen = view(
+            lens,
+            [axis[:, owner] for axis in axes],
+            origin[:, owner],
+            then.points[part].T,
+            then.on_flange,
+        )
+        residual = then.pixels[part].T - seen.pixels
+        pixels[part], shifts[part] = residual.T, at_the_board(seen, residual)
+    return pixels, shifts
 
 
 def _along(origin: FloatArray, shift: FloatArray, distances: FloatArray) -> FloatArray:
@@ -470,6 +521,9 @@ def without_each(
     if not names:
         yield from [chain] * len(systems)
         return
+    curved = [
+        k for k, name in enumerate(names) if not of_lens(name)
+    ]  # pixels are linear in a lens
     parts = [normal_equations(chain, names, System(system.sets)) for system in systems]
     extra, residual = systems[0].extra_rows(chain, names)  # the same in every part
     matrix = np.sum([part.matrix for part in parts], axis=0) + extra.T @ extra
@@ -477,7 +531,7 @@ def without_each(
     for k, part in enumerate(parts):
         rest = Normal(matrix - part.matrix, gradient - part.gradient, 0.0, part.parts)
         step = _solve(rest, 0.0)
-        if np.abs(step).max() > SMALL_STEP:
+        if np.abs(step[curved]).max(initial=0.0) > SMALL_STEP:
             yield minimise(chain, names, others(k), tolerance=1e-3).chain
         else:
             yield chain.with_offsets(dict(zip(names, step, strict=True)))

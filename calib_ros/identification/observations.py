@@ -19,7 +19,10 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
-_OPTIONAL = ('covariance', 'approach', 'distances', 'velocity', 'acceleration', 'delay')
+_OPTIONAL = (
+    *('covariance', 'approach', 'distances', 'velocity', 'acceleration', 'delay'),
+    *('pixels', 'points'),
+)
 TURN = 2.0 * np.pi
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
@@ -68,6 +71,13 @@ class Observations(Shown):
         the time, and the world's axes are those of the arm's base.
     inverse : bool
         The poses were the other way round before: of a fixed target in a camera on the flange.
+    pixels, points : (N, 2), (N, 3), optional
+        Points of a board as a camera saw them: a row for each point, with its place in the image
+        and in the frame of the board [m]. Rows of one image follow each other and share stamp and
+        joint values. Positions and rotations count for nothing then.
+    on_flange : bool
+        The camera is on the flange, at `tool`, and the board is the world. Else the camera is the
+        world and the board is at `tool`.
 
     """
 
@@ -86,6 +96,9 @@ class Observations(Shown):
     tool: str = 'tool'
     socket: bool = False
     inverse: bool = False
+    pixels: FloatArray | None = None
+    points: FloatArray | None = None
+    on_flange: bool = False
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""
@@ -105,6 +118,10 @@ class Observations(Shown):
                 shapes[name] = self.joints.shape
         if self.distances is not None:
             shapes['distances'] = (count,)
+        if (self.pixels is None) != (self.points is None):
+            raise InputError('pixels need the points of the board that they show, and points them')
+        if self.pixels is not None:
+            shapes |= {'pixels': (count, 2), 'points': (count, 3)}
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise InputError(
@@ -133,6 +150,30 @@ class Observations(Shown):
             np.asarray(positions, dtype=np.float64),
             np.broadcast_to(np.eye(3), (count, 3, 3)) if rotations is None else rotations,
             np.full(count, rotations is not None),
+        )
+
+    @classmethod
+    def from_pixels(
+        cls,
+        joints: FloatArray,
+        pixels: FloatArray,
+        points: FloatArray,
+        images: NDArray[np.intp],
+        on_flange: bool = False,
+    ) -> Observations:
+        """Make observations (N) of a board: `images` (N,) numbers the image of each row.
+
+        The joint values (N, n) are those of the image, the `points` (N, 3) [m] those of the board
+        that are seen at `pixels` (N, 2).
+        """
+        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
+        stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
+        return replace(
+            plain,
+            stamps_ns=stamps,
+            pixels=np.asarray(pixels, dtype=np.float64),
+            points=np.asarray(points, dtype=np.float64),
+            on_flange=on_flange,
         )
 
     def select(self, mask: NDArray[np.generic]) -> Observations:
@@ -213,6 +254,20 @@ class Observations(Shown):
         return replace(
             self, joints=joints, velocity=velocity, delay=np.full(len(self), float(delay))
         )
+
+    @property
+    def camera(self) -> str:
+        """Return the frame of the camera that saw the pixels."""
+        return self.tool if self.on_flange else self.base
+
+    @cached_property
+    def images(self) -> NDArray[np.intp]:
+        """Return (N,) the number of the image that each row of pixels is from."""
+        if not len(self):
+            return np.zeros(0, dtype=np.intp)
+        other = np.diff(self.stamps_ns) != 0
+        other |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
+        return np.concatenate([[0], np.cumsum(other)]).astype(np.intp)
 
     @cached_property
     def configurations(self) -> NDArray[np.intp]:

@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification import identifiability
-from calib_ros.identification.leastsquares import Prior, Samples, System
+from calib_ros.identification.leastsquares import Prior, System
 from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.robust import LOSSES
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import Chain, is_length
+from calib_ros.kinematics.chain import DELAY, FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.lens import LENS_KINDS, of_lens, require_lens
 from calib_ros.shown import Shown
 
 
@@ -57,6 +59,8 @@ class Problem(Shown):
     sigma_position, sigma_orientation : float
         Standard deviations [m, rad] of measurements without a covariance of their own. Their
         ratio weighs position against orientation; the size of the noise is estimated.
+    sigma_pixel : float
+        Standard deviation [px] of each coordinate of a point of a board in an image.
     loss : 'redescending', 'huber' or 'none'
         How gross errors are kept from ruining the fit (`robust.py`).
     priors : mapping of str to float
@@ -95,10 +99,11 @@ class Problem(Shown):
     world_frame: str = ''
     separations: Sequence[tuple[str, str, float]] = ()
     learned: Learned | None = None
+    sigma_pixel: float = 0.3
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
-        for name in ('sigma_position', 'sigma_orientation'):
+        for name in ('sigma_position', 'sigma_orientation', 'sigma_pixel'):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
         if self.loss not in LOSSES:
@@ -111,6 +116,9 @@ class Problem(Shown):
                     f'"{self.chain.name}" has {joints} joints'
                 )
 
+        for observations in (*self.sets, *self.judging):
+            if observations.pixels is not None:
+                require_lens(self.model.frame(observations.camera).lens, observations.camera)
         names = self.model.parameter_names
         for pattern in (*self.fixed, *self.priors):
             if not fnmatch.filter(names, pattern):
@@ -133,7 +141,7 @@ class Problem(Shown):
             ):
                 raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
         for pattern in self.priors:
-            if pattern.partition('.')[0] in self.model.frame_names:
+            if self._places(pattern):
                 raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
         sockets = {each.base for each in self.sets if each.socket}
         for *pair, distance in self.separations:
@@ -143,13 +151,18 @@ class Problem(Shown):
             if not distance > 0.0:
                 raise ConfigError(f'the distance of sockets must be positive, not {distance}')
         for pattern in self.fixed:
-            if pattern.partition('.')[0] in self.model.frame_names:
+            if self._places(pattern):
                 raise ConfigError(
                     f'a frame is held as a whole: give it in the chain file with "fixed: true", '
                     f'instead of fixing "{pattern}"'
                 )
         if not self.free:
             raise ConfigError('every parameter is fixed: nothing is left to identify')
+
+    def _places(self, pattern: str) -> bool:
+        """Tell whether a pattern is that of the place of a frame, not of a lens there."""
+        frame, _, kinds = pattern.partition('.')
+        return frame in self.model.frame_names and not fnmatch.filter(LENS_KINDS, kinds)
 
     @cached_property
     def sets(self) -> tuple[Observations, ...]:
@@ -173,7 +186,7 @@ class Problem(Shown):
         """Return what each set measures."""
         return tuple(
             identifiability.Kind(
-                bool(each.oriented.any()),
+                bool(each.oriented.any()) or each.pixels is not None,
                 each.distances is not None,
                 each.velocity is not None,
                 each.base,
@@ -217,7 +230,9 @@ class Problem(Shown):
         sigmas: dict[str, float] = {}
         for name in self.free:
             for pattern, sigma in self.priors.items():
-                if fnmatch.fnmatchcase(name, pattern) and not self.model.owns_frame(name):
+                if fnmatch.fnmatchcase(name, pattern) and (
+                    not self.model.owns_frame(name) or of_lens(name)
+                ):
                     sigmas.setdefault(name, sigma)
         return sigmas
 
@@ -240,7 +255,8 @@ class Problem(Shown):
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None
-        samples = [Samples(each, self.sigma_position, self.sigma_orientation) for each in sets]
+        noises = (self.sigma_position, self.sigma_orientation)
+        samples = [samples_of(each, noises, self.sigma_pixel) for each in sets]
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
         return System(tuple(samples), prior, apart)
@@ -254,7 +270,12 @@ class Problem(Shown):
         """
         model = self.model
         used = {name for each in self.sets for name in (each.base, each.tool)}
-        held = [f'{k}.*' for k in model.frame_names if model.frame(k).fixed or k not in used]
+        held = [f'{k}.*' for k in model.frame_names if k not in used]
+        for key in model.frame_names:
+            frame = model.frame(key)
+            held += [f'{key}.{kind}' for kind in (*FRAME_KINDS, DELAY) if frame.fixed]
+            fixed = frame.lens is None or frame.lens.fixed
+            held += [f'{key}.{kind}' for kind in LENS_KINDS if fixed]
         held += [f'{each.base}.r?' for each in self.sets if each.socket]
         known = dict(model.effects)
         ordered = sorted(

@@ -3,7 +3,8 @@
 """Least squares that gross errors do not ruin, and their names.
 
 A sample's distance is the length of its residual in units of a scale estimated from the data (the
-median of all lengths), the larger one of position and orientation. Weights follow it, and the fit
+median of all lengths), the larger one of position and orientation, or of a corner and the sum over
+its image. Weights follow it, and the fit
 is repeated until they stand still (iteratively reweighted least squares; Holland and Welsch 1977):
 
     first        w = min(1, 1 / distance)                  the fit of least absolute lengths
@@ -178,12 +179,13 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
     found = []
     for samples in system.sets:
         largest = np.zeros(samples.count)
-        for part in samples.whitened_residuals(chain):
-            known = ~np.isnan(part[:, 0])
+        for part, row in samples.misfits(chain):
+            length = np.linalg.norm(part, axis=1) / np.sqrt(share)
+            known = ~np.isnan(length)
             if known.any():
-                length = np.linalg.norm(part[known], axis=1) / np.sqrt(share)
-                scale = np.median(length) / _median_length(part.shape[1])
-                largest[known] = np.maximum(largest[known], length / max(scale, NOISE_FREE))
+                scale = np.median(length[known]) / _median_length(part.shape[1])
+                size = np.where(known, length, 0.0) / max(scale, NOISE_FREE)
+                largest = np.maximum(largest, size[row])
         found.append(largest)
     return tuple(found)
 

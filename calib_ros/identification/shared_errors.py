@@ -298,8 +298,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
             chosen &= samples.weights > 0.0
         if not chosen.any():
             continue
-        few = Samples(samples.observations.select(chosen), *samples.sigmas)
-        few.weights = None if samples.weights is None else samples.weights[chosen]
+        few = samples.select(chosen)
         numbers = all_numbers[chosen]
         pieces = list(_sums(chain, names, few, numbers))
         index = np.concatenate([piece[0] for piece in pieces])

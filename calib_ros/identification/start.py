@@ -11,9 +11,9 @@ out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknow
 Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
 is the shortest one, the base takes the rest, and rotations come from the registration.
 Distances: their squares are linear in the base's position and its square, solved for the better
-half of the samples. Every start is polished by least squares on the frames
-alone; the best one counts. Where none fits (few or degenerate poses), the 24 rotations of a cube
-are tried as well.
+half of the samples. Pixels: the pose of the board in each image (`resection.py`). Every start is
+polished by least squares on the frames alone; the best one counts. Where none fits (few or
+degenerate poses), the 24 rotations of a cube are tried as well.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from scipy.spatial.transform import Rotation
 from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import FRAME_KINDS, Chain, Frame
+from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.se3 import FloatArray
 
 SUBSET = 200
@@ -63,6 +65,10 @@ def start_frames(
                 frames[key] = replace(chain.frame(name), fixed=True)
         view = replace(chain, base=frames['base'], tool=frames['tool'])
         alone = replace(observations, base='base', tool='tool')
+        if observations.pixels is not None:
+            lens = require_lens(view.frame(alone.camera).lens, alone.camera)
+            share = -(-(int(alone.images[-1]) + 1) // SUBSET)
+            alone = board_poses(alone.select(alone.images % share == 0), lens)
         view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
         for key, name in ends.items():
             frame = replace(view.frame(key), fixed=chain.frame(name).fixed)

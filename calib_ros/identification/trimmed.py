@@ -23,7 +23,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -94,7 +94,9 @@ def _thinned(system: System) -> System:
     sets = []
     for samples in system.sets:
         index = np.arange(0, samples.count, -(-samples.count // most))
-        sets.append(Samples(samples.observations.select(index), *samples.sigmas))
+        few = samples.select(index)
+        few.weights = None
+        sets.append(few)
     return replace(system, sets=tuple(sets))
 
 

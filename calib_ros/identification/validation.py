@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.identification.leastsquares import System, minimise, residual_arrays, without_each
+from calib_ros.identification.leastsquares import (
+    System,
+    minimise,
+    residual_arrays,
+    seen_residuals,
+    without_each,
+)
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.region import KNOWN, Region
@@ -66,6 +72,7 @@ class ErrorFigures:
     max_mm: float
     mean_plus_3_sigma_mm: float
     rms_mrad: float | None
+    rms_px: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,18 +80,22 @@ class Residuals:
     """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
 
     Both in the world; the rotation is NaN where no orientation was measured. `configurations`
-    (N,) tells which pairs belong to one standing configuration.
+    (N,) tells which pairs belong to one standing configuration. Of points of a board the position
+    is the shortest shift that explains the residual in `pixels` (N, 2), which are NaN elsewhere.
     """
 
     position: FloatArray
     orientation: FloatArray
     configurations: NDArray[np.intp]
+    pixels: FloatArray
 
     def figures(self, which: NDArray[np.bool_]) -> ErrorFigures:
         """Return RMS, mean and maximum over the pairs of a mask (N,)."""
         distance = 1e3 * np.linalg.norm(self.position[which], axis=1)
         angle = 1e3 * np.linalg.norm(self.orientation[which], axis=1)
         angle = angle[~np.isnan(angle)]
+        away = np.linalg.norm(self.pixels[which], axis=1)
+        away = away[~np.isnan(away)]
         return ErrorFigures(
             len(distance),
             float(np.sqrt(np.mean(distance**2))),
@@ -92,6 +103,7 @@ class Residuals:
             float(distance.max()),
             float(distance.mean() + 3.0 * distance.std()),
             float(np.sqrt(np.mean(angle**2))) if angle.size else None,
+            float(np.sqrt(np.mean(away**2))) if away.size else None,
         )
 
 
@@ -133,10 +145,15 @@ class Comparison(Shown):
 
 def residuals(chain: Chain, observations: Observations) -> Residuals:
     """Return measured minus predicted for every pair."""
-    position, orientation = residual_arrays(chain, observations)
+    pixels = np.full((len(observations), 2), np.nan)
+    if observations.pixels is not None:
+        pixels, position = seen_residuals(chain, observations)
+        orientation = np.full((len(observations), 3), np.nan)
+    else:
+        position, orientation = residual_arrays(chain, observations)
     if position.shape[1] == 1:  # a distance
         position = np.pad(position, ((0, 0), (0, 2)))
-    return Residuals(position, orientation, observations.configurations)
+    return Residuals(position, orientation, observations.configurations, pixels)
 
 
 def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
@@ -275,6 +292,7 @@ def _joined(
         np.concatenate([piece.position for piece in pieces])[index],
         np.concatenate([piece.orientation for piece in pieces])[index],
         configurations,
+        np.concatenate([piece.pixels for piece in pieces])[index],
     )
 
 

@@ -31,6 +31,7 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.lens import LENS_KINDS, Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -115,12 +116,13 @@ class Frame:
     """A constant transform (4, 4); `fixed` when it is known and must not be fitted.
 
     `delay` [s] is how much later than the joints' the stamps of the device at a base frame are;
-    None where the arm stood and no delay shows.
+    None where the arm stood and no delay shows. `lens` belongs to a camera that is there.
     """
 
     matrix: FloatArray = field(default_factory=lambda: np.eye(4))
     fixed: bool = False
     delay: float | None = None
+    lens: Lens | None = None
 
     def moved(self, offsets: Mapping[str, float]) -> Frame:
         """Return the frame shifted by x, y, z [m] and turned by rx, ry, rz [rad].
@@ -133,9 +135,13 @@ class Frame:
         turn = np.array([offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]])
         if turn.any():
             matrix[:3, :3] = se3.exp_rotation(turn) @ matrix[:3, :3]
-        if 'delay' in offsets:
-            return replace(self, matrix=matrix, delay=(self.delay or 0.0) + offsets['delay'])
-        return replace(self, matrix=matrix)
+        delay = self.delay
+        if DELAY in offsets:
+            delay = (delay or 0.0) + offsets[DELAY]
+        lens = self.lens
+        if lens is not None:
+            lens = lens.moved({kind: offsets[kind] for kind in LENS_KINDS if kind in offsets})
+        return replace(self, matrix=matrix, delay=delay, lens=lens)
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
         """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""
@@ -230,6 +236,8 @@ class Chain(Shown):
         """
         names = [f'{frame}.{kind}' for frame in self.frame_names for kind in FRAME_KINDS]
         names += [f'{k}.{DELAY}' for k in self.frame_names if self.frame(k).delay is not None]
+        cameras = [key for key in self.frame_names if self.frame(key).lens is not None]
+        names += [f'{camera}.{kind}' for camera in cameras for kind in LENS_KINDS]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
             names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
@@ -252,12 +260,14 @@ class Chain(Shown):
             return float(getattr(owner, kind)) if kind in DH_KINDS else self._effect_values[name]
         if kind == DELAY:
             return owner.delay or 0.0
+        if kind in LENS_KINDS:
+            return 0.0 if owner.lens is None else float(getattr(owner.lens, kind))
         return float(owner.offsets()[FRAME_KINDS.index(kind)])
 
     def offset(self, name: str, nominal: Chain) -> float:
         """Return what `with_offsets` adds to the nominal chain's parameter to come here."""
         owner, kind = self._split(name)
-        if isinstance(owner, Joint) or kind == DELAY:
+        if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
             return self.value(name) - nominal.value(name)
         reference = nominal.frame(name.partition('.')[0])
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
@@ -442,7 +452,7 @@ class Chain(Shown):
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
         owner, _, kind = name.partition('.')
-        if owner in self._frames and kind in (*FRAME_KINDS, DELAY):
+        if owner in self._frames and kind in (*FRAME_KINDS, DELAY, *LENS_KINDS):
             return self.frame(owner), kind
         joint = self._joints.get(owner)
         if joint is not None and kind in DH_KINDS:

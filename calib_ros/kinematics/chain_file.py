@@ -25,6 +25,7 @@ from calib_ros import texts
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
+from calib_ros.kinematics.lens import IN_PIXELS, LENS_KINDS, Lens
 from calib_ros.kinematics.urdf import MOST_JOINTS, chain_from_urdf
 from calib_ros.settings import Settings
 from calib_ros.texts import parse_yaml
@@ -34,7 +35,7 @@ CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
     'calibration',
 )
-FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay')
+FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 SAME = 1e-9
@@ -320,12 +321,16 @@ def chain_document(chain: Chain) -> dict[str, Any]:
 
 
 def _frame_document(frame: Frame) -> dict[str, Any]:
-    document = {
+    document: dict[str, Any] = {
         'xyz': frame.matrix[:3, 3].tolist(),
         'quat_xyzw': se3.to_quat(frame.matrix[:3, :3]).tolist(),
         'fixed': frame.fixed,
     }
-    return document if frame.delay is None else document | {'delay': frame.delay}
+    if frame.delay is not None:
+        document['delay'] = frame.delay
+    if frame.lens is not None:
+        document['lens'] = frame.lens.values | {'fixed': frame.lens.fixed}
+    return document
 
 
 def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
@@ -412,4 +417,21 @@ def _frame(value: object, where: str) -> Frame | None:
         se3.transform(se3.from_quat(quat), xyz),
         fixed,
         None if delay is None else parse_number(delay, f'{where}.delay'),
+        None if content.get('lens') is None else _lens(content['lens'], f'{where}.lens'),
     )
+
+
+def _lens(value: object, where: str) -> Lens:
+    content = _mapping(value, (*LENS_KINDS, 'fixed'), where)
+    fixed = content.get('fixed', True)
+    if not isinstance(fixed, bool):
+        raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
+    for kind in IN_PIXELS:
+        if kind not in content:
+            raise ConfigError(f'{where}: key "{kind}" is missing')
+    numbers = {
+        kind: parse_number(content[kind], f'{where}.{kind}')
+        for kind in LENS_KINDS
+        if kind in content
+    }
+    return Lens(**numbers, fixed=fixed)

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import ANGLES, DELAY, DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.kinematics.lens import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 
 
@@ -190,6 +191,7 @@ def _layout(
     for frame in frames:
         rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
         rotates[f'{frame}.{DELAY}'] = True
+        rotates |= {f'{frame}.{kind}': False for kind in LENS_KINDS}
     for joint, _ in joints:
         rotates |= {f'{joint}.{kind}': kind in ANGLES for kind in DH_KINDS}
     driven: dict[str, list[str]] = {}
@@ -207,7 +209,7 @@ def _layout(
     still = [
         k
         for name, k in row.items()
-        if name.endswith(f'.{DELAY}') or name.partition('.')[0] in elsewhere
+        if name.partition('.')[2] in (DELAY, *LENS_KINDS) or name.partition('.')[0] in elsewhere
     ]
     order = np.array([row[name] for name in names], dtype=np.intp)
     order.setflags(write=False)

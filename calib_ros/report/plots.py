@@ -17,6 +17,8 @@ from calib_ros.escapes import one_line
 from calib_ros.identification.identification import Identification
 from calib_ros.kinematics.se3 import FloatArray
 
+INCH, MARGIN = 0.0254, 0.01
+"""In metres: an inch, and what is left free around a board."""
 BEFORE_COLOUR, AFTER_COLOUR = '#d95f02', '#1b9e77'
 
 
@@ -140,6 +142,29 @@ def placements_png(placements: Placements) -> bytes:
         positions = placements.positions[reached][:, pair]
         draw_placements(axes, positions, 1e3 * placements.errors[reached], marks, labels)
     return _png(figure)
+
+
+def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> bytes:
+    """Return a page with black rectangles (K, 4) [m] in their true size: left, top, width, height.
+
+    The page is as large as what is on it, with a margin for the hands and the words.
+    """
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    width, height = size[0] + 2.0 * MARGIN, size[1] + 2.0 * MARGIN
+    figure = Figure(figsize=(width / INCH, height / INCH))
+    FigureCanvasPdf(figure)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set(xlim=(-MARGIN, width - MARGIN), ylim=(height - MARGIN, -MARGIN))
+    axes.axis('off')
+    patches = [Rectangle((x, y), w, h) for x, y, w, h in rectangles.tolist()]
+    axes.add_collection(PatchCollection(patches, facecolor='black', edgecolor='none', linewidth=0))
+    axes.text(0.0, size[1] + 0.5 * MARGIN, words, fontsize=7, va='center', parse_math=False)
+    buffer = BytesIO()
+    figure.savefig(buffer, format='pdf', metadata={'CreationDate': None})
+    return buffer.getvalue()
 
 
 def _png(figure: Figure) -> bytes:

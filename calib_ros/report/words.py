@@ -20,6 +20,8 @@ from calib_ros.identification.validation import Comparison, ErrorFigures, Parame
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record, table_hash
+from calib_ros.kinematics.lens import IN_PIXELS, of_lens
+from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.calibration import Calibration
 from calib_ros.settings import Settings
 
@@ -44,6 +46,8 @@ def summary(
     before, after = (result.validation or result.fitted).figures
     text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
+    if before.rms_px is not None and after.rms_px is not None:
+        text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
     if result.outliers:
@@ -86,7 +90,11 @@ def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, in
 
 def weakly_determined(result: Identification) -> tuple[str, ...]:
     """Return the fitted parameters that are hardly known: judge them by predictions only."""
-    return tuple(p.name for p in result.parameters if p.std is not None and p.std > WEAK)
+    return tuple(
+        p.name
+        for p in result.parameters
+        if p.std is not None and p.std > WEAK and not of_lens(p.name)
+    )
 
 
 def provenance(result: Identification) -> dict[str, Any]:
@@ -227,6 +235,8 @@ def unit(name: str) -> str:
     kind = name.partition('.')[2]
     if kind == DELAY:
         return 's'
+    if of_lens(name):
+        return 'px' if kind in IN_PIXELS else '1'
     if kind in DH_KINDS or kind in FRAME_KINDS:
         return 'm' if is_length(name) else 'rad'
     return effects.unit(name)
@@ -256,8 +266,8 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
         '',
         f'"Before" is {BEFORE}. Validated by {result.validated_by}.',
         '',
-        '| poses | | number | RMS [mm] | mean | max | mean + 3 sigma | RMS [mrad] |',
-        '|---|---|---|---|---|---|---|---|',
+        '| poses | | number | RMS [mm] | mean | max | mean + 3 sigma | RMS [mrad] | RMS [px] |',
+        '|---|---|---|---|---|---|---|---|---|',
     ]
     for label, which in (('fitted', result.fitted), ('not fitted', result.validation)):
         if which is not None:
@@ -287,6 +297,8 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
     lines += [f'- {in_markdown(each)}' for each in identifiability_in_words(result)]
     lines += ['', '## Parameters', '']
     lines += ['Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.', '']
+    if any(of_lens(p.name) for p in result.parameters):
+        lines[-1:] = ['Those of lenses in px, and of their distortion as it is.', '']
     lines += [
         '| parameter | value [m, rad] | offset | std | 95 % | |',
         '|---|---|---|---|---|---|',
@@ -388,6 +400,25 @@ def identifiability_in_words(result: Identification) -> list[str]:
     return lines
 
 
+def cameras_in_words(result: Identification) -> list[str]:
+    """Return where cameras and boards are, and the lenses that were fitted."""
+    chain = result.chain
+    cameras = [name for name in chain.frame_names if chain.frame(name).lens is not None]
+    lines = []
+    fitted = result.fitted.figures[1]
+    if fitted.rms_px is not None:
+        lines.append(f'RMS {fitted.rms_px:.3f} px on the corners fitted')
+    for name in chain.frame_names if cameras else ():
+        frame = chain.frame(name)
+        place = ' '.join(f'{x:.6f}' for x in frame.matrix[:3, 3].tolist())
+        turn = ' '.join(f'{x:.6f}' for x in to_quat(frame.matrix[:3, :3]).tolist())
+        lines.append(f'{name}: xyz {place} m, quaternion xyzw {turn}')
+        if frame.lens is not None and not frame.lens.fixed:
+            values = ', '.join(f'{kind} {x:.6g}' for kind, x in frame.lens.values.items())
+            lines.append(f'{name}: {values}')
+    return lines
+
+
 def observability_in_words(result: Identification) -> str:
     """Return the observability indices."""
     o = result.observability
@@ -396,17 +427,19 @@ def observability_in_words(result: Identification) -> str:
 
 def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
     turn = '' if figures.rms_mrad is None else f'{figures.rms_mrad:.3f}'
+    seen = '' if figures.rms_px is None else f'{figures.rms_px:.3f}'
     return (
         f'| {label} | {when} | {figures.count} | {figures.rms_mm:.3f} | {figures.mean_mm:.3f} | '
-        f'{figures.max_mm:.3f} | {figures.mean_plus_3_sigma_mm:.3f} | {turn} |'
+        f'{figures.max_mm:.3f} | {figures.mean_plus_3_sigma_mm:.3f} | {turn} | {seen} |'
     )
 
 
 def _parameter_row(p: Parameter) -> str:
     width = p.half_width(0.95)
-    std = '' if p.std is None else f'{1e3 * p.std:.4f}'
-    within = '' if width is None else f'{1e3 * width:.4f}'
-    offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
+    scale = 1.0 if of_lens(p.name) else 1e3
+    std = '' if p.std is None else f'{scale * p.std:.4f}'
+    within = '' if width is None else f'{scale * width:.4f}'
+    offset = '' if p.std is None else f'{scale * p.offset:+.4f}'
     note = '' if p.status == 'fitted' else p.status
     return f'| {in_markdown(p.name)} | {p.value:.9f} | {offset} | {std} | {within} | {note} |'
 

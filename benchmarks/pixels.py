@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels of a board: is the estimator at the limit, how much better than by poses, how fast?
+
+    python benchmarks/pixels.py [--runs 300] [--images 40] [--speed]
+
+Simulated UR10e with errors of 0.5 mm and 1 mrad, a board of 8 x 5 corners 30 mm apart, 0.3 px of
+noise on each coordinate. `mse_over_crlb` and `coverage_95` are those of `monte_carlo.py`. The same
+images are identified from the pose of the board in each image as well (PnP, fed as poses):
+`error_mm` is the RMS position error that each leaves on other configurations in view.
+"""
+
+import argparse
+import os
+import time
+from dataclasses import replace
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
+from calib_ros.identification import identifiability
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import triangular_factor
+from calib_ros.identification.resection import board_poses
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
+
+SIGMA = 0.3
+POINTS = np.array([(0.03 * i, 0.03 * j, 0.0) for j in range(5) for i in range(8)])
+CASES = {
+    'camera on the flange, intrinsics given': (True, True),
+    'camera on the flange, intrinsics fitted': (True, False),
+    'camera fixed, intrinsics given': (False, True),
+    'camera fixed, intrinsics fitted': (False, False),
+}
+OFF = {'fx': 8.0, 'fy': -6.0, 'cx': 5.0, 'cy': -7.0, 'k1': 0.02, 'k2': -0.03}
+"""By how much intrinsics are wrong before they are fitted."""
+
+
+def scene(nominal, seed, on_flange, given, images):
+    """Return the true chain, the nominal one with its lens, what was seen, and other joints."""
+    rng = np.random.default_rng(seed)
+    camera = Camera()
+    true = before_camera(faulty(nominal, Cell(), rng), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, images, rng, SIGMA)
+    other = photograph(true, camera, POINTS[:1], on_flange, 50, rng).joints
+    lens = camera.lens if given else replace(camera.lens.moved(OFF), fixed=False)
+    frame = Frame(lens=lens)
+    known = replace(nominal, tool=frame) if on_flange else replace(nominal, base=frame)
+    return true, known, seen, other
+
+
+def error_of(chain, true, joints):
+    """Return the RMS distance [mm] of positions at other joint values."""
+    away = (chain.forward(joints) - true.forward(joints))[:, :3, 3]
+    return 1e3 * float(np.sqrt((away**2).sum(axis=1).mean()))
+
+
+def one_run(nominal, seed, on_flange, given, images):
+    """Return squared deviation / bound (P,), hits (P,), errors [mm] by pixels and by poses."""
+    true, known, seen, other = scene(nominal, seed, on_flange, given, images)
+    problem = Problem(known, seen, held_out=seen.select(np.arange(80)), sigma_pixel=SIGMA)
+    result = identify(problem)
+    bound = identifiability.covariance(
+        triangular_factor(true, result.names, problem.system([seen]))
+    )
+    deviation = np.array([result.chain.offset(name, true) for name in result.names])
+    width = {p.name: p.half_width() for p in result.parameters if p.std is not None}
+    hits = np.abs(deviation) <= [width[name] for name in result.names]
+    frame = known.tool if on_flange else known.base
+    poses = board_poses(seen, frame.lens)
+    by_poses = identify(Problem(known, poses, held_out=poses.select(np.arange(2))))
+    errors = error_of(result.chain, true, other), error_of(by_poses.chain, true, other)
+    return deviation**2 / np.diag(bound), hits, errors
+
+
+def speed(nominal):
+    """Print how long 500 images of 40 corners take."""
+    for given in (True, False):
+        _, known, seen, _ = scene(nominal, 0, True, given, 500)
+        taken = []
+        for _ in range(5):
+            begin = time.process_time()
+            identify(Problem(known, seen, sigma_pixel=SIGMA))
+            taken.append(time.process_time() - begin)
+        print(f'500 images, intrinsics {"given" if given else "fitted"}: {min(taken):.3f} s (CPU)')
+
+
+def main():
+    """Run all cases and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--runs', type=int, default=300)
+    parser.add_argument('--images', type=int, default=40)
+    parser.add_argument('--speed', action='store_true', help='only how long 500 images take')
+    options = parser.parse_args()
+    nominal = load_chain('ur10e')
+    if options.speed:
+        speed(nominal)
+        return
+    print(f'{options.runs} runs of {options.images} images')
+    for name, case in CASES.items():
+        rows = [one_run(nominal, seed, *case, options.images) for seed in range(options.runs)]
+        ratios = np.array([row[0].mean() for row in rows])
+        hits = np.concatenate([row[1] for row in rows])
+        errors = np.sqrt((np.array([row[2] for row in rows]) ** 2).mean(axis=0))
+        print(
+            f'{name}: MSE / CRLB {ratios.mean():.3f}, coverage {100 * hits.mean():.1f} %, error '
+            f'{errors[0]:.4f} mm by pixels, {errors[1]:.4f} mm by poses from PnP',
+            flush=True,
+        )
+
+
+if __name__ == '__main__':
+    main()

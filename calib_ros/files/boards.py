@@ -1,0 +1,329 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Boards that cameras see, where their corners are, and tables of corners found in images.
+
+A board is YAML: `type, columns, rows, square, marker, dictionary`, lengths in metres.
+
+charuco   columns x rows squares, black at the upper left, markers in the white ones; its corners
+          are those inside, numbered row by row
+markers   columns x rows markers, `square` from one to the next; marker k has the corners
+          4 k ... 4 k + 3, clockwise from its upper left
+
+The frame of the board has x to the right, y down and z away from who looks at it; its origin is
+the upper left corner of the first square, or of the first marker.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.escapes import from_cell, to_cell
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import (
+    LARGEST_TABLE,
+    Row,
+    decoded,
+    parse_yaml,
+    read_bytes,
+    read_rows,
+    read_text,
+)
+from calib_ros.values import QUATERNION_TOLERANCE, cell_integer, cell_number, parse_number
+
+TYPES = ('charuco', 'markers')
+KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
+MOST = 100
+"""Columns and rows of a board."""
+HEADER = ('image', 'corner', 'u', 'v')
+DISTORTED = ('plumb_bob', 'rational_polynomial')
+HALF = np.pi / 2
+POSED = 'flange_pose'
+"""Name of the virtual arm."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board: sizes in metres; `legacy` has a white square at the upper left."""
+
+    type: str
+    columns: int
+    rows: int
+    square: float
+    marker: float
+    dictionary: str
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be printed."""
+        if self.type not in TYPES:
+            raise UnknownNameError('type of board', self.type, TYPES)
+        least = 2 if self.type == 'charuco' else 1
+        for name in ('columns', 'rows'):
+            if not least <= getattr(self, name) <= MOST:
+                raise ConfigError(
+                    f'{name} of a board must be from {least} to {MOST}, not {getattr(self, name)}'
+                )
+        if not 0.0 < self.marker < self.square:
+            raise ConfigError(
+                f'a board needs 0 < marker < square in metres, not {self.marker:g} and '
+                f'{self.square:g}'
+            )
+
+    @property
+    def corners(self) -> FloatArray:
+        """Return the corners (M, 3) [m] by their numbers."""
+        if self.type == 'charuco':
+            x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
+            flat = self.square * np.column_stack([x.ravel(), y.ravel()])
+        else:
+            x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+            first = self.square * np.column_stack([x.ravel(), y.ravel()])
+            around = self.marker * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+            flat = (first[:, np.newaxis] + around).reshape(-1, 2)
+        return np.column_stack([flat, np.zeros(len(flat))])
+
+    @property
+    def markers(self) -> FloatArray:
+        """Return the upper left corners (K, 2) [m] of the markers by their numbers."""
+        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
+        place = np.column_stack([x.ravel(), y.ravel()])
+        if self.type == 'markers':
+            return np.asarray(self.square * place)
+        white = place[place.sum(axis=1) % 2 == (0 if self.legacy_pattern else 1)]
+        return np.asarray(self.square * white + 0.5 * (self.square - self.marker))
+
+    @property
+    def legacy_pattern(self) -> bool:
+        """Tell whether the square at the upper left is white: a legacy board of even rows."""
+        return self.legacy and self.rows % 2 == 0
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Return width and height [m]."""
+        less = 0.0 if self.type == 'charuco' else self.square - self.marker
+        return self.columns * self.square - less, self.rows * self.square - less
+
+
+def read_board(path: Path) -> Board:
+    """Read the YAML of a board."""
+    content = parse_yaml(read_text(path, what='board '), str(path))
+    if not isinstance(content, dict):
+        raise ConfigError(f'{path} must be a mapping with the keys {", ".join(KEYS)}')
+    for key in content:
+        if key not in KEYS:
+            raise UnknownNameError(f'key in {path}', str(key), KEYS)
+    for key in KEYS[:-1]:
+        if key not in content:
+            raise ConfigError(f'{path}: key "{key}" is missing')
+    counts = {}
+    for key in ('columns', 'rows'):
+        if type(content[key]) is not int:
+            raise ConfigError(f'{path}: {key} must be a whole number, not {content[key]!r}')
+        counts[key] = int(content[key])
+    if not isinstance(content.get('legacy', False), bool):
+        raise ConfigError(f'{path}: legacy must be true or false, not {content["legacy"]!r}')
+    return Board(
+        str(content['type']),
+        counts['columns'],
+        counts['rows'],
+        parse_number(content['square'], f'{path}: square'),
+        parse_number(content['marker'], f'{path}: marker'),
+        str(content['dictionary']),
+        bool(content.get('legacy', False)),
+    )
+
+
+def read_lens(path: Path) -> Lens:
+    """Read the intrinsics that camera_calibration writes, or the same keys plainly."""
+    content = parse_yaml(read_text(path, what='intrinsics '), str(path))
+    if not isinstance(content, dict):
+        raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
+    model = content.get('distortion_model', DISTORTED[0])
+    if model not in DISTORTED:
+        raise ConfigError(f'{path}: distortion_model must be plumb_bob, not {model!r}')
+    matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
+    if len(matrix) != 9:
+        raise ConfigError(f'{path}: camera_matrix must hold 9 numbers, not {len(matrix)}')
+    fx, skew, cx, *rest = matrix
+    _, fy, cy = rest[:3]
+    if skew or fx <= 0.0 or fy <= 0.0:
+        raise ConfigError(f'{path}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
+    distortion = _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False)
+    if any(distortion[5:]):
+        raise ConfigError(f'{path}: of distortion only k1 k2 p1 p2 k3 are known')
+    k1, k2, p1, p2, k3 = (*distortion[:5], *(0.0,) * (5 - len(distortion[:5])))
+    return Lens(fx, fy, cx, cy, k1, k2, p1, p2, k3)
+
+
+def _numbers(
+    content: Mapping[str, Any], keys: Sequence[str], path: Path, required: bool = True
+) -> list[float]:
+    value = next((content[key] for key in keys if key in content), None)
+    if isinstance(value, dict):
+        value = value.get('data')
+    if value is None and not required:
+        return []
+    if not isinstance(value, list):
+        raise ConfigError(f'{path}: {keys[0]} must be numbers, as camera_calibration writes it')
+    return [parse_number(each, f'{path}: {keys[0]}') for each in value]
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """Corners found in images: `image` (N,) numbers the names, `corner` (N,), `pixels` (N, 2)."""
+
+    names: tuple[str, ...]
+    image: NDArray[np.intp]
+    corner: NDArray[np.intp]
+    pixels: FloatArray
+
+    def as_csv(self) -> str:
+        """Return the table of a row per corner."""
+        text = io.StringIO(newline='')
+        writer = csv.writer(text, lineterminator='\n')
+        writer.writerow(HEADER)
+        for image, corner, (u, v) in zip(
+            self.image.tolist(), self.corner.tolist(), self.pixels.tolist(), strict=True
+        ):
+            writer.writerow([to_cell(self.names[image]), corner, f'{u:.4f}', f'{v:.4f}'])
+        return text.getvalue()
+
+
+def read_detections(path: Path, board: Board) -> Detections:
+    """Read a table of corners of a board."""
+    header, rows = _table(path, HEADER)
+    del header
+    most = len(board.corners)
+    names: dict[str, int] = {}
+    seen: dict[tuple[int, int], int] = {}
+    image, corner, pixels = [], [], []
+    for line, row in rows:
+        where = f'{path}, line {line}'
+        name = from_cell(row.get('image') or '')
+        number = cell_integer(row.get('corner') or '', f'{where}: corner')
+        if not 0 <= number < most:
+            raise InputError(
+                f'{where}: corner must be from 0 to {most - 1} on this board, not {number}'
+            )
+        key = (names.setdefault(name, len(names)), number)
+        if key in seen:
+            raise InputError(f'{where}: corner {number} of image {name} is there already')
+        seen[key] = line
+        image.append(key[0])
+        corner.append(number)
+        pixels.append([cell_number(row.get(k), f'{where}: {k}') for k in 'uv'])
+    order = np.argsort(image, kind='stable')
+    return Detections(
+        tuple(names),
+        np.array(image, dtype=np.intp)[order],
+        np.array(corner, dtype=np.intp)[order],
+        np.array(pixels)[order],
+    )
+
+
+def posed_arm() -> Chain:
+    """Return a virtual arm whose joint values are a pose: x y z [m], then turns about x y z.
+
+    It takes the place of an arm of which only the flange's poses are known.
+    """
+    return Chain(
+        POSED,
+        'standard',
+        (
+            Joint('flange_z', 'prismatic', theta=HALF, alpha=HALF),
+            Joint('flange_x', 'prismatic', theta=HALF, alpha=HALF),
+            Joint('flange_y', 'prismatic', alpha=-HALF),
+            Joint('flange_rx', alpha=HALF),
+            Joint('flange_ry', theta=HALF, alpha=HALF),
+            Joint('flange_rz'),
+        ),
+    )
+
+
+def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
+    """Return the joint values (N, 6) with which the virtual arm is at poses of the flange."""
+    sine = np.clip(rotations[:, 0, 2], -1.0, 1.0)
+    first = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
+    cosine, along = np.cos(first), np.sin(first)
+    last = np.arctan2(
+        cosine * rotations[:, 1, 0] + along * rotations[:, 2, 0],
+        cosine * rotations[:, 1, 1] + along * rotations[:, 2, 1],
+    )
+    x, y, z = positions.T
+    return np.column_stack([z, x, y, first, np.arcsin(sine), last])
+
+
+def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
+    """Read where the arm was at each image; return joint values (n,) by name, and if by poses.
+
+    A table with `image` and q1 ... qn, or with the flange's pose x y z qx qy qz qw.
+    """
+    header, rows = _table(path, ('image',))
+    names = [f'q{k + 1}' for k in range(joints)]
+    posed = 'q1' not in header
+    if posed:
+        names = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
+    missing = [name for name in names if name not in header]
+    if missing:
+        raise InputError(
+            f'{path}: {", ".join(missing)} missing: give q1 ... q{joints}, or x y z qx qy qz qw '
+            'of the flange'
+        )
+    found: dict[str, FloatArray] = {}
+    for line, row in rows:
+        where = f'{path}, line {line}'
+        name = from_cell(row.get('image') or '')
+        if name in found:
+            raise InputError(f'{where}: image {name} is there already')
+        found[name] = np.array([cell_number(row.get(k), f'{where}: {k}') for k in names])
+        if posed and abs(float(np.linalg.norm(found[name][3:])) - 1.0) > QUATERNION_TOLERANCE:
+            raise InputError(f'{where}: qx qy qz qw must have length 1')
+    if posed and found:
+        values = np.array(list(found.values()))
+        places = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
+        found = dict(zip(found, places, strict=True))
+    return found, posed
+
+
+def observed(
+    found: Detections, board: Board, places: Mapping[str, FloatArray], on_flange: bool
+) -> tuple[Observations, tuple[str, ...]]:
+    """Return the corners of all images at which the arm's place is known, and warnings."""
+    known = np.array([name in places for name in found.names], dtype=bool)
+    if not known.any():
+        raise InputError(
+            'no image has joint values: the names in column "image" of both tables must be alike, '
+            f'as {next(iter(found.names), "")!r} and {next(iter(places), "")!r} are not'
+        )
+    lost = [name for name, yes in zip(found.names, known.tolist(), strict=True) if not yes]
+    warnings = (f'no joint values for {len(lost)} images: {", ".join(lost[:5])}',) if lost else ()
+    kept = known[found.image]
+    image = found.image[kept]
+    joints = np.array([places[found.names[k]] for k in image.tolist()])
+    points = board.corners[found.corner[kept]]
+    seen = Observations.from_pixels(joints, found.pixels[kept], points, image, on_flange)
+    return seen, warnings
+
+
+def _table(path: Path, needed: Sequence[str]) -> tuple[Sequence[str], list[tuple[int, Row]]]:
+    data = read_bytes(path, LARGEST_TABLE, InputError)
+    header, rows = read_rows(decoded(data, str(path), InputError), path)
+    missing = [name for name in needed if name not in header]
+    if missing:
+        raise InputError(f'{path}: column {", ".join(missing)} missing')
+    if not rows:
+        raise InputError(f'{path} has no rows')
+    return header, rows

@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels of known points of a board, for the solver.
+
+The residual of a point is u_measured - u in pixels. All points of an image see the same pose, so
+their rows are
+
+    [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
+
+and a triangular factor of [G | L | residual] has the same normal matrix as the rows themselves: 16
+rows an image at most, however many points it shows. Gross errors are told point by point, and
+image by image, by the sum over its points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.identification.leastsquares import Samples, seen_residuals
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.lens import LENS_KINDS, View, at_the_board, require_lens, view
+from calib_ros.kinematics.se3 import FloatArray
+
+BOUNDED = 3.0
+"""Usual residuals that one point counts for at most in the sum of its image."""
+POINTS = 4096
+"""Points that are linearised at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Some images, linearised.
+
+    `columns` (6 + K + 1, 2, C) are the weighted derivatives of all points by twist and lens, the
+    residual last; `owner` (C,) counts the image of each point from the block's first; `twist`
+    (P, 6, b) is what parameters do to the pose of each image; `lens` the rows of the K parameters
+    of the lens among the P.
+    """
+
+    part: slice
+    owner: NDArray[np.intp]
+    columns: FloatArray
+    twist: FloatArray
+    lens: list[int]
+    seen: View
+    model: ErrorModel
+
+
+class PixelSamples(Samples):
+    """One set of pixels laid out for the solver.
+
+    Parameters
+    ----------
+    observations : Observations
+    sigma_pixel : float
+        Standard deviation [px] of each coordinate.
+
+    """
+
+    def __init__(self, observations: Observations, sigma_pixel: float, *_: float) -> None:
+        super().__init__(observations, sigma_pixel, sigma_pixel)
+        assert observations.pixels is not None
+        assert observations.points is not None
+        self.rows = 2 * self.count
+        self._pixels = np.ascontiguousarray(observations.pixels.T)
+        self._points = np.ascontiguousarray(observations.points.T)
+        self._images = observations.images
+        self._begins = np.flatnonzero(np.diff(self._images, prepend=-1))
+        self._shifts: FloatArray | None = None
+
+    @property
+    def width(self) -> int:
+        """Return the number of rows of a sample."""
+        return 2
+
+    def blocks(
+        self, chain: Chain, names: Sequence[str]
+    ) -> Iterator[tuple[FloatArray, FloatArray, ErrorModel]]:
+        """Yield rows (P + 1, R) with the normal matrix of all points, a block at a time."""
+        for block in self._linearised(chain, names):
+            size, _, points = block.columns.shape
+            images = block.twist.shape[2]
+            first = np.flatnonzero(np.diff(block.owner, prepend=-1))
+            number = np.arange(points) - first[block.owner]
+            stacked = np.zeros((images, int(number.max()) + 1, 2, size))
+            stacked[block.owner, number] = block.columns.transpose(2, 1, 0)
+            factor = np.asarray(np.linalg.qr(stacked.reshape(images, -1, size), mode='r'))
+            rows = np.empty((len(block.twist) + 1, images, factor.shape[1]))
+            arm = factor[:, :, :6] @ block.twist.transpose(2, 1, 0)
+            rows[:-1] = arm.transpose(2, 0, 1)
+            for k, row in enumerate(block.lens):
+                rows[row] = factor[:, :, 6 + k]
+            rows[-1] = factor[:, :, -1]
+            yield rows.reshape(len(rows), -1), np.zeros((0, 0)), block.model
+
+    def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
+        """Yield the rows (P + 1, 2, C) of all points, a block at a time."""
+        shifts = np.empty((self.count, 2, 3))
+        for block in self._linearised(chain, names):
+            rows = np.empty((len(block.twist) + 1, *block.columns.shape[1:]))
+            twist = block.twist[:, :, block.owner]
+            np.einsum('psc,skc->pkc', twist, block.columns[:6], out=rows[:-1])
+            for k, row in enumerate(block.lens):
+                rows[row] = block.columns[6 + k]
+            rows[-1] = block.columns[-1]
+            for k in range(2):
+                unit = np.zeros((2, len(block.owner)))
+                unit[k] = self.sigmas[0]
+                shifts[block.part, k] = at_the_board(block.seen, unit)
+            yield (rows[[*block.model.order, len(names)]],)
+        self._shifts = shifts
+
+    def position_errors(self, residuals: FloatArray) -> FloatArray:
+        """Return what weighted residuals (rows,) are at the board, (N, 3) [m].
+
+        By the chain at which rows were asked for last; robust weights are taken to be one.
+        """
+        assert self._shifts is not None
+        return np.asarray(np.einsum('nk,nkc->nc', residuals.reshape(-1, 2), self._shifts))
+
+    def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals in sigma (N, 2), and NaN (N, 3) in place of an orientation."""
+        pixels, _ = seen_residuals(chain, self.observations)
+        return pixels / self.sigmas[0], np.full((self.count, 3), np.nan)
+
+    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
+        """Yield the residuals of all points, and of all images: what their points share.
+
+        No point counts for more than some usual ones in its image.
+        """
+        found, _ = self.whitened_residuals(chain)
+        yield found, slice(None)
+        if not self.count:
+            return
+        length = np.linalg.norm(found, axis=1, keepdims=True)
+        most = BOUNDED * np.median(length)
+        sums = np.add.reduceat(
+            found * np.minimum(1.0, most / np.maximum(length, 1e-300)), self._begins
+        )
+        yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
+
+    def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Block]:
+        """Yield blocks of whole images with about POINTS points."""
+        seen_by = self.observations
+        model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
+        lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
+        kinds = [kind for kind in LENS_KINDS if f'{seen_by.camera}.{kind}' in names]
+        row = dict(zip(names, model.order.tolist(), strict=True))
+        joints, velocity = self.moving(chain)
+        ends = np.append(self._begins, self.count)
+        first = 0
+        while first < len(self._begins):
+            last = max(int(np.searchsorted(ends, ends[first] + POINTS, 'right')) - 1, first + 1)
+            images, part = self._begins[first:last], slice(int(ends[first]), int(ends[last]))
+            approach = None if self.approach is None else self.approach[:, images]
+            moving = None if velocity is None else velocity[:, images]
+            axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
+            owner = self._images[part] - self._images[part.start]
+            shape = (3, len(images))
+            seen = view(
+                lens,
+                [np.broadcast_to(axis, shape)[:, owner] for axis in axes],
+                np.broadcast_to(origin, shape)[:, owner],
+                self._points[:, part],
+                seen_by.on_flange,
+            )
+            columns = np.concatenate(
+                [
+                    seen.by_twist,
+                    lens.by_lens(seen.points, kinds),
+                    (self._pixels[:, part] - seen.pixels)[np.newaxis],
+                ]
+            )
+            columns /= self.sigmas[0]
+            if self.weights is not None:
+                columns *= self.weights[part]
+            twist = np.zeros((len(names), 6, len(images)))
+            twist[:, :3] = shift[:-1]
+            twist[: model.rotations, 3:] = turn[:-1]
+            own = [row[f'{seen_by.camera}.{kind}'] for kind in kinds]
+            yield _Block(part, owner, columns, twist, own, seen, model)
+            first = last
+
+
+def samples_of(
+    observations: Observations, sigmas: tuple[float, float], sigma_pixel: float
+) -> Samples:
+    """Return observations of any kind as the solver takes them; sigmas [m, rad] and [px]."""
+    if observations.pixels is not None:
+        return PixelSamples(observations, sigma_pixel)
+    return Samples(observations, *sigmas)

@@ -1,0 +1,181 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The pose of a flat board in each image, from its points alone (PnP).
+
+A homography from the board to the undistorted image, linear in its nine entries, gives a first
+pose (Zhang 2000), and Gauss-Newton steps on the pixels the pose. A small or distant board looks
+much the same when it is turned to the other side of the line of sight (Oberkampf et al. 1996), so
+that pose is refined as well, and the one with the smaller residuals counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import InputError
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.lens import Lens, view
+from calib_ros.kinematics.se3 import FloatArray
+
+FEWEST = 4
+"""Points of a board that tell its pose."""
+FLAT = 1e-3
+"""Thickness of a board, of its size, up to which it is flat."""
+IN_LINE = 1e-2
+"""Width of points, of their length, up to which they are in line and tell no pose."""
+STEPS = 15
+SETTLED = 1e-4
+"""Fall of the squares below which an image has its pose."""
+DAMPING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPoses:
+    """Poses (M, 4, 4) of the board in the camera, and RMS residuals (M,) [px] of the images."""
+
+    poses: FloatArray
+    rms: FloatArray
+
+
+def board_poses(observations: Observations, lens: Lens) -> Observations:
+    """Return pixels as poses, one for each image that tells one.
+
+    Raises
+    ------
+    InputError
+        When no image shows enough points.
+
+    """
+    index = observations.images
+    good = np.flatnonzero(_tell_a_pose(observations, index))
+    first = np.flatnonzero(np.diff(index, prepend=-1))[good]
+    if not len(good):
+        raise InputError(
+            f'no image shows {FEWEST} points of the board that are not in line: nothing tells '
+            'where the camera is'
+        )
+    rows = observations.select(np.isin(index, good))
+    found = resect(rows, lens)
+    alone = replace(rows, pixels=None, points=None, on_flange=False).select(
+        np.searchsorted(np.flatnonzero(np.isin(index, good)), first)
+    )
+    seen = replace(
+        alone,
+        positions=found.poses[:, :3, 3],
+        rotations=found.poses[:, :3, :3],
+        oriented=np.ones(len(alone), dtype=bool),
+    )
+    return seen.inverted() if observations.on_flange else seen
+
+
+def resect(observations: Observations, lens: Lens) -> BoardPoses:
+    """Return the pose of the board in the camera for every image."""
+    assert observations.points is not None
+    assert observations.pixels is not None
+    index = observations.images
+    centre = observations.points.mean(axis=0)
+    _, size, axes = np.linalg.svd(observations.points - centre, full_matrices=False)
+    if size[2] > FLAT * size[0]:
+        raise InputError(
+            'the points of a board must be in a plane: give each face of a body as a board of '
+            'its own'
+        )
+    axes[2] = np.cross(axes[0], axes[1])
+    plane = (observations.points - centre) @ axes.T
+    start = _from_homography(plane[:, :2], lens.rays(observations.pixels), index)
+    local = np.zeros((3, len(plane)))
+    local[:2] = plane[:, :2].T
+    best = _refined(start, local, observations.pixels, index, lens)
+    mirrored = best.poses.copy()
+    sight = mirrored[:, :3, 3] / np.linalg.norm(mirrored[:, :3, 3], axis=1, keepdims=True)
+    normal = mirrored[:, :3, 2]
+    axis = np.cross(normal, sight)
+    along = np.sign((normal * sight).sum(axis=1, keepdims=True))
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    turn = axis * along * 2.0 * np.arcsin(np.clip(sine, 0.0, 1.0)) / np.maximum(sine, 1e-12)
+    mirrored[:, :3, :3] = se3.exp_rotation(turn) @ mirrored[:, :3, :3]
+    other = _refined(mirrored, local, observations.pixels, index, lens)
+    swap = other.rms < best.rms
+    poses = np.where(swap[:, np.newaxis, np.newaxis], other.poses, best.poses)
+    board = se3.transform(axes.T, centre)  # T_board_plane
+    return BoardPoses(poses @ se3.invert(board), np.minimum(best.rms, other.rms))
+
+
+def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return (M,) which images show enough points that are not in line."""
+    assert observations.points is not None
+    count = np.bincount(index)
+    mean = np.stack([np.bincount(index, row) for row in observations.points.T], axis=1)
+    rest = observations.points - (mean / count[:, np.newaxis])[index]
+    outer = np.einsum('ni,nj->nij', rest, rest).reshape(-1, 9)
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins).reshape(-1, 3, 3))
+    return np.asarray((count >= FEWEST) & (spread[:, 1] > IN_LINE**2 * spread[:, 2]))
+
+
+def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:
+    """Return poses (M, 4, 4) from points (N, 2) [m] of the plane and rays (N, 2)."""
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    scale = np.sqrt((plane**2).sum(axis=1).mean())
+    count = np.bincount(index)[:, np.newaxis]
+    centre = np.add.reduceat(rays, begins) / count
+    near = rays - centre[index]
+    size = np.sqrt(np.add.reduceat((near**2).sum(axis=1), begins)[:, np.newaxis] / count)
+    near = near / size[index]
+    point = np.column_stack([plane / scale, np.ones(len(plane))])
+    rows = np.zeros((len(plane), 2, 9))
+    rows[:, 0, :3] = rows[:, 1, 3:6] = point
+    rows[:, :, 6:] = -near[:, :, np.newaxis] * point[:, np.newaxis]
+    normal = np.add.reduceat(np.einsum('nkp,nkr->npr', rows, rows).reshape(-1, 81), begins)
+    _, vectors = np.linalg.eigh(normal.reshape(-1, 9, 9))
+    matrix = vectors[:, :, 0].reshape(-1, 3, 3)
+    back = np.zeros((len(begins), 3, 3))
+    back[:, 0, 0] = back[:, 1, 1] = size[:, 0]
+    back[:, :2, 2], back[:, 2, 2] = centre, 1.0
+    matrix = back @ matrix @ np.diag([1.0 / scale, 1.0 / scale, 1.0])
+    matrix *= np.sign(matrix[:, 2, 2])[:, np.newaxis, np.newaxis]  # in front of the camera
+    length = np.linalg.norm(matrix[:, :, :2], axis=1).mean(axis=1)
+    matrix /= np.maximum(length, 1e-300)[:, np.newaxis, np.newaxis]
+    rotation = np.empty_like(matrix)
+    rotation[:, :, :2] = matrix[:, :, :2]
+    rotation[:, :, 2] = np.cross(matrix[:, :, 0], matrix[:, :, 1])
+    left, _, right = np.linalg.svd(rotation)
+    left[:, :, -1] *= np.linalg.det(left @ right)[:, np.newaxis]
+    return se3.transform(left @ right, matrix[:, :, 2])
+
+
+def _refined(
+    poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
+) -> BoardPoses:
+    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2)."""
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    count = np.bincount(index)
+    best, least = poses.copy(), np.full(len(poses), np.inf)
+    damping = np.full(len(poses), DAMPING)
+    step_from = (np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6)))
+    for _ in range(STEPS):
+        axes = [poses[index, :3, k].T for k in range(3)]
+        seen = view(lens, axes, poses[index, :3, 3].T, points, False)
+        rows = np.concatenate([seen.by_twist, (pixels.T - seen.pixels)[np.newaxis]])
+        outer = np.einsum('pkc,rkc->cpr', rows, rows).reshape(-1, 49)
+        normal = np.add.reduceat(outer, begins).reshape(-1, 7, 7)
+        better = normal[:, 6, 6] < least
+        settled = least - normal[:, 6, 6] < SETTLED * least
+        least = np.where(better, normal[:, 6, 6], least)
+        best[better] = poses[better]
+        step_from[0][better], step_from[1][better] = normal[better, :6, :6], normal[better, :6, 6]
+        if settled.all():
+            break
+        damping = np.where(better, np.maximum(0.1 * damping, DAMPING), 100.0 * damping)
+        scale = np.sqrt(np.maximum(np.einsum('mpp->mp', step_from[0]), 1e-300))
+        scaled = step_from[0] / (scale[:, :, np.newaxis] * scale[:, np.newaxis])
+        scaled += damping[:, np.newaxis, np.newaxis] * np.eye(6)
+        step = np.linalg.solve(scaled, (step_from[1] / scale)[..., np.newaxis])[..., 0] / scale
+        poses = best.copy()
+        poses[:, :3, 3] += step[:, :3]
+        poses[:, :3, :3] = se3.exp_rotation(step[:, 3:]) @ poses[:, :3, :3]
+    return BoardPoses(best, np.sqrt(least / count))

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Boards in photographs: found, refused with the reason, printed, and identified from."""
+
+import csv
+import json
+import os
+import re
+import zlib
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from calib_ros.cli.main import main
+from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.files import boards, images
+from calib_ros.kinematics import se3
+
+cv2 = pytest.importorskip('cv2')
+DATA = os.environ.get('CALIB_ROS_DATA')
+REAL = Path(DATA or '.') / 'charuco_wrist_camera_fixed'
+CHARUCO = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_6X6_250')
+MARKERS = boards.Board('markers', 4, 5, 0.04, 0.03, 'DICT_APRILTAG_36h11')
+SCALE = 5000.0
+"""Pixels of a drawn board per metre."""
+
+
+@cache
+def drawn(board):
+    """Return a board as it is printed, SCALE pixels a metre."""
+    width, height = (round(side * SCALE) for side in board.size)
+    page = np.full((height, width), 255, dtype=np.uint8)
+
+    def black(left, top, size):
+        first, last = np.round([[left, top], [left + size, top + size]]).astype(int) * 1
+        page[first[1] : last[1], first[0] : last[0]] = 0
+
+    side = board.square * SCALE
+    if board.type == 'charuco':
+        for row, column in np.ndindex(board.rows, board.columns):
+            if (row + column) % 2 == 0:
+                black(column * side, row * side, side)
+    for cells, (left, top) in zip(images.marker_cells(board), board.markers * SCALE, strict=True):
+        size = board.marker * SCALE / len(cells)
+        for row, column in np.argwhere(cells):
+            black(left + column * size, top + row * size, size)
+    return page
+
+
+def photograph(board, turn=(0.2, 0.3, 0.1), depth=0.5, blur=0.7, noise=2.0, shift=(0.0, 0.0)):
+    """Return an image of a board, and where its corners are in it [px]."""
+    rotation = se3.exp_rotation(np.array(turn))
+    middle = np.array([*shift, depth]) - rotation @ board.corners.mean(axis=0)
+    camera = np.array([[1300.0, 0.0, 640.0], [0.0, 1300.0, 480.0], [0.0, 0.0, 1.0]])
+    matrix = camera @ np.column_stack([rotation[:, :2], middle])
+    finer = np.array([[4.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]])
+    page = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, SCALE]]) / SCALE
+    large = cv2.warpPerspective(
+        drawn(board), finer @ matrix @ page, (5120, 3840), flags=cv2.INTER_AREA, borderValue=210
+    )
+    image = cv2.resize(large, (1280, 960), interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(image, (0, 0), blur).astype(float)
+    image += np.random.default_rng(0).normal(size=image.shape) * noise
+    seen = np.column_stack([board.corners[:, :2], np.ones(len(board.corners))]) @ matrix.T
+    return np.clip(image, 0, 255).astype(np.uint8), seen[:, :2] / seen[:, 2:]
+
+
+@pytest.mark.parametrize(('board', 'limit'), [(CHARUCO, 0.1), (MARKERS, 0.4)])
+def test_corners_are_where_they_are(board, limit):
+    image, exact = photograph(board)
+    number, pixels = images.Detector(board).of(image)
+    assert number.tolist() == list(range(len(board.corners)))
+    away = pixels - exact[number]
+    assert np.abs(away.mean(axis=0)).max() < 0.05  # no half pixel
+    assert np.sqrt((away**2).sum(axis=1).mean()) < limit
+
+
+def test_images_are_refused_with_the_reason():
+    image, _ = photograph(CHARUCO)
+    other = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_4X4_50')
+    small = boards.Board('charuco', 3, 3, 0.036, 0.026, 'DICT_6X6_250')
+    wider = boards.Board('markers', 3, 6, 0.036, 0.026, 'DICT_6X6_250')
+    whole = images.Detector(CHARUCO)
+    cases = [
+        (whole, photograph(CHARUCO, blur=4.0)[0], r'blurred: its sharpest edges are \d+ px wide'),
+        (whole, photograph(CHARUCO, shift=(0.27, 0.2))[0], 'of the 24 corners, fewer than 6'),
+        (whole, np.full((480, 640), 90, np.uint8), 'no marker of DICT_6X6_250: is the board in'),
+        (whole, np.zeros((0, 0), np.uint8), 'no image that OpenCV can read'),
+        (images.Detector(other), image, r'no marker of DICT_4X4_50, but \d+ of DICT_6X6'),
+        (images.Detector(small), image, 'another board: marker'),
+        (images.Detector(wider), image, r'do not fit the board \(\d+ px off\)'),
+    ]
+    for detector, picture, reason in cases:
+        found = detector.of(picture)
+        assert isinstance(found, str), reason
+        assert re.search(reason, found), found
+
+
+def test_what_opencv_does_not_know_is_refused():
+    with pytest.raises(ConfigError, match='unknown dictionary "DICT_6X6_25"'):
+        images.Detector(boards.Board('charuco', 5, 7, 0.03, 0.02, 'DICT_6X6_25'))
+    with pytest.raises(ConfigError, match='DICT_4X4_50 has 50 markers, the board needs 60'):
+        images.Detector(boards.Board('markers', 6, 10, 0.03, 0.02, 'DICT_4X4_50'))
+
+
+def test_a_board_is_printed_in_its_true_size(tmp_path, capsys):
+    out = tmp_path / 'board.pdf'
+    words = 'board charuco --columns 5 --rows 7 --square 0.036 --marker 0.026 --dictionary'
+    assert main([*words.split(), 'DICT_6X6_250', '--out', str(out)]) == 0
+    assert '180.00 x 252.00 mm' in capsys.readouterr().out
+    assert boards.read_board(out.with_suffix('.yaml')) == CHARUCO
+    content = out.read_bytes()
+    box = re.search(rb'/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]', content)
+    points = [72.0 / 25.4 * side for side in (180.0 + 20.0, 252.0 + 20.0)]
+    assert [float(side) for side in box.groups()] == pytest.approx(points, abs=0.01)
+    streams = re.findall(rb'stream\r?\n(.*?)endstream', content, re.DOTALL)
+    drawing = max((zlib.decompress(each) for each in streams if each[:1] == b'x'), key=len)
+    assert drawing.count(b'\nh\n') + drawing.count(b' h\n') > 100  # squares and runs of cells
+    assert main([*words.split(), 'DICT_6X6_250', '--out', str(out)]) == 1
+    assert 'exists already' in capsys.readouterr().err
+
+
+BOARD = 'type: charuco\ncolumns: 5\nrows: 7\nsquare: 0.036\nmarker: 0.026\ndictionary: D\n'
+
+
+@pytest.mark.parametrize(
+    ('old', 'new', 'said'),
+    [
+        ('columns: 5', 'columns: 5.0', 'columns must be a whole number'),
+        ('columns: 5', 'columns: 1', 'columns of a board must be from 2 to 100, not 1'),
+        ('marker: 0.026', 'marker: 0.036', 'needs 0 < marker < square'),
+        ('rows: 7\n', '', 'key "rows" is missing'),
+        ('charuco', 'chess', 'unknown type of board "chess"'),
+        ('rows', 'lines', 'unknown key'),
+    ],
+)
+def test_boards_that_are_none_are_refused(tmp_path, old, new, said):
+    path = tmp_path / 'board.yaml'
+    path.write_text(BOARD.replace(old, new))
+    with pytest.raises(CalibrationError, match=said):
+        boards.read_board(path)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('image,corner,u\na,0,1\n', 'column v missing'),
+        ('image,corner,u,v\na,24,1,2\n', 'line 2: corner must be from 0 to 23 on this board'),
+        ('image,corner,u,v\na,0,1,2\na,0,1,2\n', 'line 3: corner 0 of image a is there already'),
+        ('image,corner,u,v\na,0,x,2\n', 'line 2: u'),
+        ('image,corner,u,v\n', 'has no rows'),
+    ],
+)
+def test_detections_that_are_none_are_refused(tmp_path, text, said):
+    path = tmp_path / 'detections.csv'
+    path.write_text(text)
+    with pytest.raises(InputError, match=said):
+        boards.read_detections(path, CHARUCO)
+
+
+def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
+    path = tmp_path / 'camera.yaml'
+    path.write_text(INTRINSICS)
+    lens = boards.read_lens(path)
+    assert (lens.fx, lens.fy, lens.cx, lens.cy) == (1352.02747, 1356.14287, 789.67065, 627.2995)
+    assert (lens.k1, lens.p2, lens.fixed) == (0.0, 0.0, True)
+    path.write_text(INTRINSICS.replace('plumb_bob', 'equidistant'))
+    with pytest.raises(ConfigError, match='must be plumb_bob'):
+        boards.read_lens(path)
+
+
+def test_the_virtual_arm_is_where_the_flange_is(rng):
+    rotations = se3.exp_rotation(rng.normal(size=(50, 3)))
+    positions = rng.normal(size=(50, 3))
+    found = boards.posed_arm().forward(boards.joints_of_poses(positions, rotations))
+    np.testing.assert_allclose(found, se3.transform(rotations, positions), atol=1e-12)
+
+
+INTRINSICS = """\
+image_width: 1600
+image_height: 1200
+camera_matrix: {rows: 3, cols: 3, data: [1352.02747, 0.0, 789.67065, 0.0, 1356.14287, 627.2995,
+  0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
+"""
+REAL_BOARD = BOARD.replace('0.036', '0.036195').replace('0.026', '0.018256')
+
+
+@pytest.fixture(scope='module')
+def photographs(tmp_path_factory):
+    """Return a folder with board, intrinsics and the corners of the real photographs."""
+    if not DATA:
+        pytest.skip('CALIB_ROS_DATA is not set')
+    folder = tmp_path_factory.mktemp('charuco')
+    (folder / 'board.yaml').write_text(REAL_BOARD.replace('D\n', 'DICT_6X6_250\n'))
+    (folder / 'camera.yaml').write_text(INTRINSICS)
+    assert main(['images', str(REAL / 'images'), *corners_to(folder, 'corners.csv')]) == 0
+    return folder
+
+
+def corners_to(folder, name):
+    return ['--board', str(folder / 'board.yaml'), '--out', str(folder / name)]
+
+
+@pytest.mark.parametrize(('lens', 'least', 'limit'), [('given', 2.4, 2.66), ('fitted', 0.5, 1.10)])
+def test_the_real_photographs(photographs, capsys, lens, least, limit):
+    words = ['identify', '--chain', 'flange_pose', '--json', '--lens', lens]
+    for name, file in (('detections', 'corners.csv'), ('board', 'board.yaml')):
+        words += [f'--{name}', str(photographs / file)]
+    words += ['--intrinsics', str(photographs / 'camera.yaml')]
+    assert main([*words, '--places', str(REAL / 'poses.csv')]) == 3  # nothing of an arm
+    document = json.loads(capsys.readouterr().out)
+    fitted = document['fitted']['after']
+    assert fitted['count'] >= (290 if int(cv2.__version__.partition('.')[0]) > 4 else 260)
+    assert least < fitted['rms_px'] <= limit
+    assert document['rank'] == (12 if lens == 'given' else 21)
+    assert document['parameters']['base.fx']['unit'] == 'px'
+    assert document['parameters']['base.fx']['status'] == (
+        'fixed' if lens == 'given' else 'fitted'
+    )
+
+
+def test_a_bag_of_the_real_photographs(photographs, capsys):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = store.types
+    bag = photographs / 'bag'
+    files = sorted((REAL / 'images').iterdir(), key=lambda path: (len(path.name), path.name))
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        kinds = ('Image', 'CompressedImage')
+        raw, packed = (
+            writer.add_connection(f'/{kind}', f'sensor_msgs/msg/{kind}', typestore=store)
+            for kind in kinds
+        )
+        for k, path in enumerate(files[:4]):
+            time = types['builtin_interfaces/msg/Time'](k + 1, 0)
+            header = types['std_msgs/msg/Header'](time, 'camera')
+            data = np.frombuffer(path.read_bytes(), np.uint8)
+            image = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2BGR)
+            whole = types['sensor_msgs/msg/Image'](
+                header, *image.shape[:2], 'bgr8', 0, 4800, image.ravel()
+            )
+            small = types['sensor_msgs/msg/CompressedImage'](header, 'png', data)
+            for connection, message in ((raw, whole), (packed, small)):
+                kind = connection.msgtype
+                writer.write(connection, k, store.serialize_cdr(message, kind))
+    assert main(['images', str(bag), *corners_to(photographs, 'none.csv')]) == 1
+    assert 'several topics of images, choose one with --topic' in capsys.readouterr().err
+    with (photographs / 'corners.csv').open() as file:
+        names = [path.name for path in files[:4]]
+        wanted = [row for row in csv.DictReader(file) if row['image'] in names]
+    for kind in kinds:
+        words = ['images', str(bag), '--topic', f'/{kind}']
+        assert main([*words, *corners_to(photographs, f'{kind}.csv')]) == 0
+        with (photographs / f'{kind}.csv').open() as file:
+            found = list(csv.DictReader(file))
+        assert [row['u'] for row in found] == [row['u'] for row in wanted]
+        assert found[0]['image'] == '1000000000'

@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a board in images, as measurements of the arm."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import seen_residuals
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.pixels import PixelSamples
+from calib_ros.identification.resection import board_poses, resect
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
+
+UR = load_chain('ur5e')
+POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
+SIGMA = 0.3
+CAMERA = Camera()
+
+
+@cache
+def scene(seed, on_flange, count=30, noise=SIGMA, exact=False):
+    """Return the true chain, and images of the board."""
+    rng = np.random.default_rng(seed)
+    arm = UR if exact else faulty(UR, Cell(), rng)
+    true = before_camera(arm, CAMERA, POINTS, on_flange, rng)
+    return true, photograph(true, CAMERA, POINTS, on_flange, count, rng, noise)
+
+
+def known(on_flange, lens=CAMERA.lens):
+    return replace(UR, **{'tool' if on_flange else 'base': Frame(lens=lens)})
+
+
+def error(found, true, seen):
+    """Return the RMS error [m] of positions over the range of the joints."""
+    joints = UR.random_joints(200, np.random.default_rng(5))
+    away = found.forward(joints)[:, :3, 3] - true.forward(joints)[:, :3, 3]
+    return np.sqrt((away**2).sum(axis=1).mean())
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+@settings(max_examples=4)
+@given(seed=st.integers(0, 1000))
+def test_the_jacobian_is_that_of_differences(on_flange, seed):
+    true, seen = scene(seed, on_flange, 3)
+    chain = true.with_effects(['elbow_joint.sin_1'])
+    names = list(chain.parameter_names)
+    samples = PixelSamples(seen, 0.5)
+    samples.weights = np.random.default_rng(seed).uniform(0.1, 1.0, len(seen))
+    rows = samples.rows_of(chain, names)
+    for k, name in enumerate(names):
+        step = 1e-4 if name.partition('.')[2] in ('fx', 'fy', 'cx', 'cy') else 1e-6
+        more, less = (
+            seen_residuals(chain.with_offsets({name: s * step}), seen)[0] for s in (1.0, -1.0)
+        )
+        change = samples.weights[:, np.newaxis] * (less - more) / (2.0 * step * 0.5)
+        scale = np.abs(change).max() + 1.0
+        np.testing.assert_allclose(rows[:, :, k], change, atol=1e-6 * scale, err_msg=name)
+    residual = samples.weights[:, np.newaxis] * seen_residuals(chain, seen)[0] / 0.5
+    np.testing.assert_allclose(rows[:, :, -1], residual, atol=1e-12)
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_few_rows_an_image_have_the_same_normal_matrix(on_flange):
+    true, seen = scene(1, on_flange, 5)
+    seen = seen.select(np.arange(len(seen)) % 7 != 0)
+    names = true.parameter_names
+    samples = PixelSamples(seen, SIGMA)
+    rows = samples.rows_of(true, names).reshape(-1, len(names) + 1)
+    found = np.zeros((len(names) + 1,) * 2)
+    count = 0
+    for block, _, model in samples.blocks(true, names):
+        order = [*model.order, len(names)]
+        found += block[order] @ block[order].T
+        count += block.shape[1]
+    assert count == 5 * 16 < len(rows)
+    scale = np.sqrt(np.maximum(np.diag(found), 1.0))
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), rows.T @ rows / np.outer(scale, scale), atol=1e-9
+    )
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 10_000), st.booleans())
+def test_an_image_tells_the_pose_of_a_board(seed, on_flange):
+    true, seen = scene(seed, on_flange, 4, noise=0.0, exact=True)
+    poses = board_poses(seen, CAMERA.lens)
+    exact = true.forward(poses.joints)
+    np.testing.assert_allclose(poses.positions, exact[:, :3, 3], atol=1e-7)
+    np.testing.assert_allclose(poses.rotations, exact[:, :3, :3], atol=1e-7)
+
+
+def test_images_that_tell_no_pose_are_left_out():
+    _, seen = scene(3, False, 4, noise=0.0, exact=True)
+    index, corner = np.divmod(np.arange(len(seen)), len(POINTS))
+    line = (index == 1) & (corner >= 6)
+    few = (index == 2) & (corner >= 3)
+    poses = board_poses(seen.select(~(line | few)), CAMERA.lens)
+    first = np.flatnonzero(corner == 0)[[0, 3]]
+    np.testing.assert_array_equal(poses.joints, seen.joints[first])
+    with pytest.raises(InputError, match='no image shows 4 points'):
+        board_poses(seen.select((index == 1) & ~line), CAMERA.lens)
+    bent = replace(seen, points=seen.points + np.array([0.0, 0.0, 0.02]) * (corner % 2)[:, None])
+    with pytest.raises(InputError, match='must be in a plane'):
+        resect(bent, CAMERA.lens)
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_the_arm_is_found_by_pixels(on_flange):
+    true, seen = scene(1, on_flange)
+    result = identify(Problem(known(on_flange), seen, sigma_pixel=SIGMA))
+    assert result.accepted, result.refusals
+    assert result.rank == 30
+    assert result.gauges['wrist_3_joint.d']
+    before, after = result.validation.figures
+    assert after.rms_px == pytest.approx(SIGMA * np.sqrt(2.0), rel=0.1)
+    assert after.rms_mm < 0.3 < before.rms_mm
+    assert error(result.chain, true, seen) < 0.3 * error(result.before, true, seen)
+    off = [result.chain.offset(name, true) for name in result.names]
+    size = np.abs(off) / np.sqrt(np.diag(result.covariance))
+    assert np.median(size) < 1.5
+    assert size.max() < 5.0
+    assert result.chain.frame('tool' if on_flange else 'base').lens == CAMERA.lens
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_a_lens_is_fitted_with_the_arm(on_flange):
+    true, seen = scene(2, on_flange, 40)
+    wrong = replace(CAMERA.lens.moved({'fx': 8.0, 'fy': -6.0, 'cx': 5.0, 'k1': 0.02}), fixed=False)
+    result = identify(Problem(known(on_flange, wrong), seen, sigma_pixel=SIGMA))
+    assert result.accepted, result.refusals
+    assert result.rank == 39
+    rows = {p.name.partition('.')[2]: p for p in result.parameters if p.name.count('.f')}
+    for p in rows.values():
+        exact = getattr(CAMERA.lens, p.name.partition('.')[2])
+        assert abs(p.value - exact) < 4.0 * p.std
+    given = identify(Problem(known(on_flange, replace(wrong, fixed=True)), seen, loss='none'))
+    assert error(result.chain, true, seen) < error(given.chain, true, seen)
+
+
+def test_a_prior_holds_a_lens():
+    _, seen = scene(2, False, 12)
+    wrong = replace(CAMERA.lens.moved({'fx': 8.0}), fixed=False)
+    held = identify(
+        Problem(known(False, wrong), seen, sigma_pixel=SIGMA, priors={'base.f?': 1e-3})
+    )
+    assert held.priors == {'base.fx': 1e-3, 'base.fy': 1e-3}
+    assert held.chain.value('base.fx') == pytest.approx(wrong.fx, abs=0.1)
+    with pytest.raises(ConfigError, match='frames are unknown or known'):
+        Problem(known(False), seen, priors={'base.x': 1.0})
+
+
+def test_gross_errors_of_corners_and_images_are_named(rng):
+    true, seen = scene(4, True)
+    pixels = seen.pixels.copy()
+    corners = rng.choice(len(seen), 20, replace=False)
+    pixels[corners] += rng.choice([-1.0, 1.0], (20, 2)) * rng.uniform(10.0, 200.0, (20, 2))
+    image = seen.images == 7
+    pixels[image] += 1.2  # below what names a corner, but all alike
+    spoilt = replace(seen, pixels=pixels)
+    result = identify(Problem(known(True), spoilt, sigma_pixel=SIGMA))
+    named = {each.sample for each in result.outliers}
+    assert named == set(corners) | set(np.flatnonzero(image))
+    clean = identify(Problem(known(True), seen, sigma_pixel=SIGMA))
+    assert not clean.outliers
+    assert error(result.chain, true, seen) < 1.5 * error(clean.chain, true, seen)
+
+
+def test_pixels_and_poses_in_one_fit(rng):
+    true, seen = scene(5, False)
+    seen = replace(seen, base='base_camera', tool='tool_board')
+    true = replace(true, frames=(('base_camera', true.base), ('tool_board', true.tool)))
+    tracked = replace(true, base=Frame(), tool=Frame())
+    poses = measure(tracked, UR.random_joints(20, rng), rng, 5e-5, 2e-4)
+    chain = UR.with_frame('base_camera', Frame(lens=CAMERA.lens))
+    both = identify(Problem(chain, poses, more=[seen], sigma_pixel=SIGMA, sigma_position=5e-5))
+    alone = identify(Problem(UR, poses, sigma_position=5e-5))
+    assert both.accepted, both.refusals
+    assert both.rank == 30 + 6 + 6
+    assert error(both.chain, tracked, seen) < error(alone.chain, tracked, seen)
+
+
+def test_held_out_images_judge_in_pixels_and_millimetres():
+    _, seen = scene(6, True, 40)
+    fitted = seen.images < 30
+    result = identify(
+        Problem(known(True), seen.select(fitted), held_out=seen.select(~fitted), sigma_pixel=SIGMA)
+    )
+    figures = result.validation.figures[1]
+    assert figures.count == 10 * len(POINTS)
+    assert figures.rms_px == pytest.approx(SIGMA * np.sqrt(2.0), rel=0.2)
+    depth = CAMERA.depth / CAMERA.lens.fx
+    assert figures.rms_mm == pytest.approx(1e3 * depth * figures.rms_px, rel=0.15)
+
+
+def test_pixels_without_a_lens_are_refused():
+    _, seen = scene(1, False, 3)
+    with pytest.raises(InputError, match=r'need the intrinsics of their camera \(base\)'):
+        Problem(UR, seen)
+    with pytest.raises(InputError, match='pixels need the points'):
+        replace(seen, points=None)
+    with pytest.raises(InputError, match='pixels of 72 observations'):
+        Observations.from_pixels(seen.joints, seen.pixels[:, :1], seen.points, seen.images)
