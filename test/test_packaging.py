@@ -76,7 +76,7 @@ def test_package_xml_names_everything_that_is_imported():
     package = ET.parse(ROOT / 'package.xml').getroot()
     declared = {element.text for element in package.iter('exec_depend')}
     declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
-    declared.add('cv2')  # for photographs only, `pip install calib_ros[camera]`
+    declared |= {'cv2', 'openpyxl'}  # for photographs and workbooks only, extras as well
     keys = {'yaml': 'python3-yaml'}
     keys |= {
         name: f'python3-{name}' for name in ('jinja2', 'matplotlib', 'numpy', 'plotly', 'scipy')
