@@ -92,7 +92,7 @@ class Seen:
         """Draw all figures, as printing does."""
         self.page.evaluate("dispatchEvent(new Event('beforeprint'))")
         self.page.wait_for_function(
-            "[...document.querySelectorAll('.plot')].every((e) => e.querySelector('.main-svg'))"
+            "[...document.querySelectorAll('div.plot')].every((e) => e.querySelector('.main-svg'))"
         )
 
     @property
