@@ -225,3 +225,11 @@ def random_offsets(chain, rng, size=1e-3):
 
 
 # ---- forward kinematics
+
+
+def by_kinpy(text, names, q, base, tip):
+    import kinpy
+
+    serial = kinpy.build_serial_chain_from_urdf(text, tip, base)
+    assert tuple(serial.get_joint_parameter_names()) == names
+    return np.array([serial.forward_kinematics(row).matrix() for row in q])

@@ -26,7 +26,8 @@ from calib_ros.files.bags import Recording, replay, write_bag
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report import plots, words
+from calib_ros.report import page, plots, reports, words
+from calib_ros.report.page import Origin
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -448,10 +449,12 @@ def identified(monkeypatch):
     def found(label, seed):
         problem = Problem(load_chain('ur5e'), measured(seed=seed))
         result, settings = identify(problem), Settings(folds=seed)
-        text = words.configuration_yaml('ur5e', settings)
-        return result, {'samples': label}, (f'of {label}',), text, ''
+        origin = Origin(settings=words.configuration_yaml('ur5e', settings))
+        return main._Identified(problem, result, {'samples': label}, (f'of {label}',), origin)
 
     monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
+    monkeypatch.setattr(reports, 'identification_report', lambda *of: of[1])
+    monkeypatch.setattr(page, 'render', lambda result: f'page of {result.names}')
     monkeypatch.setattr(words, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: '')))
     return {'A': found('A', 5), 'B': found('B', 6)}
 
@@ -461,8 +464,9 @@ def test_an_identification_that_is_killed_mixes_nothing(
     tmp_path, monkeypatch, identified, accepted
 ):
     if not accepted:
-        result, *rest = identified['B']
-        identified['B'] = (replace(result, refusals=('no gain',)), *rest)
+        found = identified['B']
+        refused = replace(found.result, refusals=('no gain',))
+        identified['B'] = found._replace(result=refused)
     out = tmp_path / 'out'
 
     def run(label):

@@ -23,6 +23,7 @@ from urdfs import (
     UR_JOINTS,
     ZERO,
     Z,
+    by_kinpy,
     ends,
     numbers,
     place,
@@ -400,14 +401,6 @@ def by_yourdfpy(text, names, q, base, tip):
         robot.update_cfg(dict(zip(names, row, strict=True)))
         poses.append(robot.get_transform(tip, base))
     return np.array(poses)
-
-
-def by_kinpy(text, names, q, base, tip):
-    import kinpy
-
-    serial = kinpy.build_serial_chain_from_urdf(text, tip, base)
-    assert tuple(serial.get_joint_parameter_names()) == names
-    return np.array([serial.forward_kinematics(row).matrix() for row in q])
 
 
 HAND_WRITTEN = """<?xml version='1.0' encoding='utf-8'?>\r
