@@ -306,11 +306,11 @@ def clean_set(seed):
     ), f'{chain.name}, {count} {"poses" if oriented else "points"}, {kind}'
 
 
-def of_clean_sets(count):
+def of_clean_sets(count, first):
     """Print how many clean sets have a mistake named; return their number."""
     alarms = 0
     begin = time.process_time()
-    for seed in range(count):
+    for seed in range(first, first + count):
         problem, what = clean_set(seed)
         found = mistakes.explained(problem)
         if found is not None:
@@ -325,12 +325,13 @@ def main():
     """Print the table, or the false alarms."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('--clean', type=int, metavar='N', help='simulated sets without a mistake')
+    parser.add_argument('--first', type=int, default=0, metavar='SEED', help='of these')
     parser.add_argument('--only', default='', metavar='SET', help='columns with this in the name')
     parser.add_argument('--rows', type=int, default=0, help='rows of each set, else all')
     parser.add_argument('--json', action='store_true')
     options = parser.parse_args()
     if options.clean is not None:
-        of_clean_sets(options.clean)
+        of_clean_sets(options.clean, options.first)
     else:
         of_real_robots(options.only, options.rows, options.json)
 

@@ -9,7 +9,7 @@ NEARER times that as given and within what faulty arms show; those that explain 
 together.
 
 The typical error is the median over the samples of the distance and the angle times LEVER, in
-units of the spread of the positions that the joint values make.
+units of the spread of the positions.
 Nothing can be told where a mistake makes no difference: a first joint's zero is the base's turn,
 a last one's the tool's.
 """
@@ -200,8 +200,8 @@ def _few(observations: Observations) -> Observations:
 class _Trial:
     """A chain with its frames for some samples, and their typical error [m].
 
-    `share` is the error in units of the spread of the flange's positions: in millimetres taken
-    for metres, or degrees for radians, every error is small.
+    `share` is the error in units of the spread of the positions, of the flange or measured, which
+    is less: with metres taken for millimetres, or radians for degrees, every error is small.
     """
 
     chain: Chain
@@ -223,7 +223,8 @@ def _tried(chain: Chain, sets: Sets) -> _Trial | None:
         if best is None:
             return None
         bare = replace(best[1], base=None, tool=None).forward(each.joints)[:, :3, 3]
-        spreads.append(float(np.sqrt(bare.var(axis=0).sum())))
+        seen = bare if each.socket else each.positions  # in sockets there is no measured place
+        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (bare, seen)))
         chain = chain.with_frame(each.base, best[1].frame('base'))
         chain = chain.with_frame(each.tool, best[1].frame('tool'))
     return _trial(chain, sets, float(np.median(spreads)))
