@@ -248,7 +248,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
 
     tables = options.csv or options.detections
     if (options.bag is None) == (tables is None):
-        raise InputError('give either a bag, or --csv FILE, --detections FILE or both')
+        raise InputError('give either a bag or --csv FILE, --detections FILE or both of these')
     source = 'table' if tables else 'bag'
     useless = (
         ('joint_topics', 'sources', 'joint_names', 'frame_id')

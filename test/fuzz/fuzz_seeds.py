@@ -40,6 +40,17 @@ points:
   velocities: [0.0, 1e-3, 0.0]
 ---
 """
+FOREIGN = """separator: ';'
+decimal: ','
+length: mm
+angle: deg
+euler: ZYX
+columns: {q1: A1, q2: A2, q3: J3 + J2, x: X, y: Y, z: Z, r1: A, r2: B, r3: C}
+===
+A1;A2;J2;J3;X;Y;Z;A;B;C
+1,5;2;3;4;100;2;3;10;20;30
+1,6;2;3;4;100;2;3;10;20;30
+"""
 OPTIONS = (
     '--sigma-position\n0.001\n--fixed\na.a',
     '--priors\n*.a=0.001',
@@ -132,6 +143,22 @@ def main():
     put('table', 1, 'q1,q2,q3,x,y,z,split\n0.1,0.2,0.3,1,2,3,train\n0.2,0.2,0.3,1,2,3,test\n')
     put('table', 2, 'q1,q2,q3,distance,session,device\n0.1,0.2,0.3,1.5,A,w\n0.2,0.2,0.3,1.6,A,w\n')
     put('table', 3, 'q1,q2,q3,location,socket\n0.1,0.2,0.3,L,1\n0.2,0.2,0.3,L,2\n')
+    put('foreign', 0, FOREIGN)
+    put('foreign', 1, 'quaternion: wxyz\n===\nq1 q2 q3 x y z qw qx qy qz\n1 2 3 1 2 3 1 0 0 0\n')
+    square = 'columns: 4\nrows: 3\nsquare: 0.03\nmarker: 0.02\n'
+    put('board', 0, f'type: charuco\n{square}dictionary: DICT_5X5_250\n')
+    put('board', 1, f'type: markers\n{square}dictionary: DICT_APRILTAG_36h11\n')
+    matrix = '{rows: 3, cols: 3, data: [900, 0, 640, 0, 900, 480, 0, 0, 1]}'
+    bent = '{rows: 1, cols: 5, data: [0.1, 0, 0, 0, 0]}'
+    put(
+        'lens',
+        0,
+        f'camera_matrix: {matrix}\ndistortion_model: plumb_bob\ndistortion_coefficients: {bent}\n',
+    )
+    put(
+        'detections', 0, 'image,corner,u,v\na.png,0,1.5,2\na.png,1,3,4\nb.png,0,1,2\nb.png,5,6,7\n'
+    )
+    put('detections', 1, 'image,q1,q2,q3\na.png,1,2,3\n')
     put('waypoints', 0, 'q1,q2,q3\n0.1,0.2,0.3\n')
     put('waypoints', 1, 'x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n')
     put(

@@ -110,6 +110,47 @@ def table(path):
 
 
 @target('.csv')
+def foreign(path):
+    """The layout in the first lines, up to a mark of its own; then the table."""
+    from calib_ros.files.foreign import Foreign, as_csv
+    from calib_ros.files.layouts import load_layout
+
+    layout, _, rows = path.read_bytes().partition(b'===\n')
+    given = path.with_suffix('.yaml')
+    given.write_bytes(layout)
+    path.write_bytes(rows)
+    columns, _ = Foreign(load_layout(str(given)), ARM).convert(path)
+    as_csv(columns)
+
+
+@target('.yaml')
+def board(path):
+    from calib_ros.files.boards import read_board
+
+    _ = read_board(path).corners
+
+
+@target('.yaml')
+def lens(path):
+    from calib_ros.files.boards import read_lens
+
+    read_lens(path)
+
+
+@target('.csv')
+def detections(path):
+    import numpy as np
+
+    from calib_ros.files.boards import observed, read_board, read_detections, read_places
+
+    known = read_board(CORPUS / 'board' / 'seed0')
+    with contextlib.suppress(CalibrationError):
+        read_places(path, len(ARM.joints))
+    found = read_detections(path, known)
+    observed(found, known, dict.fromkeys(found.names, np.zeros(len(ARM.joints))), False)
+
+
+@target('.csv')
 def journal(path):
     from calib_ros.files.journal import Journal
     from calib_ros.files.tables import read_journal
