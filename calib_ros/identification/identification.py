@@ -310,7 +310,8 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         step=step,
         remarks=remarks(problem, step, coarse),
     )
-    return mistakes.remarked(problem, suspicions.remarked(problem, result))
+    told = mistakes.remarked(problem, result)
+    return suspicions.remarked(problem, told, another=told is result)
 
 
 @dataclass(frozen=True, eq=False)

@@ -61,11 +61,14 @@ EXPLAINED = 0.5
 """Share of the residual squares that couplings explain, or that gravity must explain more."""
 
 
-def remarked(problem: Problem, result: Identification) -> Identification:
-    """Return the result with what is suspicious in it, refused where it cannot be right."""
+def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
+    """Return the result with what is suspicious in it, refused where it cannot be right.
+
+    `another` asks whether it is another robot: not where a mistake is named already.
+    """
     if any(each.socket for each in problem.sets):
         return result  # one place tells nothing of what follows
-    sister = _sister(problem, result)
+    sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
     refusals = (*result.refusals, scale) if certain else result.refusals
     found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
