@@ -310,8 +310,8 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         step=step,
         remarks=remarks(problem, step, coarse),
     )
-    told = mistakes.remarked(problem, result)
-    return suspicions.remarked(problem, told, another=told is result)
+    named = mistakes.remarked(problem, result)
+    return suspicions.remarked(problem, named, another=named is result)
 
 
 @dataclass(frozen=True, eq=False)
