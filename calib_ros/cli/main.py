@@ -67,6 +67,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status
 
 
+class _Help(argparse.ArgumentDefaultsHelpFormatter):
+    """Help that tells a default where there is one."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        given = action.default not in (None, '', False, (), [])
+        return super()._get_help_string(action) if given else action.help
+
+
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='calib_ros', description='Kinematic calibration of industrial arms.'
@@ -79,7 +87,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
             name,
             help=text,
             description=text,
-            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+            formatter_class=_Help,
         )
         added.set_defaults(run=run)
         return added

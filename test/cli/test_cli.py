@@ -469,3 +469,13 @@ def test_wrong_usage_is_status_2(run, arguments):
     with pytest.raises(SystemExit) as caught:
         run(*arguments)
     assert caught.value.code == 2
+
+
+@pytest.mark.parametrize('command', ['identify', 'plan', 'verify', 'import'])
+def test_help_tells_defaults_only_where_there_are_some(capsys, command):
+    with pytest.raises(SystemExit):
+        main([command, '--help'])
+    text = ' '.join(capsys.readouterr().out.split())
+    for nothing in ('(default: None)', '(default: )', '(default: False)'):
+        assert nothing not in text
+    assert command == 'import' or '(default: ' in text
