@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from calib_ros.apply.candidates import Visibility
     from calib_ros.apply.design import Design
     from calib_ros.apply.planning import Plan
-    from calib_ros.apply.workspace import CalibratedArm
+    from calib_ros.identification.calibration import Calibration
     from calib_ros.kinematics.se3 import FloatArray
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
@@ -108,7 +108,7 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
 
 def _add_workspace(parser: argparse.ArgumentParser) -> None:
     from calib_ros.apply.placement import AIMS
-    from calib_ros.apply.workspace import MODELS
+    from calib_ros.identification.calibration import MODELS
 
     add = parser.add_argument
     add('result', type=Path, help='folder of identify --out, or a calibrated chain file alone')
@@ -344,11 +344,12 @@ def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
 
     from calib_ros.apply import placement, workspace
     from calib_ros.files.waypoints import csv_of, joints_csv
+    from calib_ros.identification.calibration import calibration_file, load_calibration
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import plots
     from calib_ros.report.maps import workspace_report
 
-    arm = workspace.CalibratedArm.read(options.result, load_chain(options.chain))
+    arm = load_calibration(options.result, load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
     survey = workspace.survey(arm, options.poses, rng)
@@ -370,20 +371,13 @@ def _workspace_files(options: argparse.Namespace) -> dict[str, str | bytes]:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    origin = origin_of(options, _calibration_files(options.result))
+    origin = origin_of(options, (calibration_file(options.result),))
     contents |= page_of(workspace_report(arm, survey, origin, found))
     return contents | {'workspace.md': words}
 
 
-def _calibration_files(path: Path) -> tuple[Path, ...]:
-    """Return the files of a calibration, or of the folder of a result, that are read."""
-    if not path.is_dir():
-        return (path,)
-    return tuple(path / name for name in ('calibration.yaml', 'result.json'))
-
-
 def _task(
-    options: argparse.Namespace, arm: CalibratedArm, rng: np.random.Generator
+    options: argparse.Namespace, arm: Calibration, rng: np.random.Generator
 ) -> FloatArray | None:
     """Return the poses (K, 4, 4) of the task to place, if there is one."""
     import numpy as np
@@ -398,7 +392,7 @@ def _task(
         return read_poses(options.task)
     if options.joint_box is None:
         return None
-    size = len(arm.after.joints)
+    size = len(arm.chain.joints)
     if len(options.joint_box) != 2 * size:
         raise InputError(
             f'--joint-box: give {size} lower and {size} upper values, not '
@@ -425,15 +419,15 @@ def _verify(options: argparse.Namespace) -> int:
 def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]:
     """Judge, and print what comes out; return the exit status and the files of --out."""
     from calib_ros.apply.verification import in_words, verify
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.files.tables import read_table
     from calib_ros.files.waypoints import read_joints
+    from calib_ros.identification.calibration import calibration_file, load_calibration
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report.poses import poses_to_verify
     from calib_ros.report.verified import verification_report
 
     nominal = load_chain(options.chain)
-    arm = CalibratedArm.read(options.calibration, nominal)
+    arm = load_calibration(options.calibration, nominal)
     sessions = tuple(options.session.split(',')) if options.session else ()
     foreign = foreign_of(options, nominal)
     table = read_table(options.measured, len(nominal.joints), sessions, foreign=foreign)
@@ -457,11 +451,11 @@ def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]
     status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
     if options.out is None:
         return status, {}
-    poses = poses_to_verify(arm.after, sets, found.comparison, table.by_line)
+    poses = poses_to_verify(arm.chain, sets, found.comparison, table.by_line)
     origin = origin_of(
-        options, (options.measured, options.commanded, *_calibration_files(options.calibration))
+        options, (options.measured, options.commanded, calibration_file(options.calibration))
     )
-    report = verification_report(arm.after, found, poses, origin, table.warnings)
+    report = verification_report(arm.chain, found, poses, origin, table.warnings)
     contents: dict[str, str | bytes] = {
         'residuals.csv': poses.table(),
         'verification.txt': f'{words}\n',
@@ -472,9 +466,9 @@ def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]
 def _compensate(options: argparse.Namespace) -> int:
 
     from calib_ros.apply.compensation import POSITIVE, Compensator, compensate_program, in_words
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.atomic import write_file
     from calib_ros.files.trajectories import read_program
+    from calib_ros.identification.calibration import load_calibration
     from calib_ros.kinematics.chain_file import load_chain
 
     if options.out.exists() and not options.force:
@@ -484,9 +478,9 @@ def _compensate(options: argparse.Namespace) -> int:
             '--out is the program itself: keep it, a program compensated twice is wrong'
         )
     nominal = load_chain(options.chain)
-    arm = CalibratedArm.read(options.calibration, nominal)
+    arm = load_calibration(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
-    compensator = Compensator(nominal, arm.after, tuple(options.tool), **limits, region=arm.region)
+    compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
     source = read_program(options.program, nominal.joint_names)
     corrected, result = compensate_program(compensator, source.program)
     if result.refusals:

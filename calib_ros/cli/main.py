@@ -387,16 +387,13 @@ def _export(options: argparse.Namespace) -> int:
     from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
     from calib_ros.files.vendors import VENDOR_FILES, vendor_files
     from calib_ros.files.waypoints import read_joints
-    from calib_ros.kinematics.chain_file import (
-        URDF_SUFFIXES,
-        load_chain,
-        parse_calibration,
-        read_text,
-    )
+    from calib_ros.identification.calibration import load_calibration
+    from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
     from calib_ros.kinematics.urdf import corrected_urdf
 
-    nominal, path = load_chain(options.chain), options.calibration
-    chain, origin = parse_calibration(read_text(path), str(path), nominal)
+    nominal = load_chain(options.chain)
+    calibration = load_calibration(options.calibration, nominal)
+    chain, origin = calibration.chain, calibration.record
     measured = None
     if options.measured is not None:
         measured = read_joints(options.measured, chain)
@@ -547,6 +544,7 @@ def _write_result(
     not: it does not belong to the files beside it any more. `tolerance` is the wanted error [mm].
     """
     from calib_ros.atomic import write_files
+    from calib_ros.identification.calibration import Calibration
     from calib_ros.report import words
     from calib_ros.report.plots import before_after_png
     from calib_ros.report.poses import poses_of
@@ -567,7 +565,7 @@ def _write_result(
     contents |= page_of(report)
     earlier = out / 'calibration.yaml'
     if result.accepted:
-        contents['calibration.yaml'] = words.calibration_yaml(result)
+        contents['calibration.yaml'] = Calibration.of(result).dump()
     elif earlier.exists():
         contents['calibration.previous.yaml'] = earlier.read_bytes()
     write_files(folder, contents)

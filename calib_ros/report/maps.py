@@ -10,7 +10,8 @@ import numpy as np
 
 from calib_ros.apply.placement import Placements
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import CalibratedArm, Spread, Survey, in_base, regions
+from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
@@ -24,7 +25,7 @@ MOST_REGIONS = 6
 
 
 def workspace_report(
-    arm: CalibratedArm, found: Survey, origin: Origin, placed: Placements | None = None
+    arm: Calibration, found: Survey, origin: Origin, placed: Placements | None = None
 ) -> Report:
     """Return the report of a survey, and of the placements of a task if there are any."""
     parts = [('removed by the calibration', found.removed)]
@@ -69,7 +70,7 @@ def workspace_report(
         sections.insert(0, _placed(placed))
     return Report(
         kind='Errors over the workspace',
-        robot=arm.after.name,
+        robot=arm.chain.name,
         verdict=Verdict('info', 'What the calibration changes, and where', tuple(text)),
         accuracy=Section(
             'accuracy',
@@ -81,7 +82,7 @@ def workspace_report(
                 for label, s in spreads
             ),
         ),
-        identity=identity_of(arm.after, origin, corrected=table_hash(arm.after)),
+        identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=tuple(sections),
         inputs=origin.inputs,
         settings=origin.settings,

@@ -12,7 +12,8 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.verification import rms_interval
-from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.apply.workspace import survey
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison, ErrorFigures
@@ -404,7 +405,7 @@ def _parameters(problem: Problem, result: Identification) -> list[Section]:
 
 def _map(result: Identification) -> Section:
     """Return the error map over the workspace."""
-    found = survey(CalibratedArm.of(result), SURVEYED, np.random.default_rng(0))
+    found = survey(Calibration.of(result), SURVEYED, np.random.default_rng(0))
     where = '' if result.region is None else f'The calibration is {result.region.in_words()}.'
     return Section(
         'map',
