@@ -342,7 +342,7 @@ def _outliers(result: Identification, poses: Poses) -> Section:
 def _parameters(problem: Problem, result: Identification) -> list[Section]:
     """Return the parameters of the arm: figures, and a table with all."""
     own = [p for p in result.parameters if not result.chain.owns_frame(p.name)]
-    geometric = [p for p in own if words.unit(p.name) in ('m', 'rad')]
+    geometric = [p for p in own if p.name.unit in ('m', 'rad')]
     effects = {name for name, _ in result.chain.effects}
     geometric = [p for p in geometric if p.name not in effects]
     found = []
@@ -368,7 +368,7 @@ def _parameters(problem: Problem, result: Identification) -> list[Section]:
             )
     rows = []
     for p in result.parameters:
-        unit = words.unit(p.name)
+        unit = p.name.unit
         width = p.half_width()
         offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
         within = '' if width is None else f'{1e3 * width:.4f}'
