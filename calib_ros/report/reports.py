@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.verification import rms_interval
+from calib_ros.apply.confidence import rms_interval
 from calib_ros.apply.workspace import CalibratedArm, survey
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
