@@ -11,8 +11,8 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files import history
-from calib_ros.files.history import Filing, History, Row
+from calib_ros.files.history import UNCACHED, History
+from calib_ros.files.rows import Filing, Row, identified, measured_at, settings_hash
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
@@ -36,8 +36,8 @@ def row(k=0, serial='SN 1/ö', **more):
 
 
 def test_a_row_comes_back_as_it_was_filed(result, tmp_path):
-    settings = history.settings_hash(CHAIN, Settings())
-    filed = history.identified(result, Filing('0042', BEGIN, 'i' * 64, settings, 'a.csv', 'f'))
+    settings = settings_hash(CHAIN, Settings())
+    filed = identified(result, Filing('0042', BEGIN, 'i' * 64, settings, 'a.csv', 'f'))
     store = History(tmp_path / 'history')
     assert store.file(filed)
     assert store.serials() == ('0042',)
@@ -73,7 +73,7 @@ def test_whatever_a_result_depends_on_makes_it_another_one():
     assert len(known) == 6
     settings = [Settings(), Settings(folds=4)]
     nominals = [CHAIN, CHAIN.with_offsets({CHAIN.parameter_names[0]: 1e-3})]
-    hashes = {history.settings_hash(chain, each) for chain in nominals for each in settings}
+    hashes = {settings_hash(chain, each) for chain in nominals for each in settings}
     assert len(hashes) == 4
 
 
@@ -97,7 +97,7 @@ def test_pandas_and_arrow_read_it_as_a_plain_dataset(tmp_path):
 
 def test_what_was_read_before_is_kept_and_never_needed(tmp_path):
     store = History(tmp_path)
-    for k in range(history.UNCACHED):
+    for k in range(UNCACHED):
         store.file(row(k))
     first = store.rows('SN 1/ö')
     (kept,) = (tmp_path / '.cache').iterdir()
@@ -144,9 +144,9 @@ def test_serials_and_places_that_cannot_be():
 def test_the_time_is_that_of_the_measurement():
     rng = np.random.default_rng(0)
     rows = simulation.measure(CHAIN, CHAIN.random_joints(3, rng), rng)
-    assert history.measured_at([rows], BEGIN) == BEGIN
+    assert measured_at([rows], BEGIN) == BEGIN
     stamps = np.array([0, 1, 2], np.int64) + 1_700_000_000_000_000_000
-    at = history.measured_at([replace(rows, stamps_ns=stamps)])
+    at = measured_at([replace(rows, stamps_ns=stamps)])
     assert at == datetime.fromtimestamp(1.7e9, timezone.utc)
 
 
