@@ -13,6 +13,7 @@ import numpy as np
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
 from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.files.rows import EPOCH_NS
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison, ErrorFigures
@@ -31,8 +32,6 @@ MOST_OUTLIERS = 50
 """Outliers that have a row of their own table."""
 SURVEYED = 4000
 """Random poses of the error map."""
-EPOCH_NS = 10**17
-"""Stamps from which on they are times of this century."""
 ISO_9283 = (
     'Terms as in ISO 9283: the position accuracy AP is the distance between the pose commanded '
     'and the mean of the poses attained. Where a pose was measured once, its repeatability is '
