@@ -164,6 +164,7 @@ def detected(
     from calib_ros.files.tables import read_table
     from calib_ros.identification.model_choice import identify_model
     from calib_ros.identification.problem import Problem
+    from calib_ros.identification.reasons import Reason, Rule
     from calib_ros.kinematics.chain import Frame
 
     for name in ('board', 'places'):
@@ -206,7 +207,7 @@ def detected(
     result = identify_model(problem, settings.model)
     if posed:
         reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'
-        result = replace(result, refusals=(reason,))
+        result = replace(result, refusals=(Reason(Rule.POSED, reason),))
     count = sum(map(len, problem.sets))
     samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
     return problem, result, samples, warnings

@@ -17,8 +17,9 @@ from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import Samples, System, minimise
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import Observations
-from calib_ros.kinematics.chain import ANGLES, DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
+from calib_ros.kinematics.parameter import DH_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
 from calib_ros.values import parse_number, parse_numbers
@@ -171,10 +172,10 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
     for joint, other in zip(chain.joints, nominal.joints, strict=True):
         if joint.sign != other.sign:
             names.append(f'the sign of {joint.name}')
-        for kind in DH_KINDS:
-            limit = angle if kind in ANGLES else length
-            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
-                names.append(f'{joint.name}.{kind}')
+        for name in joint.parameters:
+            limit = length if name.is_length else angle
+            if abs(chain.value(name) - nominal.value(name)) > limit:
+                names.append(name)
     return names
 
 
@@ -190,10 +191,10 @@ def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: st
         nominal, base=chain.frame('base'), tool=chain.frame('tool'), frames=chain.frames
     )
     names = [
-        f'{frame}.{kind}'
+        name
         for frame in ('base', 'tool')
         if not start.frame(frame).fixed
-        for kind in FRAME_KINDS
+        for name in parameters_of(frame)
     ]
     if not names:
         return start

@@ -24,8 +24,9 @@ import numpy as np
 from calib_ros import texts
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import DH_KINDS, Chain, Convention, Frame, Joint
-from calib_ros.kinematics.lens import IN_PIXELS, LENS_KINDS, Lens
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS, Parameter
 from calib_ros.kinematics.urdf import MOST_JOINTS, chain_from_urdf
 from calib_ros.texts import parse_yaml
 from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_name, parse_number, parse_numbers
@@ -233,7 +234,12 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     """Return plain values as YAML."""
     import yaml
 
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000))
+    class Dumper(yaml.SafeDumper):
+        """Writes parameters by their names."""
+
+    Dumper.add_representer(Parameter, yaml.SafeDumper.represent_str)
+    text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
+    return str(text)
 
 
 def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]:
