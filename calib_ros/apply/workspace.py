@@ -15,7 +15,7 @@ expected to miss by the root of removed^2 + remaining^2, by its calibrated model
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -28,9 +28,10 @@ from calib_ros.identification.identification import Identification
 from calib_ros.identification.leastsquares import Samples, System, minimise
 from calib_ros.identification.region import Region, region_of_record
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_calibration
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 from calib_ros.texts import read_text
@@ -197,10 +198,10 @@ def _in_frames_of(nominal: Chain, after: Chain) -> Chain:
     base, tool = after.frame('base'), after.frame('tool')
     start = replace(nominal, base=base, tool=tool, frames=after.frames)
     names = [
-        f'{frame}.{kind}'
+        name
         for frame in ('base', 'tool')
         if not start.frame(frame).fixed
-        for kind in FRAME_KINDS
+        for name in parameters_of(frame)
     ]
     if not names:
         return start
@@ -234,6 +235,14 @@ class Survey(Shown):
     turned: FloatArray
     sigma: FloatArray
     remaining: FloatArray
+
+    @property
+    def parts(self) -> dict[str, FloatArray]:
+        """Return the errors (N,) [m] by their names: only what is removed, if no more is known."""
+        found = {'removed by the calibration': self.removed}
+        if not np.isnan(self.remaining).any():
+            found |= {'sigma of what remains': self.sigma, 'expected to remain': self.remaining}
+        return found
 
     @property
     def cloud(self) -> FloatArray:
@@ -350,14 +359,8 @@ def rms_map(
 
 def in_words(survey: Survey) -> str:
     """Return the errors over the workspace as Markdown: figures, and where they are largest."""
-    parts = [('removed by the calibration', survey.removed)]
-    if np.isnan(survey.remaining).any():
-        rest = 'What remains is not known: the covariance is in the folder of the result.'
-    else:
-        parts += [
-            ('sigma of what remains', survey.sigma),
-            ('expected to remain', survey.remaining),
-        ]
+    rest = 'What remains is not known: the covariance is in the folder of the result.'
+    if len(survey.parts) > 1:
         rest = 'Expected to remain: sigma and the RMS error on poses that were not fitted.'
     lines = [
         f'Position errors [mm] at {len(survey.joints)} random poses of the joint range.',
@@ -365,12 +368,11 @@ def in_words(survey: Survey) -> str:
         '| | RMS | mean | median | 95 % | max |',
         '|---|---|---|---|---|---|',
     ]
-    for label, errors in parts:
-        s = Spread.of(1e3 * errors)
-        figures = (s.rms, s.mean, s.median, s.percentile_95, s.max)
-        lines.append(f'| {label} | ' + ' | '.join(f'{value:.4f}' for value in figures) + ' |')
+    for label, errors in survey.parts.items():
+        figures = ' | '.join(f'{value:.4f}' for value in astuple(Spread.of(1e3 * errors)))
+        lines.append(f'| {label} | {figures} |')
     lines += ['', rest]
-    for label, errors in parts[:2]:
+    for label, errors in list(survey.parts.items())[:2]:
         found = regions(survey.positions, errors)
         lines += ['', f'Largest RMS, {label}:', '']
         lines += [f'- {_region_in_words(region)}' for region in found[:3]]

@@ -33,6 +33,7 @@ def detected(
         read_places,
     )
     from calib_ros.identification.problem import Problem
+    from calib_ros.identification.reasons import Reason, Rule
     from calib_ros.kinematics.chain import Frame
 
     for name in ('board', 'places'):
@@ -72,7 +73,7 @@ def detected(
         **given,
     )
     reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'
-    refusals = (reason,) if posed else ()
+    refusals = (Reason(Rule.POSED, reason),) if posed else ()
     count = sum(map(len, problem.sets))
     samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
     return Loaded(problem, samples, warnings, refusals=refusals, instead=posed)

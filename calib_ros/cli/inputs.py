@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from calib_ros.files.bags import Replayed
     from calib_ros.files.tables import Table
     from calib_ros.identification.problem import Problem
+    from calib_ros.identification.reasons import Reason
     from calib_ros.kinematics.chain import Chain
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.settings import Settings
@@ -38,7 +39,7 @@ class Loaded:
     warnings: tuple[str, ...] = ()
     read: str = ''
     lines: bool = False
-    refusals: tuple[str, ...] = ()
+    refusals: tuple[Reason, ...] = ()
     instead: bool = False
 
 

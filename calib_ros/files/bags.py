@@ -39,6 +39,7 @@ from calib_ros.files.salvage import (
     unpacked_files,
 )
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
@@ -86,15 +87,17 @@ class Replayed:
             return f'read {self.read} messages of the bag; how many are lost is not known'
         return f'read {self.read} of {self.recorded} messages of the bag'
 
-    def refusals(self, account: Account, largest_loss: float) -> tuple[str, ...]:
+    def refusals(self, account: Account, largest_loss: float) -> tuple[Reason, ...]:
         """Return why a result must not be accepted: more was lost than a share allows.
 
         Lost is what could not be read and, of joint states and measurements each, what was
         dropped for its stamp or for want of room. What the device did not see is not.
         """
         if self.recorded is None and largest_loss < 1.0:
-            return (f'how much of the bag is lost is not known, {ALLOW} 1',)
-        lost = {'of the messages could not be read': _share(self.recorded, self.read)}
+            text = f'how much of the bag is lost is not known, {ALLOW} 1'
+            return (Reason(Rule.UNKNOWN_LOSS, text),)
+        share = _share(self.recorded, self.read)
+        lost = {'of the messages could not be read': (Rule.UNREADABLE, share)}
         for name, all_of_them in (('joints', account.joint_states), ('poses', account.poses)):
             dropped = sum(
                 count
@@ -102,10 +105,10 @@ class Replayed:
                 if cause.startswith(name) and _LOSS.search(cause) and not _TWICE.search(cause)
             )
             cause = f'of the {name} were dropped for their stamps or for want of room'
-            lost[cause] = _share(all_of_them, all_of_them - dropped)
+            lost[cause] = (Rule.DROPPED, _share(all_of_them, all_of_them - dropped))
         return tuple(
-            f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}'
-            for cause, share in lost.items()
+            Reason(rule, f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}')
+            for cause, (rule, share) in lost.items()
             if share > largest_loss
         )
 

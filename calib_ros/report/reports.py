@@ -11,8 +11,9 @@ from datetime import datetime, timezone
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.verification import rms_interval
+from calib_ros.apply.confidence import rms_interval
 from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.files.rows import EPOCH_NS
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison, ErrorFigures
@@ -31,8 +32,6 @@ MOST_OUTLIERS = 50
 """Outliers that have a row of their own table."""
 SURVEYED = 4000
 """Random poses of the error map."""
-EPOCH_NS = 10**17
-"""Stamps from which on they are times of this century."""
 ISO_9283 = (
     'Terms as in ISO 9283: the position accuracy AP is the distance between the pose commanded '
     'and the mean of the poses attained. Where a pose was measured once, its repeatability is '
@@ -342,7 +341,7 @@ def _outliers(result: Identification, poses: Poses) -> Section:
 def _parameters(problem: Problem, result: Identification) -> list[Section]:
     """Return the parameters of the arm: figures, and a table with all."""
     own = [p for p in result.parameters if not result.chain.owns_frame(p.name)]
-    geometric = [p for p in own if words.unit(p.name) in ('m', 'rad')]
+    geometric = [p for p in own if p.name.unit in ('m', 'rad')]
     effects = {name for name, _ in result.chain.effects}
     geometric = [p for p in geometric if p.name not in effects]
     found = []
@@ -368,7 +367,7 @@ def _parameters(problem: Problem, result: Identification) -> list[Section]:
             )
     rows = []
     for p in result.parameters:
-        unit = words.unit(p.name)
+        unit = p.name.unit
         width = p.half_width()
         offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
         within = '' if width is None else f'{1e3 * width:.4f}'

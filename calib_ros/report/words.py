@@ -16,11 +16,11 @@ import calib_ros
 from calib_ros.escapes import in_markdown
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.region import Region
-from calib_ros.identification.validation import Comparison, ErrorFigures, Parameter
+from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record, table_hash
-from calib_ros.kinematics.lens import IN_PIXELS, of_lens
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.calibration import Calibration
 from calib_ros.settings import Settings
@@ -99,7 +99,7 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     return tuple(
         p.name
         for p in result.parameters
-        if p.std is not None and p.std > WEAK and not of_lens(p.name)
+        if p.std is not None and p.std > WEAK and not p.name.of_lens
     )
 
 
@@ -195,7 +195,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
                 'offset': p.offset,
                 'std': p.std,
                 'half_width_95': p.half_width(0.95),
-                'unit': unit(p.name),
+                'unit': p.name.unit,
                 'status': p.status,
             }
             for p in result.parameters
@@ -234,18 +234,6 @@ def region_figures(region: Region) -> dict[str, Any]:
 
 
 BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
-
-
-def unit(name: str) -> str:
-    """Return the unit of a parameter."""
-    kind = name.partition('.')[2]
-    if kind == DELAY:
-        return 's'
-    if of_lens(name):
-        return 'px' if kind in IN_PIXELS else '1'
-    if kind in DH_KINDS or kind in FRAME_KINDS:
-        return 'm' if is_length(name) else 'rad'
-    return effects.unit(name)
 
 
 def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]) -> str:
@@ -303,7 +291,7 @@ def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[st
     lines += [f'- {in_markdown(each)}' for each in identifiability_in_words(result)]
     lines += ['', '## Parameters', '']
     lines += ['Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.', '']
-    if any(of_lens(p.name) for p in result.parameters):
+    if any(p.name.of_lens for p in result.parameters):
         lines[-1:] = ['Those of lenses in px, and of their distortion as it is.', '']
     lines += [
         '| parameter | value [m, rad] | offset | std | 95 % | |',
@@ -324,7 +312,7 @@ def priors_in_words(result: Identification) -> list[str]:
     known = dict(result.chain.effects)
     why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
     lines = [
-        f'prior on {name}: {sigma:.3g} {unit(name)}{why.get(name, "")}'
+        f'prior on {name}: {sigma:.3g} {Parameter(name).unit}{why.get(name, "")}'
         for name, sigma in result.priors.items()
         if name not in known
     ]
@@ -332,7 +320,7 @@ def priors_in_words(result: Identification) -> list[str]:
     for name in known:
         groups.setdefault(effects.group_of(name), []).append(name)
     for group, names in groups.items():
-        sigma, of = result.priors[names[0]], unit(names[0])
+        sigma, of = result.priors[names[0]], Parameter(names[0]).unit
         lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
     return lines
 
@@ -440,9 +428,9 @@ def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
     )
 
 
-def _parameter_row(p: Parameter) -> str:
+def _parameter_row(p: ParameterRow) -> str:
     width = p.half_width(0.95)
-    scale = 1.0 if of_lens(p.name) else 1e3
+    scale = 1.0 if p.name.of_lens else 1e3
     std = '' if p.std is None else f'{scale * p.std:.4f}'
     within = '' if width is None else f'{scale * width:.4f}'
     offset = '' if p.std is None else f'{scale * p.offset:+.4f}'
@@ -455,7 +443,7 @@ def against_truth(result: Identification, truth: Chain) -> str:
     width = max(len(name) for name in result.names)
     rows = [f'  {"parameter":{width}}     true   identified        std   deviation']
     for p in result.parameters:
-        if p.std is None or p.name.partition('.')[0] in ('base', 'tool'):
+        if p.std is None or p.name.owner in ('base', 'tool'):
             continue
         true = truth.value(p.name) - (p.value - p.offset)
         rows.append(
