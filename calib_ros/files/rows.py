@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.verification import Verification, rms_interval
+from calib_ros.apply.confidence import rms_interval
+from calib_ros.apply.verification import Verification
 from calib_ros.errors import ConfigError
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.observations import Observations
