@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.verification import Verification, rms_interval
+from calib_ros.apply.confidence import rms_interval
+from calib_ros.apply.verification import Verification
 from calib_ros.errors import ConfigError
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.observations import Observations
@@ -129,7 +130,7 @@ def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None)
 
 def identified(result: Identification, about: Filing, kind: str = 'identify') -> Row:
     """Return the row of an identification."""
-    offsets = {each.name: each.offset for each in result.parameters}
+    offsets = {str(each.name): each.offset for each in result.parameters}
     which = result.validation or result.fitted
     shown = which.judged & ~np.isnan(which.after.position).any(axis=1)
     errors = which.after

@@ -251,7 +251,7 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
         'yaxis': axis('predicted RMS error [mm]', type='log'),
     }
     if wanted_mm is not None:
-        line = {'type': 'line', 'xref': 'paper', 'x0': 0, 'x1': 1, 'y0': wanted_mm}
+        line: Figure = {'type': 'line', 'xref': 'paper', 'x0': 0, 'x1': 1, 'y0': wanted_mm}
         layout['shapes'] = [line | {'y1': wanted_mm, 'line': {'color': LIMIT, 'dash': 'dot'}}]
     return {'data': data, 'layout': layout}
 

@@ -47,32 +47,38 @@ def summary(
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
-    if result.unidentifiable:
-        text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
-    if result.outliers:
-        if numbers is None:
-            text += f'; {len(result.outliers)} outliers named in the report carry no weight'
-        else:
-            named = _outliers_in_words(result.outliers, numbers)
-            text += f'; {len(result.outliers)} outliers carry no weight: {named}'
-    if result.chain.effects:
-        groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
-        text += f'; with {len(result.chain.effects)} effects ({", ".join(groups)})'
-    given = set(result.priors) - set(result.weak)
-    if given:
-        text += f'; priors on {len(given)} parameters'
+    if result.outliers and numbers is None:
+        text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+    elif numbers is not None and result.outliers:
+        named = _outliers_in_words(result.outliers, numbers)
+        text += f'; {len(result.outliers)} outliers carry no weight: {named}'
     if result.region is not None:
         text += f'; {result.region.in_words()}'
-    if result.weak:
-        text += f'; hardly determined, held near nominal by priors: {", ".join(result.weak)}'
-    weak = [name for name in weakly_determined(result) if name not in result.weak]
-    if weak:
-        text += f'; weakly determined: {", ".join(weak)}'
-    if notes := (*warnings, *result.remarks):
-        text += f'; note: {"; ".join(notes)}'
+    text = '; '.join((text, *notes(result)))
+    if more := (*warnings, *result.remarks):
+        text += f'; note: {"; ".join(more)}'
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
+
+
+def notes(result: Identification) -> list[str]:
+    """Return what there is to know of the parameters, one thing each."""
+    found = []
+    if result.unidentifiable:
+        found.append(f'not identifiable, kept nominal: {", ".join(result.unidentifiable)}')
+    if result.chain.effects:
+        groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
+        found.append(f'with {len(result.chain.effects)} effects ({", ".join(groups)})')
+    given = set(result.priors) - set(result.weak)
+    if given:
+        found.append(f'priors on {len(given)} parameters')
+    if result.weak:
+        found.append(f'hardly determined, held near nominal by priors: {", ".join(result.weak)}')
+    weak = [name for name in weakly_determined(result) if name not in result.weak]
+    if weak:
+        found.append(f'weakly determined: {", ".join(weak)}')
+    return found
 
 
 def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
