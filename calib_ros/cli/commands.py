@@ -79,7 +79,7 @@ def add_commands(command: Command, given: Sequence[str]) -> None:
 
 
 def _add_plan(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.apply.planning import CRITERIA
+    from calib_ros.apply.choice import CRITERIA
 
     add_chain(parser)
     add = parser.add_argument
@@ -471,7 +471,8 @@ def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]
 
 def _compensate(options: argparse.Namespace) -> int:
 
-    from calib_ros.apply.compensation import POSITIVE, Compensator, compensate_program, in_words
+    from calib_ros.apply.compensation import POSITIVE, Compensator, in_words
+    from calib_ros.apply.program import compensate_program
     from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.atomic import write_file
     from calib_ros.files.trajectories import read_program

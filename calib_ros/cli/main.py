@@ -548,6 +548,7 @@ def _write_result(
     """
     from calib_ros.atomic import write_files
     from calib_ros.report import words
+    from calib_ros.report.markdown import markdown
     from calib_ros.report.plots import before_after_png
     from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report
@@ -557,7 +558,7 @@ def _write_result(
     poses = poses_of(problem, result, lines)
     contents: dict[str, str | bytes] = {
         'result.json': json.dumps(document, indent=2) + '\n',
-        'report.md': words.markdown(result, samples, warnings),
+        'report.md': markdown(result, samples, warnings),
         'residuals.csv': poses.table(),
         'before_after.png': before_after_png(result),
         'settings.yaml': origin.settings,
