@@ -38,7 +38,8 @@ from calib_ros.identification.leastsquares import Samples, System, minimise, tri
 from calib_ros.identification.observations import Observations, configurations
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -278,9 +279,9 @@ def _in_new_frames(
         chain = _rebased(chain, sets)
     if not new_tool:
         return chain
-    names = [f'{each.tool}.{axis}' for each in sets for axis in 'xyz']
+    names = [name for each in sets for name in parameters_of(each.tool)[:3]]
     if new_base:
-        names = [f'{each.base}.{kind}' for each in sets for kind in FRAME_KINDS] + names
+        names = [name for each in sets for name in parameters_of(each.base)] + names
     unoriented = [replace(each, oriented=np.zeros(len(each), bool)) for each in sets]
     system = System(tuple(Samples(replace(each, covariance=None), *UNIT) for each in unoriented))
     names = list(dict.fromkeys(names))

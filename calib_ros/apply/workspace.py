@@ -28,9 +28,10 @@ from calib_ros.identification.identification import Identification
 from calib_ros.identification.leastsquares import Samples, System, minimise
 from calib_ros.identification.region import Region, region_of_record
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_calibration
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 from calib_ros.texts import read_text
@@ -197,10 +198,10 @@ def _in_frames_of(nominal: Chain, after: Chain) -> Chain:
     base, tool = after.frame('base'), after.frame('tool')
     start = replace(nominal, base=base, tool=tool, frames=after.frames)
     names = [
-        f'{frame}.{kind}'
+        name
         for frame in ('base', 'tool')
         if not start.frame(frame).fixed
-        for kind in FRAME_KINDS
+        for name in parameters_of(frame)
     ]
     if not names:
         return start

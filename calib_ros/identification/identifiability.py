@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import of_lens
+from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -51,7 +51,7 @@ def independent(
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)  # once more: Gram-Schmidt loses orthogonality
         size = float(np.linalg.norm(rest))
-        placed = name.partition('.')[2] in FRAME_KINDS
+        placed = Parameter(name).kind in FRAME_KINDS
         least = (frame_tolerance if placed else RANK_TOLERANCE) * float(np.linalg.norm(column))
         if size > least and size > 0.0:
             basis = np.column_stack([basis, rest / size])
@@ -110,7 +110,7 @@ def structurally_independent(
         posed = joints
         if kind.socket:
             posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
-            shift = {f'{kind.base}.{axis}': -x for axis, x in zip('xyz', place, strict=True)}
+            shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
         jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
@@ -123,7 +123,7 @@ def structurally_independent(
         rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
     if extra is not None:
         rows = np.concatenate([rows, extra(anywhere, names)[0]])
-    lens = [k for k, name in enumerate(names) if of_lens(name)]
+    lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     rows = np.concatenate([rows, np.eye(len(names))[lens]])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
@@ -139,7 +139,7 @@ def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, 
 
     It is that of the first; the others are led there by damped Gauss-Newton steps.
     """
-    driven = [f'{j.name}.{"theta" if j.type == "revolute" else "d"}' for j in chain.joints]
+    driven = [j.driven for j in chain.joints]
     model = ErrorModel(chain, driven, kind.base, kind.tool)
     signs = np.array([joint.sign for joint in chain.joints], dtype=float)
     wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]

@@ -29,7 +29,8 @@ from scipy import linalg
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.lens import at_the_board, of_lens, require_lens, view
+from calib_ros.kinematics.lens import at_the_board, require_lens, view
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -349,9 +350,9 @@ class System(Shown):
             length = max(float(np.linalg.norm(apart)), 1e-12)
             residual[i] = (distance - length) / SEPARATION_SIGMA
             for frame, sign in ((first, -1.0), (second, 1.0)):
-                for k, axis in enumerate('xyz'):
-                    if f'{frame}.{axis}' in column:
-                        rows[i, column[f'{frame}.{axis}']] = sign * apart[k] / length
+                for k, name in enumerate(parameters_of(frame)[:3]):
+                    if name in column:
+                        rows[i, column[name]] = sign * apart[k] / length
         return rows / SEPARATION_SIGMA, residual
 
     @property
@@ -522,7 +523,7 @@ def without_each(
         yield from [chain] * len(systems)
         return
     curved = [
-        k for k, name in enumerate(names) if not of_lens(name)
+        k for k, name in enumerate(names) if not Parameter(name).of_lens
     ]  # pixels are linear in a lens
     parts = [normal_equations(chain, names, System(system.sets)) for system in systems]
     extra, residual = systems[0].extra_rows(chain, names)  # the same in every part

@@ -29,8 +29,9 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.evidence import ROUNDING, Posterior
 from calib_ros.identification.leastsquares import BLOCK
 from calib_ros.identification.observations import Observations
-from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -165,7 +166,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
 
 
 def _is_geometric(chain: Chain, name: str) -> bool:
-    return chain.owns_frame(name) or name.partition('.')[2] in DH_KINDS
+    return chain.owns_frame(name) or Parameter(name).of_dh
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
@@ -222,8 +223,7 @@ class _Judge:
         self, posterior: Posterior, joints: FloatArray, ends: Observations, freedom: float
     ) -> None:
         chain, names = posterior.chain, posterior.names
-        frames = [f'{ends.base}.{kind}' for kind in FRAME_KINDS]
-        frames += [f'{ends.tool}.{kind}' for kind in FRAME_KINDS[:3]]
+        frames = [*parameters_of(ends.base), *parameters_of(ends.tool)[:3]]
         every = list(dict.fromkeys([*frames, *names]))
         rows = ErrorModel(chain, every, ends.base, ends.tool).jacobian(joints)[:, :3]
         column = {name: k for k, name in enumerate(every)}

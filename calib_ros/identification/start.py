@@ -30,8 +30,9 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain, Frame
+from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 SUBSET = 200
@@ -87,11 +88,11 @@ def _start_one(
     """Return the chain with frames for one set of observations."""
     oriented = bool(observations.oriented.any()) and observations.distances is None
     names = [
-        f'{key}.{kind}'
+        name
         for key in ('base', 'tool')
         if not chain.frame(key).fixed
-        for kind in FRAME_KINDS
-        if oriented or key == 'base' or not kind.startswith('r')
+        for name in parameters_of(key)
+        if oriented or key == 'base' or name.is_length
     ]
     if not names:
         return chain

@@ -24,7 +24,8 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import KNOWN, Region
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.identification.steps import Step
-from calib_ros.kinematics.chain import DH_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -41,7 +42,7 @@ MOST_OUTLIERS = 0.35
 
 
 @dataclass(frozen=True)
-class Parameter:
+class ParameterRow:
     """One parameter of the model: m for lengths, rad for angles.
 
     `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
@@ -49,7 +50,7 @@ class Parameter:
     degrees of freedom from which `std` was estimated; infinite where the noise is known.
     """
 
-    name: str
+    name: Parameter
     value: float
     offset: float
     std: float | None
@@ -330,7 +331,7 @@ def _leave_one_place_out(
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]
     for place in places:
-        own = [name for name in names if name.partition('.')[0] in place]
+        own = [name for name in names if Parameter(name).owner in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
             elsewhere = [name for name in fitted if name not in own]
             trained = minimise(chain, elsewhere, part(place, inside=False)).chain
@@ -355,7 +356,7 @@ def _leave_one_place_out(
 def refusals(
     problem: Problem,
     converged: bool,
-    parameters: Sequence[Parameter],
+    parameters: Sequence[ParameterRow],
     validation: Comparison | None,
     chance: float | None,
     region: Region | None,
@@ -402,10 +403,9 @@ def refusals(
             'in more combinations, or fix these parameters',
         )
     for p in parameters:
-        length = is_length(p.name)
+        length = p.name.is_length
         limit = problem.largest_length if length else problem.largest_angle
-        joint, _, kind = p.name.partition('.')
-        if p.std is None or joint not in problem.chain.joint_names or kind not in DH_KINDS:
+        if p.std is None or not p.name.of_dh:
             continue
         if abs(p.offset) - 3.0 * p.std > limit:
             refuse(

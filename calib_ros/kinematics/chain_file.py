@@ -24,8 +24,9 @@ import numpy as np
 from calib_ros import texts
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
-from calib_ros.kinematics.lens import IN_PIXELS, LENS_KINDS, Lens
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS, Parameter
 from calib_ros.kinematics.urdf import MOST_JOINTS, chain_from_urdf
 from calib_ros.settings import Settings
 from calib_ros.texts import parse_yaml
@@ -277,10 +278,10 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
     for joint, other in zip(chain.joints, nominal.joints, strict=True):
         if joint.sign != other.sign:
             names.append(f'the sign of {joint.name}')
-        for kind in DH_KINDS:
-            limit = angle if kind in ANGLES else length
-            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
-                names.append(f'{joint.name}.{kind}')
+        for name in joint.parameters:
+            limit = length if name.is_length else angle
+            if abs(getattr(joint, name.kind) - getattr(other, name.kind)) > limit:
+                names.append(name)
     return names
 
 
@@ -345,7 +346,12 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     """Return plain values as YAML."""
     import yaml
 
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000))
+    class Dumper(yaml.SafeDumper):
+        """Writes parameters by their names."""
+
+    Dumper.add_representer(Parameter, yaml.SafeDumper.represent_str)
+    text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
+    return str(text)
 
 
 def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]:

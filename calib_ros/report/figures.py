@@ -12,8 +12,8 @@ from scipy import special
 
 from calib_ros.apply.workspace import Survey, rms_map
 from calib_ros.escapes import one_line
-from calib_ros.identification.validation import Parameter
-from calib_ros.kinematics.chain import Chain, Joint, is_length
+from calib_ros.identification.validation import ParameterRow
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.poses import Poses
 
@@ -106,12 +106,12 @@ def against_noise(poses: Poses) -> Figure:
     return {'data': data, 'layout': layout}
 
 
-def forest(parameters: Sequence[Parameter], lengths: bool, limit: float) -> Figure | None:
+def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> Figure | None:
     """Return offsets with their 95 % intervals, of lengths [mm] or of angles [mrad].
 
     `limit` [m or rad] is that of common sense: drawn where it comes near.
     """
-    found = [p for p in parameters if p.std is not None and is_length(p.name) == lengths]
+    found = [p for p in parameters if p.std is not None and p.name.is_length == lengths]
     if not found:
         return None
     unit = 'mm' if lengths else 'mrad'

@@ -9,16 +9,15 @@ from typing import Any
 
 from calib_ros.escapes import in_markdown
 from calib_ros.identification.identification import Identification
-from calib_ros.identification.validation import ErrorFigures, Parameter
+from calib_ros.identification.validation import ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.lens import of_lens
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report.words import (
     BEFORE,
     chance_in_words,
     identifiability_in_words,
     noise_in_words,
     summary,
-    unit,
 )
 
 
@@ -114,7 +113,7 @@ def _effects(result: Identification) -> list[str]:
 
 def _parameters(result: Identification) -> list[str]:
     text = 'Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.'
-    if any(of_lens(p.name) for p in result.parameters):
+    if any(p.name.of_lens for p in result.parameters):
         text += '\nThose of lenses in px, and of their distortion as it is.'
     head = ('parameter', 'value [m, rad]', 'offset', 'std', '95 %', '')
     return [
@@ -126,9 +125,9 @@ def _parameters(result: Identification) -> list[str]:
     ]
 
 
-def _parameter(p: Parameter) -> tuple[str, ...]:
+def _parameter(p: ParameterRow) -> tuple[str, ...]:
     width = p.half_width()
-    scale = 1.0 if of_lens(p.name) else 1e3
+    scale = 1.0 if p.name.of_lens else 1e3
     found = ('', '', '')
     if p.std is not None and width is not None:
         found = (f'{scale * p.offset:+.4f}', f'{scale * p.std:.4f}', f'{scale * width:.4f}')
@@ -141,7 +140,7 @@ def priors_in_words(result: Identification) -> list[str]:
     known = dict(result.chain.effects)
     why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
     lines = [
-        f'prior on {name}: {sigma:.3g} {unit(name)}{why.get(name, "")}'
+        f'prior on {name}: {sigma:.3g} {Parameter(name).unit}{why.get(name, "")}'
         for name, sigma in result.priors.items()
         if name not in known
     ]
@@ -149,6 +148,6 @@ def priors_in_words(result: Identification) -> list[str]:
     for name in known:
         groups.setdefault(effects.group_of(name), []).append(name)
     for group, names in groups.items():
-        sigma, of = result.priors[names[0]], unit(names[0])
+        sigma, of = result.priors[names[0]], Parameter(names[0]).unit
         lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
     return lines

@@ -239,7 +239,7 @@ def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
     own = [
         p
         for p in result.parameters
-        if words.unit(p.name) in ('m', 'rad')
+        if p.name.unit in ('m', 'rad')
         and not result.chain.owns_frame(p.name)
         and p.name not in effects
     ]
@@ -266,7 +266,7 @@ def _parameters(result: Identification) -> Section:
     """Return the table of all parameters."""
     rows = []
     for p in result.parameters:
-        unit = words.unit(p.name)
+        unit = p.name.unit
         width = p.half_width()
         offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
         within = '' if width is None else f'{1e3 * width:.4f}'

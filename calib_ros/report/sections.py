@@ -11,6 +11,7 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
+from calib_ros.files.rows import EPOCH_NS
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -20,8 +21,6 @@ from calib_ros.report.poses import Poses
 
 INTERVAL = 0.975
 """One-sided confidence of each limit of an interval of 95 %."""
-EPOCH_NS = 10**17
-"""Stamps from which on they are times of this century."""
 ISO_9283 = (
     'Terms as in ISO 9283: the position accuracy AP is the distance between the pose commanded '
     'and the mean of the poses attained. Where a pose was measured once, its repeatability is '

@@ -17,9 +17,8 @@ from calib_ros.identification.identification import Identification, Noise, Outli
 from calib_ros.identification.region import Region
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record, table_hash
-from calib_ros.kinematics.lens import IN_PIXELS, of_lens
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.calibration import Calibration
 from calib_ros.settings import Settings
@@ -92,7 +91,7 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     return tuple(
         p.name
         for p in result.parameters
-        if p.std is not None and p.std > WEAK and not of_lens(p.name)
+        if p.std is not None and p.std > WEAK and not p.name.of_lens
     )
 
 
@@ -188,7 +187,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
                 'offset': p.offset,
                 'std': p.std,
                 'half_width_95': p.half_width(0.95),
-                'unit': unit(p.name),
+                'unit': p.name.unit,
                 'status': p.status,
             }
             for p in result.parameters
@@ -227,18 +226,6 @@ def region_figures(region: Region) -> dict[str, Any]:
 
 
 BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
-
-
-def unit(name: str) -> str:
-    """Return the unit of a parameter."""
-    kind = name.partition('.')[2]
-    if kind == DELAY:
-        return 's'
-    if of_lens(name):
-        return 'px' if kind in IN_PIXELS else '1'
-    if kind in DH_KINDS or kind in FRAME_KINDS:
-        return 'm' if is_length(name) else 'rad'
-    return effects.unit(name)
 
 
 def sigma_over_range(result: Identification) -> dict[str, float]:
@@ -340,7 +327,7 @@ def against_truth(result: Identification, truth: Chain) -> str:
     width = max(len(name) for name in result.names)
     rows = [f'  {"parameter":{width}}     true   identified        std   deviation']
     for p in result.parameters:
-        if p.std is None or p.name.partition('.')[0] in ('base', 'tool'):
+        if p.std is None or p.name.owner in ('base', 'tool'):
             continue
         true = truth.value(p.name) - (p.value - p.offset)
         rows.append(
