@@ -66,7 +66,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.apply.compensation import POSITIVE, Compensator, compensate_program, in_words
+    from calib_ros.apply.compensation import POSITIVE, Compensator, in_words
+    from calib_ros.apply.program import compensate_program
     from calib_ros.atomic import write_file
     from calib_ros.files.trajectories import read_program
     from calib_ros.identification.calibration import load_calibration

@@ -18,7 +18,7 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures
 from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.reports import coverage, identity_of
+from calib_ros.report.sections import coverage, identity_of
 
 MOST_POSES = 200
 """Poses of a plan that have a row."""
@@ -125,7 +125,7 @@ def plan_report(
     ]
     text: tuple[str, ...] = (f'{len(joints)} poses.',)
     verdict = Verdict('info', 'Poses to go', text)
-    steps = (
+    steps: tuple[str, ...] = (
         'Go to P1 to P5 in turn, 30 times, and measure each time.',
         'Then judge: calib_ros verify.',
     )
