@@ -193,6 +193,8 @@ def detected(
         lens = replace(lens, fixed=options.lens != 'fitted')
     chain = chain.with_frame(seen.camera, replace(camera, lens=lens))
     given = settings.for_problem()
+    if options.sigma_touch is not None:
+        given['sigma_touch'] = options.sigma_touch
     if posed:
         given['fixed'] = (*given['fixed'], *(f'{name}.*' for name in chain.joint_names))
     problem = Problem(

@@ -117,6 +117,12 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         metavar='M',
         help='between two sockets of a place, 0.05 if not given',
     )
+    identify.add_argument(
+        '--sigma-touch',
+        type=float,
+        metavar='M',
+        help='of heights over touched planes, 1e-4 if not given',
+    )
     add_chain(identify)
     identify.add_argument('--out', type=Path, help='folder for calibration, result and report')
     identify.add_argument('--force', action='store_true', help='replace the result in --out')
@@ -261,7 +267,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
     useless = (
         ('joint_topics', 'sources', 'joint_names', 'frame_id')
         if tables
-        else ('session', 'eye_in_hand', 'socket_distance', *LAYOUT, *DETECTIONS)
+        else ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
     )
     for name in useless:
         if getattr(options, name):
@@ -287,6 +293,9 @@ def _identified(options: argparse.Namespace) -> _Identified:
             foreign_of(options, chain),
         )
         warnings, lines = table.warnings, table.by_line
+        given = settings.for_problem()
+        if options.sigma_touch is not None:
+            given['sigma_touch'] = options.sigma_touch
         sockets = 0.05 if options.socket_distance is None else options.socket_distance
         problem = Problem(
             chain,
@@ -295,7 +304,7 @@ def _identified(options: argparse.Namespace) -> _Identified:
             more=table.fitted[1:],
             separations=tuple((*pair, sockets) for pair in table.pairs),
             world_frame=table.world_frame,
-            **settings.for_problem(),
+            **given,
         )
         result = identify_model(problem, settings.model)
         samples = {
