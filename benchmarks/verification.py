@@ -27,10 +27,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
+from calib_ros.apply.confidence import freedom_of, rms_limits
 from calib_ros.apply.design import Design
 from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.apply.verification import _freedom, rms_limits, verify
+from calib_ros.apply.verification import verify
 from calib_ros.apply.workspace import CalibratedArm
 from calib_ros.identification.identification import Problem, identify, residuals
 from calib_ros.kinematics import inverse
@@ -89,7 +90,7 @@ def drawn(kind, draws):
             for _ in range(draws // len(arms)):
                 chosen = errors[rng.integers(0, len(errors), count)]
                 moments = chosen[:, :, None] * chosen[:, None]
-                freedom = np.array([count * _freedom(moments)])
+                freedom = np.array([count * freedom_of(moments)])
                 lower, upper = rms_limits(rms(chosen), freedom, 0.95)
                 held.append((upper[0] >= truth, lower[0] <= truth))
         upper, lower = np.mean(held, axis=0).tolist()

@@ -12,8 +12,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib_ros.apply.compensation import Compensator, Program, compensate
+    from calib_ros.apply.compensation import Compensator, compensate
     from calib_ros.apply.planning import Plan, plan
+    from calib_ros.apply.program import Program
     from calib_ros.apply.verification import Verification, verify
     from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.errors import CalibrationError
@@ -67,7 +68,7 @@ _HOMES = {
     'Observations': 'identification.observations',
     'Plan': 'apply.planning',
     'Problem': 'identification.problem',
-    'Program': 'apply.compensation',
+    'Program': 'apply.program',
     'Settings': 'settings',
     'Verification': 'apply.verification',
     'chain_from_urdf': 'kinematics.urdf',

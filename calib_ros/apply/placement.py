@@ -128,15 +128,21 @@ def place(
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
     for _ in range(REFINEMENTS):
         step = 0.5 * step
-        best = grid[np.nanargmin(errors)]
-        around = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
-        near = np.column_stack([best[:3] + step * around, np.full(len(around), best[3])])
-        near[:, :3] = np.clip(near[:, :3], corners[0], corners[1])
-        more_errors, more_joints = search.errors(near)
-        grid, errors = np.concatenate([grid, near]), np.concatenate([errors, more_errors])
-        joints = np.concatenate([joints, more_joints])
+        near = _around(grid[np.nanargmin(errors)], step, corners)
+        more = search.errors(near)
+        grid, errors, joints = (
+            np.concatenate(both)
+            for both in zip((grid, errors, joints), (near, *more), strict=True)
+        )
     best = int(np.nanargmin(errors))
     return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
+
+
+def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:
+    """Return the placements (26, 4) a step (3,) away from the best (4,), within corners (2, 3)."""
+    steps = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
+    places = np.clip(best[:3] + step * steps, corners[0], corners[1])
+    return np.column_stack([places, np.full(len(places), best[3])])
 
 
 class _Search:

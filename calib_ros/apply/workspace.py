@@ -15,7 +15,7 @@ expected to miss by the root of removed^2 + remaining^2, by its calibrated model
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -237,6 +237,14 @@ class Survey(Shown):
     remaining: FloatArray
 
     @property
+    def parts(self) -> dict[str, FloatArray]:
+        """Return the errors (N,) [m] by their names: only what is removed, if no more is known."""
+        found = {'removed by the calibration': self.removed}
+        if not np.isnan(self.remaining).any():
+            found |= {'sigma of what remains': self.sigma, 'expected to remain': self.remaining}
+        return found
+
+    @property
     def cloud(self) -> FloatArray:
         """Return (N, 5): x, y, z [m] in the arm's base frame, error removed [m], sigma [m]."""
         return np.column_stack([self.positions, self.removed, self.sigma])
@@ -351,14 +359,8 @@ def rms_map(
 
 def in_words(survey: Survey) -> str:
     """Return the errors over the workspace as Markdown: figures, and where they are largest."""
-    parts = [('removed by the calibration', survey.removed)]
-    if np.isnan(survey.remaining).any():
-        rest = 'What remains is not known: the covariance is in the folder of the result.'
-    else:
-        parts += [
-            ('sigma of what remains', survey.sigma),
-            ('expected to remain', survey.remaining),
-        ]
+    rest = 'What remains is not known: the covariance is in the folder of the result.'
+    if len(survey.parts) > 1:
         rest = 'Expected to remain: sigma and the RMS error on poses that were not fitted.'
     lines = [
         f'Position errors [mm] at {len(survey.joints)} random poses of the joint range.',
@@ -366,12 +368,11 @@ def in_words(survey: Survey) -> str:
         '| | RMS | mean | median | 95 % | max |',
         '|---|---|---|---|---|---|',
     ]
-    for label, errors in parts:
-        s = Spread.of(1e3 * errors)
-        figures = (s.rms, s.mean, s.median, s.percentile_95, s.max)
-        lines.append(f'| {label} | ' + ' | '.join(f'{value:.4f}' for value in figures) + ' |')
+    for label, errors in survey.parts.items():
+        figures = ' | '.join(f'{value:.4f}' for value in astuple(Spread.of(1e3 * errors)))
+        lines.append(f'| {label} | {figures} |')
     lines += ['', rest]
-    for label, errors in parts[:2]:
+    for label, errors in list(survey.parts.items())[:2]:
         found = regions(survey.positions, errors)
         lines += ['', f'Largest RMS, {label}:', '']
         lines += [f'- {_region_in_words(region)}' for region in found[:3]]

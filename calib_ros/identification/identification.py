@@ -25,6 +25,7 @@ from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Learned, Problem
+from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import KNOWN, Region, region_of
 from calib_ros.identification.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
@@ -98,7 +99,7 @@ class Identification(Shown):
     chance : float or None
         Probability that errors shared by what was measured in succession, as of a drifting
         tracker, would let the arm's parameters explain as much. None for a target in sockets.
-    refusals : tuple of str
+    refusals : tuple of Reason
         Rules of acceptance that failed, in words; none when the result is accepted.
     posterior : Posterior
         What is known of the arm, effects that the model leaves out included.
@@ -134,7 +135,7 @@ class Identification(Shown):
     iterations: int
     converged: bool
     chance: float | None
-    refusals: tuple[str, ...]
+    refusals: tuple[Reason, ...]
     posterior: Posterior
     region: Region | None
     weak: tuple[str, ...] = ()

@@ -28,6 +28,7 @@ from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.start import closed_forms
 from calib_ros.identification.validation import MOST_OUTLIERS
 from calib_ros.kinematics import se3
@@ -118,7 +119,7 @@ def remarked(problem: Problem, result: Identification) -> Identification:
     if found is None:
         return result
     if result.refusals:
-        return replace(result, refusals=(str(found), *result.refusals))
+        return replace(result, refusals=(Reason(Rule.MISTAKE, str(found)), *result.refusals))
     return replace(result, remarks=(str(found), *result.remarks))
 
 

@@ -29,6 +29,7 @@ from scipy import special
 from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.observations import stops
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import Robust, weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
@@ -92,6 +93,11 @@ class Step:
     def harmful(self) -> bool:
         """Tell whether the fit is that of no arm: of none before or after, or of one no more."""
         return self.kind == 'joint' or not self.outside
+
+    @property
+    def reason(self) -> Reason:
+        """Return why a result is refused for it."""
+        return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
 
     def __str__(self) -> str:
         """Return what moved and what to do about it."""

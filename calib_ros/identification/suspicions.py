@@ -33,6 +33,7 @@ from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -71,7 +72,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         return result  # one place tells nothing of what follows
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
-    refusals = (*result.refusals, scale) if certain else result.refusals
+    refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
     found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)

@@ -27,9 +27,10 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
-from calib_ros.apply.compensation import Compensator, compensate_program, in_words
+from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.design import Design
 from calib_ros.apply.planning import next_pose
+from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import CalibratedArm, survey
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.files.trajectories import RATES, trajectory_program

@@ -11,14 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from calib_ros.apply.compensation import (
-    Compensator,
-    Program,
-    approaches,
-    compensate,
-    compensate_program,
-    in_words,
-)
+from calib_ros.apply.compensation import Compensator, compensate, in_words
+from calib_ros.apply.program import Program, approaches, compensate_program
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED

@@ -10,8 +10,8 @@ import pytest
 from calib_ros.apply import simulation, workspace
 from calib_ros.apply.placement import place, task_of
 from calib_ros.apply.workspace import CalibratedArm, regions, survey
-from calib_ros.cli.commands import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.cli.main import main
+from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.waypoints import csv_of, read_joints, read_poses
 from calib_ros.identification.identification import Problem, identify
