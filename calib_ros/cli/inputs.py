@@ -109,10 +109,3 @@ def of_table(
         'sets': len(found.fitted),
     }
     return Loaded(problem, samples, found.warnings, lines=found.by_line)
-
-
-def inputs_of_calibration(path: Path) -> tuple[Path, ...]:
-    """Return the files of a calibration, or of the folder of a result, that are read."""
-    if not path.is_dir():
-        return (path,)
-    return tuple(path / name for name in ('calibration.yaml', 'result.json'))

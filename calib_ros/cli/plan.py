@@ -35,7 +35,7 @@ TASK_POSES = 300
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.apply.planning import CRITERIA
+    from calib_ros.apply.choice import CRITERIA
 
     group = parser.add_argument_group('what is wanted')
     add_chain(group)

@@ -126,7 +126,8 @@ def result_files(
     A chain that was accepted earlier, in `out`, is kept under another name when this result is
     not: it does not belong to the files beside it any more. `tolerance` is the wanted error [mm].
     """
-    from calib_ros.report import words
+    from calib_ros.identification.calibration import Calibration
+    from calib_ros.report.markdown import markdown
     from calib_ros.report.plots import before_after_png
     from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report
@@ -136,7 +137,7 @@ def result_files(
         poses = poses_of(loaded.problem, result, loaded.lines)
         contents: dict[str, str | bytes] = {
             'result.json': json.dumps(document(found, tolerance), indent=2) + '\n',
-            'report.md': words.markdown(result, loaded.samples, found.warnings),
+            'report.md': markdown(result, loaded.samples, found.warnings),
             'residuals.csv': poses.table(),
             'before_after.png': before_after_png(result),
             'settings.yaml': found.origin.settings,
@@ -148,7 +149,7 @@ def result_files(
         contents |= page_of(report, screen)
     earlier = out / 'calibration.yaml'
     if result.accepted:
-        contents['calibration.yaml'] = words.calibration_yaml(result)
+        contents['calibration.yaml'] = Calibration.of(result).dump()
     elif earlier.exists():
         contents['calibration.previous.yaml'] = earlier.read_bytes()
     return contents

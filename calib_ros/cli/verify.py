@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib_ros.cli.command import Command
-from calib_ros.cli.inputs import inputs_of_calibration, replayed, table
+from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
@@ -95,14 +95,14 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[str, str | bytes]]:
     """Judge, and print what comes out; return the exit status and the files of --out."""
     from calib_ros.apply.verification import in_words, verify
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.files.waypoints import read_joints
+    from calib_ros.identification.calibration import calibration_file, load_calibration
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report.poses import poses_to_verify
     from calib_ros.report.verified import verification_report
 
     nominal = load_chain(options.chain)
-    arm = CalibratedArm.read(options.calibration, nominal)
+    arm = load_calibration(options.calibration, nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
     commanded = None
     if options.commanded is not None:
@@ -124,10 +124,10 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
     status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
     if options.out is None:
         return status, {}
-    read = (options.measured, options.commanded, *inputs_of_calibration(options.calibration))
+    read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report'):
-        poses = poses_to_verify(arm.after, sets, found.comparison, by_line)
-        report = verification_report(arm.after, found, poses, origin_of(options, read), warnings)
+        poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
+        report = verification_report(arm.chain, found, poses, origin_of(options, read), warnings)
         contents: dict[str, str | bytes] = {
             'residuals.csv': poses.table(),
             'verification.txt': f'{words}\n',

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib_ros.cli.command import Command
-from calib_ros.cli.inputs import inputs_of_calibration
 from calib_ros.cli.options import (
     add_chain,
     add_identity,
@@ -23,8 +22,8 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.cli.screen import Screen
+    from calib_ros.identification.calibration import Calibration
     from calib_ros.kinematics.se3 import FloatArray
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
@@ -35,7 +34,7 @@ BOX_POSES = 30
 
 def _add(parser: argparse.ArgumentParser) -> None:
     from calib_ros.apply.placement import AIMS
-    from calib_ros.apply.workspace import MODELS
+    from calib_ros.identification.calibration import MODELS
 
     group = parser.add_argument_group('what to map')
     add = group.add_argument
@@ -79,11 +78,12 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
 
     from calib_ros.apply import placement, workspace
     from calib_ros.files.waypoints import csv_of, joints_csv
+    from calib_ros.identification.calibration import calibration_file, load_calibration
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import plots
     from calib_ros.report.maps import workspace_report
 
-    arm = workspace.CalibratedArm.read(options.result, load_chain(options.chain))
+    arm = load_calibration(options.result, load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
     survey = workspace.survey(arm, options.poses, rng)
@@ -105,13 +105,13 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    origin = origin_of(options, inputs_of_calibration(options.result))
+    origin = origin_of(options, (calibration_file(options.result),))
     contents |= page_of(workspace_report(arm, survey, origin, found), screen)
     return contents | {'workspace.md': words}
 
 
 def _task(
-    options: argparse.Namespace, arm: CalibratedArm, rng: np.random.Generator
+    options: argparse.Namespace, arm: Calibration, rng: np.random.Generator
 ) -> FloatArray | None:
     """Return the poses (K, 4, 4) of the task to place, if there is one."""
     import numpy as np
@@ -126,7 +126,7 @@ def _task(
         return read_poses(options.task)
     if options.joint_box is None:
         return None
-    size = len(arm.after.joints)
+    size = len(arm.chain.joints)
     if len(options.joint_box) != 2 * size:
         raise InputError(
             f'--joint-box: give {size} lower and {size} upper values, not '
