@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
-from calib_ros.apply.workspace import CalibratedArm
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations, configurations
@@ -139,7 +139,7 @@ class Verification(Shown):
 
 
 def verify(
-    arm: CalibratedArm,
+    arm: Calibration,
     sets: Sequence[Observations],
     tolerance: float | None,
     confidence: float = 0.95,
@@ -151,7 +151,7 @@ def verify(
 
     Parameters
     ----------
-    arm : CalibratedArm
+    arm : Calibration
         Before and after.
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
@@ -182,8 +182,8 @@ def verify(
             f'{tolerance} and {confidence}'
         )
     for each in sets:
-        _check(arm.after, each)
-    before, after = arm.before, arm.after
+        _check(arm.chain, each)
+    before, after = arm.before, arm.chain
     wanted = sets
     if commanded is not None:
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)

@@ -213,6 +213,15 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     return [*row, split or ('test' if sample.validation else 'train')]
 
 
+def table_text(samples: Sequence[Sample], joints: int) -> str:
+    """Return samples as a table, with the columns that any of them fills."""
+    names = columns(joints)
+    rows = [cells(sample) for sample in samples]
+    used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
+    lines = [','.join(row[k] for k in used) for row in (names, *rows)]
+    return '\n'.join(lines) + '\n'
+
+
 class _Reader:
     """Turns rows into samples."""
 

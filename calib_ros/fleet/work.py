@@ -173,10 +173,11 @@ def _identify(path: Path, task: Task) -> tuple[Problem, Identification, tuple[st
         return problem, result, table.warnings, table.by_line
     session = CalibrationSession(robot.chain, settings)
     replayed = replay(path, session)
-    result = session.identify()
+    problem = session.problem()
+    result = identify_model(problem, settings.model)
     lost = replayed.refusals(session.account(), robot.largest_loss)
     result = replace(result, refusals=(*result.refusals, *lost))
-    return session.problem_of(session.usable), result, replayed.warnings, False
+    return problem, result, replayed.warnings, False
 
 
 def _file_system(url: str) -> tuple[Any, str]:

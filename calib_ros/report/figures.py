@@ -251,8 +251,9 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
         'yaxis': axis('predicted RMS error [mm]', type='log'),
     }
     if wanted_mm is not None:
-        line = {'type': 'line', 'xref': 'paper', 'x0': 0, 'x1': 1, 'y0': wanted_mm}
-        layout['shapes'] = [line | {'y1': wanted_mm, 'line': {'color': LIMIT, 'dash': 'dot'}}]
+        dotted = {'color': LIMIT, 'dash': 'dot'}
+        at = {'x0': 0, 'x1': 1, 'y0': wanted_mm, 'y1': wanted_mm}
+        layout['shapes'] = [{'type': 'line', 'xref': 'paper', **at, 'line': dotted}]
     return {'data': data, 'layout': layout}
 
 

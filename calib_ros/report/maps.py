@@ -11,13 +11,14 @@ import numpy as np
 
 from calib_ros.apply.placement import Placements
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import CalibratedArm, Spread, Survey, in_base, regions
+from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures
 from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.reports import coverage, identity_of
+from calib_ros.report.sections import coverage, identity_of
 
 MOST_POSES = 200
 """Poses of a plan that have a row."""
@@ -25,7 +26,7 @@ MOST_REGIONS = 6
 
 
 def workspace_report(
-    arm: CalibratedArm, found: Survey, origin: Origin, placed: Placements | None = None
+    arm: Calibration, found: Survey, origin: Origin, placed: Placements | None = None
 ) -> Report:
     """Return the report of a survey, and of the placements of a task if there are any."""
     spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
@@ -39,7 +40,7 @@ def workspace_report(
     errors = Section('map', 'Errors by radius and height', (about,), figures.error_map(found))
     return Report(
         kind='Errors over the workspace',
-        robot=arm.after.name,
+        robot=arm.chain.name,
         verdict=Verdict('info', 'What the calibration changes, and where', tuple(text)),
         accuracy=Section(
             'accuracy',
@@ -48,7 +49,7 @@ def workspace_report(
             head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
-        identity=identity_of(arm.after, origin, corrected=table_hash(arm.after)),
+        identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
         inputs=origin.inputs,
         settings=origin.settings,
@@ -124,7 +125,7 @@ def plan_report(
     ]
     text: tuple[str, ...] = (f'{len(joints)} poses.',)
     verdict = Verdict('info', 'Poses to go', text)
-    steps = (
+    steps: tuple[str, ...] = (
         'Go to P1 to P5 in turn, 30 times, and measure each time.',
         'Then judge: calib_ros verify.',
     )

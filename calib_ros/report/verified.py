@@ -14,12 +14,12 @@ from calib_ros.report.advice import SPREAD
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
-from calib_ros.report.reports import (
+from calib_ros.report.sections import (
     HEAD,
     ISO_9283,
     accuracy_rows,
     coverage,
-    distributions,
+    distribution,
     gain,
     identity_of,
 )
@@ -79,7 +79,7 @@ def verification_report(
         explorer=explorer(chain, poses),
         sections=(
             *_by_configuration(found),
-            *distributions(poses),
+            distribution(poses),
             coverage(chain, poses.joints, 'How far each joint was moved'),
         ),
         inputs=origin.inputs,
