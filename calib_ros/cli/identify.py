@@ -45,7 +45,7 @@ LAYOUT = (
 """Options of tables of others."""
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens', 'sigma_pixel')
 """Options for what a camera saw."""
-OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', *LAYOUT, *DETECTIONS)
+OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 LARGEST_LOSS = 0.1
 """Share of the messages of a bag that may be lost. As many fewer samples at random make standard
@@ -82,6 +82,12 @@ def _add(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar='M',
         help='between two sockets of a place, 0.05 if not given',
+    )
+    add(
+        '--sigma-touch',
+        type=float,
+        metavar='M',
+        help='of heights over touched planes, 1e-4 if not given',
     )
     group = parser.add_argument_group('what to write')
     add_out(group, 'calibration, result and report')

@@ -66,11 +66,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         if getattr(options, name) < lowest:
             raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
     with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as folder:
-        with screen.work('mapping errors over the workspace'):
-            contents = _files(options, screen)
+        contents = _files(options, screen)
         write_files(folder, contents)
-    screen.say(str(contents['workspace.md']))
-    screen.say(f'wrote {options.out}')
+    screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
     return 0
 
 

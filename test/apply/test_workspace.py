@@ -13,7 +13,7 @@ from calib_ros.cli.main import main
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.waypoints import csv_of, read_joints, read_poses
-from calib_ros.identification.calibration import Calibration, load_calibration
+from calib_ros.identification.calibration import MODELS, Calibration, load_calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
@@ -236,7 +236,7 @@ def test_the_best_placement_of_a_corrected_arm_beats_the_centre(task):
 def test_the_joint_values_bring_the_arm_to_the_placed_task(cell, task):
     _, result = cell
     arm = Calibration.of(result)
-    for model in workspace.MODELS:
+    for model in MODELS:
         found = place(arm, task, 'mean', model, cells=5, turns=3)
         chain = arm.commanded_by(model)
         reached = ~np.isnan(found.errors)
