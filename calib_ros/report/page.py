@@ -106,14 +106,42 @@ class Report:
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
 
 
-def render(report: Report) -> str | None:
-    """Return a report as HTML; None where jinja2 or plotly is not installed."""
+def plotly_script() -> str | None:
+    """Return plotly's JavaScript; None where plotly is not installed."""
     try:
-        import jinja2
         from plotly.offline import get_plotlyjs
 
-        plotly = get_plotlyjs()
+        return str(get_plotlyjs())
     except (ImportError, FileNotFoundError):
+        return None
+
+
+def render(report: Report, script: str = '') -> str | None:
+    """Return a report as HTML; None where jinja2 or plotly is not installed.
+
+    With the path of plotly's `script`, which many pages share, the page needs that file besides.
+    """
+    plotly = '' if script else plotly_script()
+    if plotly is None:
+        return None
+    return filled(
+        'report.html.jinja',
+        report=report,
+        marks=MARKS,
+        script=script,
+        plotly=plotly,
+        data={
+            'figures': {each.name: each.figure for each in report.sections if each.figure},
+            'explorer': report.explorer,
+        },
+    )
+
+
+def filled(template: str, **values: Any) -> str | None:
+    """Return a page with the style and the scripts of all; None where jinja2 is not installed."""
+    try:
+        import jinja2
+    except ImportError:
         return None
     folder = resources.files('calib_ros.report') / 'templates'
 
@@ -127,16 +155,8 @@ def render(report: Report) -> str | None:
         finalize=_shown,
         trim_blocks=True,
     )
-    page: str = environment.get_template('report.html.jinja').render(
-        report=report,
-        marks=MARKS,
-        css=source('report.css'),
-        js=source('report.js'),
-        plotly=plotly,
-        data={
-            'figures': {each.name: each.figure for each in report.sections if each.figure},
-            'explorer': report.explorer,
-        },
+    page: str = environment.get_template(template).render(
+        css=source('report.css'), js=source('report.js'), **values
     )
     return page
 
