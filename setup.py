@@ -17,6 +17,9 @@ AMENT = (
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
+# Ubuntu 24.04 has it with the libraries that it needs.
+PDF = 'weasyprint>=61.1'
+DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.24']
 XLSX = 'openpyxl>=3.1.2'
 CAMERA = 'opencv-python-headless>=4.7'
 FLEET = ['distributed>=2024.5.0', 'fsspec>=2024.2.0', 'pyarrow>=14.0.1']
@@ -44,6 +47,10 @@ setup(
         'bags': [BAGS],
         # report.html; without it the other files are written.
         'report': REPORT,
+        # report.pdf, a certificate on paper.
+        'pdf': [*REPORT, PDF],
+        # The site: `make docs`.
+        'docs': DOCS,
         # Workbooks as tables.
         'xlsx': [XLSX],
         # For photographs; Ubuntu has it as python3-opencv.
@@ -57,6 +64,7 @@ setup(
         'test': [
             BAGS,
             *REPORT,
+            PDF,
             XLSX,
             CAMERA,
             *FLEET,

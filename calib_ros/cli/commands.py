@@ -19,10 +19,12 @@ from calib_ros.cli.options import (
     add_chain,
     add_identity,
     add_layout,
+    add_pdf,
     add_settings,
     foreign_of,
     origin_of,
     page_of,
+    paper_of,
     results,
     settings_of,
 )
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from calib_ros.kinematics.se3 import FloatArray
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
-VERIFICATION_FILES = ('report.html', 'residuals.csv', 'verification.txt')
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
 TASK_POSES = 300
 """Random poses at which a plan is to be accurate when no task is given."""
@@ -160,6 +162,7 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('--out', type=Path, help='folder for the report and the residuals')
     add('--force', action='store_true', help='replace the result in --out')
     add_identity(parser)
+    add_pdf(parser)
     add_layout(parser)
 
 
@@ -466,7 +469,7 @@ def _verified(options: argparse.Namespace) -> tuple[int, dict[str, str | bytes]]
         'residuals.csv': poses.table(),
         'verification.txt': f'{words}\n',
     }
-    return status, contents | page_of(report)
+    return status, {**contents, **page_of(report), **paper_of(report, options.pdf)}
 
 
 def _compensate(options: argparse.Namespace) -> int:

@@ -30,10 +30,12 @@ from calib_ros.cli.options import (
     add_chain,
     add_identity,
     add_layout,
+    add_pdf,
     add_settings,
     foreign_of,
     origin_of,
     page_of,
+    paper_of,
     results,
     settings_of,
 )
@@ -125,6 +127,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
     )
     add_identity(identify)
+    add_pdf(identify)
     add_layout(identify)
     if 'identify' in given:  # they know numpy, which takes longer than all the rest
         add_settings(identify)
@@ -214,9 +217,9 @@ def _identify(options: argparse.Namespace) -> int:
     if options.out is None:
         found = _identified(options)
     else:
-        with results(options, RESULT_FILES) as folder:
+        with results(options, (*RESULT_FILES, 'report.pdf')) as folder:
             found = _identified(options)
-            _write_result(folder, options.out, found, options.tolerance)
+            _write_result(folder, options.out, found, options.tolerance, options.pdf)
     result = found.result
     for warning in (*found.warnings, *result.remarks):
         print(f'warning: {warning}', file=sys.stderr)
@@ -540,6 +543,7 @@ def _write_result(
     out: Path,
     found: _Identified,
     tolerance: float | None = None,
+    pdf: bool = False,
 ) -> None:
     """Write the files of a result; a chain only if it is accepted.
 
@@ -565,7 +569,7 @@ def _write_result(
     }
     wanted = None if tolerance is None else 1e-3 * tolerance
     report = identification_report(problem, result, poses, origin, warnings, wanted)
-    contents |= page_of(report)
+    contents |= {**page_of(report), **paper_of(report, pdf)}
     earlier = out / 'calibration.yaml'
     if result.accepted:
         contents['calibration.yaml'] = words.calibration_yaml(result)

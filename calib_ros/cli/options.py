@@ -151,3 +151,19 @@ def page_of(report: Report, name: str = 'report.html') -> dict[str, str]:
         print(f'note: {MISSING}', file=sys.stderr)
         return {}
     return {name: text}
+
+
+def add_pdf(parser: argparse.ArgumentParser) -> None:
+    """Add the option for a report on paper."""
+    text = 'write report.pdf as well: the report on paper, with a certificate first'
+    parser.add_argument('--pdf', action='store_true', help=text)
+
+
+def paper_of(report: Report, wanted: bool = True) -> dict[str, bytes]:
+    """Return report.pdf by its name, as `page_of` does; nothing where it is not wanted."""
+    from calib_ros.report.page import MISSING_PDF, on_paper
+
+    found = on_paper(report) if wanted else None
+    if wanted and found is None:
+        print(f'note: {MISSING_PDF}', file=sys.stderr)
+    return {} if found is None else {'report.pdf': found}
