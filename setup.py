@@ -93,7 +93,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
-        (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
+        (f'{SHARE}/config', glob('config/*.*')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
         (f'{SHARE}/config/tables', glob('config/tables/*.yaml')),
         (f'{SHARE}/security', glob('security/*.xml')),
