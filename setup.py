@@ -22,6 +22,7 @@ PDF = 'weasyprint>=61.1'
 DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.24']
 XLSX = 'openpyxl>=3.1.2'
 CAMERA = 'opencv-python-headless>=4.7'
+TERMINAL = ['argcomplete>=3.1.4', 'rich>=13.7.1']
 FLEET = ['distributed>=2024.5.0', 'fsspec>=2024.2.0', 'pyarrow>=14.0.1']
 
 setup(
@@ -55,6 +56,8 @@ setup(
         'xlsx': [XLSX],
         # For photographs; Ubuntu has it as python3-opencv.
         'camera': [CAMERA],
+        # Colour, bars with the time left, completion of commands by TAB.
+        'terminal': TERMINAL,
         # Histories and fleets.
         'fleet': FLEET,
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
@@ -68,6 +71,7 @@ setup(
             XLSX,
             CAMERA,
             *FLEET,
+            *TERMINAL,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',

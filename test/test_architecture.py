@@ -28,7 +28,9 @@ ONLY = {
     'cv2': ('files.images',),
     'pyarrow': ('files.history',),
     'fsspec': ('files.history', 'fleet.'),
-    **dict.fromkeys(('distributed', 'rich'), ('fleet.',)),
+    'distributed': ('fleet.',),
+    'rich': ('fleet.', 'cli.screen'),
+    'argcomplete': ('cli.main',),
     'yaml': (
         *('texts', 'kinematics.chain_file', 'files.export', 'files.trajectories'),
         *('files.vendors', 'ros.arguments'),

@@ -78,7 +78,8 @@ def test_package_xml_names_everything_that_is_imported():
     declared.add('openpyxl')  # for workbooks only: `pip install calib_ros[xlsx]`
     declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
     declared |= {'cv2', 'openpyxl'}  # for photographs and workbooks only, extras as well
-    declared |= {'distributed', 'fsspec', 'pyarrow', 'rich'}  # for fleets and histories only
+    declared |= {'distributed', 'fsspec', 'pyarrow'}  # for fleets and histories only
+    declared |= {'argcomplete', 'rich'}  # for terminals only
     keys = {'yaml': 'python3-yaml'}
     keys |= {
         name: f'python3-{name}' for name in ('jinja2', 'matplotlib', 'numpy', 'plotly', 'scipy')

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
@@ -118,7 +118,9 @@ def _share(expected: int | None, found: int) -> float:
     return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
-def replay(path: Path, session: CalibrationSession) -> Replayed:
+def replay(
+    path: Path, session: CalibrationSession, told: Callable[[float], None] = lambda share: None
+) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
     Parameters
@@ -127,15 +129,19 @@ def replay(path: Path, session: CalibrationSession) -> Replayed:
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
         Takes the messages; its settings name topics where the types leave a choice.
+    told : callable, optional
+        Called with the share of the messages that are read.
 
     """
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
     with unpacked_files(path) as folder:
-        return _replay(path, folder, session)
+        return _replay(path, folder, session, told)
 
 
-def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
+def _replay(
+    path: Path, folder: Path, session: CalibrationSession, told: Callable[[float], None]
+) -> Replayed:
     """Feed the files in a folder, which are those of a bag or were unpacked from it."""
     library = _rosbag2()
     try:
@@ -153,7 +159,12 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
         streams, deserialise = _chosen(session, available, partial(read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
-        count, problem = _feed(session, read(reader, streams), deserialise)
+        count, problem = _feed(
+            session,
+            read(reader, streams),
+            deserialise,
+            lambda count: told(count / max(expected, count, 1)),
+        )
     if problem is not None and count == 0:
         found = salvage(folder)
         if found is not None:
@@ -413,8 +424,9 @@ def _feed(
     session: CalibrationSession,
     messages: Iterator[tuple[Stream, bytes]],
     deserialise: Deserialise,
+    told: Callable[[int], None] = lambda count: None,
 ) -> tuple[int, str | None]:
-    """Feed serialised messages; return how many, and what is wrong with the others if any."""
+    """Feed serialised messages, and tell how many so far; return that and what is wrong if any."""
     count, problem, ended = 0, None, False
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
@@ -429,6 +441,7 @@ def _feed(
         if len(usable) < len(batch):
             problems.append(f'messages without data, or of more than {LARGEST_MESSAGE} bytes')
         problem = (problem, *problems)[-1]
+        told(count)
     session.finish()
     return count, problem
 

@@ -130,7 +130,7 @@ def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None)
 
 def identified(result: Identification, about: Filing, kind: str = 'identify') -> Row:
     """Return the row of an identification."""
-    offsets: dict[str, float] = {each.name: each.offset for each in result.parameters}
+    offsets = {str(each.name): each.offset for each in result.parameters}
     which = result.validation or result.fitted
     shown = which.judged & ~np.isnan(which.after.position).any(axis=1)
     errors = which.after

@@ -20,9 +20,10 @@ from measured import TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 from plotly import graph_objects
 
 from calib_ros.apply.verification import verify
-from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.apply.workspace import survey
 from calib_ros.cli.main import main
 from calib_ros.files.export import exports
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
@@ -198,7 +199,7 @@ def test_a_page_loads_nothing(solved):
 
 
 def test_every_figure_is_one_that_plotly_knows(solved):
-    arm = CalibratedArm.of(solved[1])
+    arm = Calibration.of(solved[1])
     found = survey(arm, 500, np.random.default_rng(0))
     reports = [report_of(*solved), workspace_report(arm, found, Origin())]
     count = 0
@@ -246,7 +247,7 @@ def test_paper_begins_with_a_certificate(solved):
 
 
 def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
-    arm = CalibratedArm.of(solved[1])
+    arm = Calibration.of(solved[1])
     found = survey(arm, 500, np.random.default_rng(0))
     for report in (report_of(*solved), workspace_report(arm, found, Origin())):
         for each in report.sections:
@@ -293,7 +294,7 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
 def test_a_verification_has_its_verdict_first(solved):
     problem, result = solved
     sets = (problem.held_out,)
-    found = verify(CalibratedArm.of(result), sets, 1e-3)
+    found = verify(Calibration.of(result), sets, 1e-3)
     poses = poses_to_verify(result.chain, sets, found.comparison)
     page = page_of(verification_report(result.chain, found, poses, Origin()))
     assert page.text.index('Passed') < page.text.index('Accuracy before')
