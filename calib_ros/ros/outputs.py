@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -55,7 +56,7 @@ class Exportable(NamedTuple):
 
     chain: Chain
     text: str
-    joints: Sequence[FloatArray] | None
+    joints: FloatArray | None
 
 
 class Keeper:
@@ -104,7 +105,7 @@ class Keeper:
         """Take an accepted result as the calibration in use."""
         with self._lock:
             self._session.adopt(result, samples)
-            self._publish(result.chain, published)
+            self._publish(result.chain, result.world_frame, published)
 
     @property
     def published(self) -> Published:
@@ -163,8 +164,9 @@ class Keeper:
                 f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
             )
         with self._lock:
-            session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''), region)
-            self._publish(chain, Published(text, ''))
+            world = record.get('world_frame', '')
+            session.load(chain, record.get('rms_mm_after'), world, region)
+            self._publish(chain, world, Published(text, ''))
         return path
 
     def exportable(self) -> Exportable:
@@ -172,16 +174,19 @@ class Keeper:
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
-        joints = [sample.joints for sample in session.samples]
+        joints = np.array([sample.joints for sample in session.samples])
         with self._lock:
-            return Exportable(session.calibration.chain, self._published.text, joints or None)
+            return Exportable(
+                session.calibration.chain, self._published.text, joints if len(joints) else None
+            )
 
     def export(self, found: Exportable) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
         record = calibration_record(found.text)
         nominal, links = self._session.chain, self._given.links
         forms = exports(found.chain, nominal, found.joints, record)
-        forms += vendor_files(found.chain, nominal, record, self._urdf, links)
+        ends = {'base_link': links['base_link'], 'tip_link': links['tip_link']}
+        forms += vendor_files(found.chain, nominal, record, self._urdf, ends)
         files = {each.name: each.content for each in forms}
         if self._urdf:
             text = corrected_urdf(self._urdf, found.chain, **links)
@@ -212,11 +217,11 @@ class Keeper:
             f'choose {parameter} in data_dir, or start the node with allowed_folders',
         )
 
-    def _publish(self, chain: Chain, published: Published) -> None:
+    def _publish(self, chain: Chain, world: str, published: Published) -> None:
         self._published = published
         self._dh_parameters.publish(to_ros.dh_parameters(chain))
         self._calibration.publish(String(data=published.text))
-        self._broadcast.publish(chain, self._session.calibration.world_frame)
+        self._broadcast.publish(chain, world)
 
 
 def _calibration_text(path: Path) -> str:
