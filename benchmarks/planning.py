@@ -47,7 +47,7 @@ from calib_ros.apply.choice import choose
 from calib_ros.apply.design import Candidates, Design, accuracy, predicted
 from calib_ros.apply.placement import place
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
@@ -117,7 +117,7 @@ def speed():
         theirs = timed('naive_d', lambda: naive(design, candidates, 30))
     timed('choose_o5', lambda: choose(design, candidates, 30, 'o5'))
     true = faulty(chain, Cell(), rng)
-    arm = CalibratedArm.of(identify(Problem(chain, measure(true, candidates[:60], rng, *SIGMAS))))
+    arm = Calibration.of(identify(Problem(chain, measure(true, candidates[:60], rng, *SIGMAS))))
     postures = chain.random_joints(10000, rng)
 
     def mapped(joints):
@@ -204,7 +204,7 @@ def placement(draws):
         identify(Problem(nominal, measure(true, joints, np.random.default_rng(seed), *SIGMAS)))
         for seed in range(draws)
     ]
-    arm = CalibratedArm.of(results[0])
+    arm = Calibration.of(results[0])
     angle = 2.0 * np.pi * np.arange(12) / 12
     circle = np.column_stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros(12)])
     task = transform(np.tile(np.diag([1.0, -1.0, -1.0]), (12, 1, 1)), circle)

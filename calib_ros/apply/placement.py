@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib_ros.apply.workspace import CalibratedArm, Model, in_base
+from calib_ros.apply.workspace import in_base
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.identification.calibration import Calibration, Model
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
@@ -69,7 +70,7 @@ class Placements(Shown):
 
 
 def place(
-    arm: CalibratedArm,
+    arm: Calibration,
     task: FloatArray,
     aim: Aim = 'mean',
     model: Model = 'corrected',
@@ -81,7 +82,7 @@ def place(
 
     Parameters
     ----------
-    arm : CalibratedArm
+    arm : Calibration
         Before and after.
     task : (K, 4, 4)
         Poses of the target in the task's frame, whose axes are those of the base at turn 0.
@@ -148,7 +149,7 @@ def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArr
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad]."""
 
-    def __init__(self, arm: CalibratedArm, task: FloatArray, aim: Aim, model: Model) -> None:
+    def __init__(self, arm: Calibration, task: FloatArray, aim: Aim, model: Model) -> None:
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
         self._chain = arm.commanded_by(model)
         self._base = self._chain.frame('base').matrix

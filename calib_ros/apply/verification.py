@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
-from calib_ros.apply.workspace import CalibratedArm
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations, configurations
@@ -139,7 +139,7 @@ class Verification(Shown):
 
 
 def verify(
-    arm: CalibratedArm,
+    arm: Calibration,
     sets: Sequence[Observations],
     tolerance: float | None,
     confidence: float = 0.95,
@@ -151,7 +151,7 @@ def verify(
 
     Parameters
     ----------
-    arm : CalibratedArm
+    arm : Calibration
         Before and after.
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
@@ -182,8 +182,8 @@ def verify(
             f'{tolerance} and {confidence}'
         )
     for each in sets:
-        _check(arm.after, each)
-    before, after = arm.before, arm.after
+        _check(arm.chain, each)
+    before, after = arm.before, arm.chain
     wanted = sets
     if commanded is not None:
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
@@ -338,14 +338,20 @@ def in_words(found: Verification) -> str:
     for k, pose in enumerate(found.each):
         again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
         lines.append(f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}')
-    if found.fitted:
-        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
     wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
     lines.append(
         f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
         f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
     )
+    return '\n'.join([*lines, *remarks(found)])
+
+
+def remarks(found: Verification) -> list[str]:
+    """Return what to know besides the figures, and what to do."""
+    lines = []
+    if found.fitted:
+        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     if not found.by_program:
         lines.append(
             'this is about the calibration: whether its correction arrives at the arm shows only '
@@ -360,4 +366,4 @@ def in_words(found: Verification) -> str:
             'the error would be left: was the measuring device moved? If it stands elsewhere on '
             'purpose, --new-base fits its frame, and --new-tool that of another target'
         )
-    return '\n'.join(lines)
+    return lines

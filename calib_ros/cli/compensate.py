@@ -68,9 +68,9 @@ def _add(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.apply.compensation import POSITIVE, Compensator, in_words
     from calib_ros.apply.program import compensate_program
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.atomic import write_file
     from calib_ros.files.trajectories import read_program
+    from calib_ros.identification.calibration import load_calibration
     from calib_ros.kinematics.chain_file import load_chain
 
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
@@ -80,9 +80,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             '--out is the program itself: keep it, a program compensated twice is wrong'
         )
     nominal = load_chain(options.chain)
-    arm = CalibratedArm.read(options.calibration, nominal)
+    arm = load_calibration(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
-    compensator = Compensator(nominal, arm.after, tuple(options.tool), **limits, region=arm.region)
+    compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
     with screen.work(f'correcting {options.program.name}'):
         source = read_program(options.program, nominal.joint_names)
         corrected, result = compensate_program(compensator, source.program)

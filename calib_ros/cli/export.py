@@ -46,16 +46,13 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
     from calib_ros.files.vendors import VENDOR_FILES, vendor_files
     from calib_ros.files.waypoints import read_joints
-    from calib_ros.kinematics.chain_file import (
-        URDF_SUFFIXES,
-        load_chain,
-        parse_calibration,
-        read_text,
-    )
+    from calib_ros.identification.calibration import load_calibration
+    from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
     from calib_ros.kinematics.urdf import corrected_urdf
 
-    nominal, path = load_chain(options.chain), options.calibration
-    chain, origin = parse_calibration(read_text(path), str(path), nominal)
+    nominal = load_chain(options.chain)
+    calibration = load_calibration(options.calibration, nominal)
+    chain, origin = calibration.chain, calibration.record
     measured = None
     if options.measured is not None:
         measured = read_joints(options.measured, chain)

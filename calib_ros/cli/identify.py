@@ -98,7 +98,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     _add_detections(parser)
     add_settings(parser)
     add_layout(parser)
-    add_identity(parser)
+    add_identity(parser, pdf=True)
 
 
 def _add_detections(parser: argparse.ArgumentParser) -> None:
@@ -125,9 +125,10 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.out is None:
         found = _identified(options, screen)
     else:
-        with results(options, RESULT_FILES) as folder:
+        with results(options, (*RESULT_FILES, 'report.pdf')) as folder:
             found = _identified(options, screen)
-            write_files(folder, result_files(found, screen, options.out, options.tolerance))
+            made = result_files(found, screen, options.out, options.tolerance, options.pdf)
+            write_files(folder, made)
     for warning in (*found.warnings, *found.result.remarks):
         screen.warn(warning)
     if options.json:

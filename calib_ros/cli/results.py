@@ -119,14 +119,18 @@ def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
 
 
 def result_files(
-    found: Identified, screen: Screen, out: Path, tolerance: float | None = None
+    found: Identified,
+    screen: Screen,
+    out: Path,
+    tolerance: float | None = None,
+    pdf: bool = False,
 ) -> dict[str, str | bytes]:
     """Return the files of a result by name; a chain only if it is accepted.
 
     A chain that was accepted earlier, in `out`, is kept under another name when this result is
     not: it does not belong to the files beside it any more. `tolerance` is the wanted error [mm].
     """
-    from calib_ros.report import words
+    from calib_ros.identification.calibration import Calibration
     from calib_ros.report.markdown import markdown
     from calib_ros.report.plots import before_after_png
     from calib_ros.report.poses import poses_of
@@ -146,10 +150,10 @@ def result_files(
         report = identification_report(
             loaded.problem, result, poses, found.origin, found.warnings, wanted
         )
-        contents |= page_of(report, screen)
+        contents |= page_of(report, screen, pdf=pdf)
     earlier = out / 'calibration.yaml'
     if result.accepted:
-        contents['calibration.yaml'] = words.calibration_yaml(result)
+        contents['calibration.yaml'] = Calibration.of(result, owners=loaded.owners).dump()
     elif earlier.exists():
         contents['calibration.previous.yaml'] = earlier.read_bytes()
     return contents

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib_ros.cli.command import Command
-from calib_ros.cli.inputs import inputs_of_calibration, replayed, table
+from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
@@ -30,11 +30,12 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from calib_ros.apply.verification import Verification
     from calib_ros.cli.screen import Screen
     from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain import Chain
 
-VERIFICATION_FILES = ('report.html', 'residuals.csv', 'verification.txt')
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
 TITLES = {
     'PASS': ('PASS: the arm is within the tolerance', True),
     'FAIL': ('FAIL: the arm is beyond the tolerance', False),
@@ -76,7 +77,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(group, 'the report and the residuals')
     add_settings(parser, OF_BAGS)
     add_layout(parser)
-    add_identity(parser)
+    add_identity(parser, pdf=True)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -94,14 +95,14 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[str, str | bytes]]:
     """Judge, and print what comes out; return the exit status and the files of --out."""
     from calib_ros.apply.verification import in_words, verify
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.files.waypoints import read_joints
+    from calib_ros.identification.calibration import calibration_file, load_calibration
     from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report.poses import poses_to_verify
     from calib_ros.report.verified import verification_report
 
     nominal = load_chain(options.chain)
-    arm = CalibratedArm.read(options.calibration, nominal)
+    arm = load_calibration(options.calibration, nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
     commanded = None
     if options.commanded is not None:
@@ -119,20 +120,56 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
     for warning in warnings:
         screen.warn(warning)
     words = in_words(found)
-    screen.title(*TITLES[found.verdict])
-    screen.say(words)
+    show(found, screen)
     status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
     if options.out is None:
         return status, {}
-    read = (options.measured, options.commanded, *inputs_of_calibration(options.calibration))
+    read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report'):
-        poses = poses_to_verify(arm.after, sets, found.comparison, by_line)
-        report = verification_report(arm.after, found, poses, origin_of(options, read), warnings)
+        poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
+        report = verification_report(arm.chain, found, poses, origin_of(options, read), warnings)
         contents: dict[str, str | bytes] = {
             'residuals.csv': poses.table(),
             'verification.txt': f'{words}\n',
         }
-        return status, contents | page_of(report, screen)
+        return status, contents | page_of(report, screen, pdf=options.pdf)
+
+
+def show(found: Verification, screen: Screen) -> None:
+    """Print a verdict, six rows, the poses if they are few, and what to do."""
+    from calib_ros.apply.verification import remarks
+
+    before, after = found.comparison.figures
+    orientation = 'not measured'
+    if before.rms_mrad is not None and after.rms_mrad is not None:
+        orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
+    tolerance = 'none given (--tolerance MM)'
+    if found.tolerance is not None:
+        tolerance = f'RMS {1e3 * found.tolerance:g} mm'
+    screen.title(*TITLES[found.verdict])
+    screen.table(
+        (
+            ('measured', f'{after.count} times in {found.configurations} configurations'),
+            ('position error', f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm'),
+            ('largest', f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm'),
+            ('orientation error', orientation),
+            (
+                f'{100.0 * found.confidence:g} % sure',
+                f'RMS over poses like these is above {1e3 * found.lower:.4f} and below '
+                f'{1e3 * found.upper:.4f} mm',
+            ),
+            ('tolerance', tolerance),
+        )
+    )
+    if found.each:
+        screen.say('position error [mm] by configuration')
+        screen.say('  pose   measured   before    after   repeatability (mean + 3 sigma)')
+    for k, pose in enumerate(found.each):
+        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        line = f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
+        screen.say(line.rstrip())
+    for remark in remarks(found):
+        screen.bullet(remark)
 
 
 def _sets(

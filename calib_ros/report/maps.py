@@ -11,7 +11,8 @@ import numpy as np
 
 from calib_ros.apply.placement import Placements
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import CalibratedArm, Spread, Survey, in_base, regions
+from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
@@ -25,7 +26,7 @@ MOST_REGIONS = 6
 
 
 def workspace_report(
-    arm: CalibratedArm, found: Survey, origin: Origin, placed: Placements | None = None
+    arm: Calibration, found: Survey, origin: Origin, placed: Placements | None = None
 ) -> Report:
     """Return the report of a survey, and of the placements of a task if there are any."""
     spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
@@ -39,7 +40,7 @@ def workspace_report(
     errors = Section('map', 'Errors by radius and height', (about,), figures.error_map(found))
     return Report(
         kind='Errors over the workspace',
-        robot=arm.after.name,
+        robot=arm.chain.name,
         verdict=Verdict('info', 'What the calibration changes, and where', tuple(text)),
         accuracy=Section(
             'accuracy',
@@ -48,7 +49,7 @@ def workspace_report(
             head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
-        identity=identity_of(arm.after, origin, corrected=table_hash(arm.after)),
+        identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
         inputs=origin.inputs,
         settings=origin.settings,

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.apply.workspace import survey
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import table_hash
@@ -301,7 +302,7 @@ def _correlations(result: Identification) -> Section:
 
 def _map(result: Identification) -> Section:
     """Return the error map over the workspace."""
-    found = survey(CalibratedArm.of(result), SURVEYED, np.random.default_rng(0))
+    found = survey(Calibration.of(result), SURVEYED, np.random.default_rng(0))
     where = '' if result.region is None else f'The calibration is {result.region.in_words()}.'
     return Section(
         'map',

@@ -7,20 +7,19 @@ from __future__ import annotations
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 
 import calib_ros
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.region import Region
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record, table_hash
+from calib_ros.kinematics.chain_file import dump_yaml
 from calib_ros.kinematics.se3 import to_quat
-from calib_ros.sampling.calibration import Calibration
 from calib_ros.settings import Settings
 
 HOLDS = 1.5
@@ -101,35 +100,6 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     )
 
 
-def provenance(result: Identification) -> dict[str, Any]:
-    """Return where the numbers of a corrected chain come from, as plain values."""
-    before, after = (result.validation or result.fitted).figures
-    return {
-        'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-        'software': f'calib_ros {calib_ros.__version__}',
-        'accepted': result.accepted,
-        'world_frame': result.world_frame,
-        'samples': len(result.fitted.judged),
-        'outliers': len(result.outliers),
-        'validated_by': result.validated_by,
-        'rms_mm_before': round(before.rms_mm, 6),
-        'rms_mm_after': round(after.rms_mm, 6),
-        'not_identifiable': list(result.unidentifiable),
-        'table_sha256': table_hash(result.chain),
-        'nominal': nominal_record(result.before),
-        'region': None if result.region is None else result.region.document(),
-    }
-
-
-def calibration_yaml(result: Identification, origin: Mapping[str, Any] | None = None) -> str:
-    """Return the corrected chain as the text of a chain file, which can be an input again.
-
-    `origin` says where the samples come from.
-    """
-    head = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
-    return head + dump_chain(result.chain, provenance(result) | dict(origin or {}))
-
-
 def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     """Return the configuration as a parameter file, with which a node does the same again.
 
@@ -142,16 +112,14 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
 
 
 def verdict(
-    calibration: Calibration | None, now: ErrorFigures, nominal: ErrorFigures | None
+    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures
 ) -> tuple[bool, str]:
     """Return whether a calibration still holds on new samples, and why in words."""
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    text += f'{now.count} samples taken since'
-    if nominal is not None:
-        text += f'; the nominal chain has {nominal.rms_mm:.3f} mm'
-    judged = None if calibration is None else calibration.rms_mm
-    if judged is None:
+    text += f'{now.count} samples taken since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    if calibration.residual is None:
         return True, text
+    judged = 1e3 * calibration.residual
     if now.rms_mm > HOLDS * judged:
         return False, (
             f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '

@@ -8,12 +8,13 @@ A sample is what the live node takes, what the journal keeps, and what a row of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.records import Owner
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -84,13 +85,23 @@ class Frames:
     """Names of the frames between which samples were measured.
 
     The first session, device and target that is met has the frames `base` and `tool`; others add
-    their names.
+    their names. `owners` are those of frames that have names already.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, owners: Mapping[str, Owner] | None = None) -> None:
         self._sessions: list[str] = []
         self._ends: dict[tuple[str, str], list[tuple[bool, str]]] = {}
-        self._owners: dict[str, tuple[str, bool, bool, str]] = {}
+        self._owners = dict(owners or {})
+        for name, (session, eye, socket, label) in self._owners.items():
+            if session not in self._sessions:
+                self._sessions.append(session)
+            if not socket:
+                self._end(name.partition('_')[0], session, (eye, label))
+
+    @property
+    def owners(self) -> Mapping[str, Owner]:
+        """Return which session, device or target each frame is of."""
+        return self._owners
 
     def of(self, sample: Sample) -> tuple[str, str]:
         """Return the names of base and tool of a sample.
@@ -114,7 +125,7 @@ class Frames:
             self._own(f'tool{suffix}{end}', (sample.session, eye, False, tool)),
         )
 
-    def _own(self, name: str, owner: tuple[str, bool, bool, str]) -> str:
+    def _own(self, name: str, owner: Owner) -> str:
         """Return a name that is no one else's: a device may be called like a session."""
         while self._owners.setdefault(name, owner) != owner:
             name += '_'
