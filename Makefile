@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test fuzz lint oldest screenshots clean
+.PHONY: demo test fuzz mutants lint oldest screenshots clean
 
 demo: $(VENV)/installed
 	$(BIN)/calib_ros demo --out demo --force
@@ -16,6 +16,13 @@ fuzz: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: atheris \
 	    || echo 'no atheris for this Python: hypothesis alone'
 	OMP_NUM_THREADS=1 $(BIN)/python test/fuzz/fuzz_run.py --seconds $(FUZZ_SECONDS)
+
+# Changes one thing at a time in the numeric folders and tells which changes no test notices; hours,
+# so not part of CI. MUTANTS='calib_ros.kinematics.se3*' for a part, `mutmut browse` for the rest.
+mutants: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check mutmut
+	OMP_NUM_THREADS=1 $(BIN)/mutmut run $(MUTANTS)
+	$(BIN)/mutmut results
 
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
