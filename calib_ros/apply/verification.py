@@ -338,14 +338,20 @@ def in_words(found: Verification) -> str:
     for k, pose in enumerate(found.each):
         again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
         lines.append(f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}')
-    if found.fitted:
-        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
     wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
     lines.append(
         f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
         f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
     )
+    return '\n'.join([*lines, *remarks(found)])
+
+
+def remarks(found: Verification) -> list[str]:
+    """Return what to know besides the figures, and what to do."""
+    lines = []
+    if found.fitted:
+        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     if not found.by_program:
         lines.append(
             'this is about the calibration: whether its correction arrives at the arm shows only '
@@ -360,4 +366,4 @@ def in_words(found: Verification) -> str:
             'the error would be left: was the measuring device moved? If it stands elsewhere on '
             'purpose, --new-base fits its frame, and --new-tool that of another target'
         )
-    return '\n'.join(lines)
+    return lines

@@ -8,7 +8,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from calib_ros.cli.inputs import Loaded, table
+from calib_ros.cli.inputs import SIGMA_TOUCH, Loaded, table
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -70,6 +70,7 @@ def detected(
         rows.held_out if options.csv is not None else None,
         more=more,
         sigma_pixel=SIGMA_PIXEL if options.sigma_pixel is None else options.sigma_pixel,
+        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
         **given,
     )
     reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'

@@ -45,7 +45,7 @@ LAYOUT = (
 """Options of tables of others."""
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens', 'sigma_pixel')
 """Options for what a camera saw."""
-OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', *LAYOUT, *DETECTIONS)
+OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 LARGEST_LOSS = 0.1
 """Share of the messages of a bag that may be lost. As many fewer samples at random make standard
@@ -83,6 +83,12 @@ def _add(parser: argparse.ArgumentParser) -> None:
         metavar='M',
         help='between two sockets of a place, 0.05 if not given',
     )
+    add(
+        '--sigma-touch',
+        type=float,
+        metavar='M',
+        help='of heights over touched planes, 1e-4 if not given',
+    )
     group = parser.add_argument_group('what to write')
     add_out(group, 'calibration, result and report')
     group.add_argument('--json', action='store_true', help='print the result as JSON')
@@ -92,7 +98,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     _add_detections(parser)
     add_settings(parser)
     add_layout(parser)
-    add_identity(parser)
+    add_identity(parser, pdf=True)
 
 
 def _add_detections(parser: argparse.ArgumentParser) -> None:
@@ -119,9 +125,10 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.out is None:
         found = _identified(options, screen)
     else:
-        with results(options, RESULT_FILES) as folder:
+        with results(options, (*RESULT_FILES, 'report.pdf')) as folder:
             found = _identified(options, screen)
-            write_files(folder, result_files(found, screen, options.out, options.tolerance))
+            made = result_files(found, screen, options.out, options.tolerance, options.pdf)
+            write_files(folder, made)
     for warning in (*found.warnings, *found.result.remarks):
         screen.warn(warning)
     if options.json:

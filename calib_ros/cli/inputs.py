@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.settings import Settings
 
+SIGMA_TOUCH = 1e-4
+"""Standard deviation [m] of heights over touched planes, if it is not given."""
 SOCKETS = 0.05
 """Distance [m] between two sockets of a place, if it is not given."""
 
@@ -107,6 +109,7 @@ def of_table(
         more=found.fitted[1:],
         separations=tuple((*pair, sockets) for pair in found.pairs),
         world_frame=found.world_frame,
+        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
         **settings.for_problem(),
     )
     samples = {

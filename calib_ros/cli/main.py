@@ -30,10 +30,11 @@ from calib_ros.errors import CalibrationError, UnknownNameError, shortened
 
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
-    ('calib_ros robots', 'the arms that come with calib_ros'),
+    ('calib_ros robots', 'the arms that are known'),
     ('calib_ros plan --chain ur10e --out plan.csv', 'which poses to measure'),
     ('calib_ros identify measured.csv --chain ur10e --out result/', ''),
     ('calib_ros verify new.csv --chain ur10e --calibration result/', ''),
+    ('calib_ros compensate program.csv --chain ur10e --calibration result/ ...', ''),
 )
 ADVICE = {
     errno.ENOSPC: 'the disk is full: make room, or write to another place',
@@ -67,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _failed(text: str, status: int = 1) -> int:
-    print(f'calib_ros: {shortened(text)}', file=sys.stderr)
+    Screen().warn(shortened(text), 'calib_ros')
     return status
 
 
@@ -120,7 +121,11 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
 
 
 def _foot(command: Command) -> str:
-    return 'examples:\n' + '\n'.join(f'  calib_ros {each}' for each in command.examples)
+    lines = ['examples:']
+    for each in command.examples:
+        parts = textwrap.wrap(f'calib_ros {each}', WIDTH - 8, break_on_hyphens=False)
+        lines.append('  ' + ' \\\n      '.join(parts))
+    return '\n'.join(lines)
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -178,7 +183,7 @@ def _overview() -> str:
                 lines.append(text)
     lines += ['', 'The way:']
     for command, words in WAY:
-        lines.append(f'  {command:46}{words}' if words else f'  {command}')
+        lines.append(f'  {command:45}{words}'.rstrip())
     lines += ['', '`calib_ros COMMAND --help` tells the options of a command, with examples.']
     return '\n'.join(lines)
 

@@ -49,10 +49,8 @@ class Screen:
         if self.quiet:
             return
         for line in text.splitlines() or ['']:
-            if sys.stdout.isatty():
-                indent = ' ' * (len(line) - len(line.lstrip()) + 2)
-                line = _wrapped(line, '', indent, _width(sys.stdout))
-            print(_printable(line), flush=True)
+            indent = ' ' * (len(line) - len(line.lstrip()) + 2)
+            print(_fitted(line, indent, sys.stdout), flush=True)
 
     def title(self, text: str, good: bool | None = None) -> None:
         """Print a verdict; the colour of a good or bad one never says more than the words."""
@@ -92,12 +90,12 @@ class Screen:
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
-        line = f'{kind}: {text}'
+        line = _fitted(f'{kind}: {text}', '  ', sys.stderr)
         console = _console(sys.stderr)
         if console is not None:
             console.print(_rich_text(line, 'yellow'))
         else:
-            print(_printable(line), file=sys.stderr)
+            print(line, file=sys.stderr)
 
     @contextmanager
     def work(self, what: str) -> Iterator[Work]:
@@ -211,6 +209,11 @@ def _width(stream: TextIO) -> int:
 
 def _printable(text: str) -> str:
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
+
+
+def _fitted(line: str, indent: str, stream: TextIO) -> str:
+    """Return a line as a terminal takes it; in a file it stays one."""
+    return _wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
 
 
 def _wrapped(text: str, head: str, indent: str, width: int) -> str:

@@ -30,11 +30,12 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from calib_ros.apply.verification import Verification
     from calib_ros.cli.screen import Screen
     from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain import Chain
 
-VERIFICATION_FILES = ('report.html', 'residuals.csv', 'verification.txt')
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
 TITLES = {
     'PASS': ('PASS: the arm is within the tolerance', True),
     'FAIL': ('FAIL: the arm is beyond the tolerance', False),
@@ -76,7 +77,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_out(group, 'the report and the residuals')
     add_settings(parser, OF_BAGS)
     add_layout(parser)
-    add_identity(parser)
+    add_identity(parser, pdf=True)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -119,8 +120,7 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
     for warning in warnings:
         screen.warn(warning)
     words = in_words(found)
-    screen.title(*TITLES[found.verdict])
-    screen.say(words)
+    show(found, screen)
     status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
     if options.out is None:
         return status, {}
@@ -132,7 +132,44 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
             'residuals.csv': poses.table(),
             'verification.txt': f'{words}\n',
         }
-        return status, contents | page_of(report, screen)
+        return status, contents | page_of(report, screen, pdf=options.pdf)
+
+
+def show(found: Verification, screen: Screen) -> None:
+    """Print a verdict, six rows, the poses if they are few, and what to do."""
+    from calib_ros.apply.verification import remarks
+
+    before, after = found.comparison.figures
+    orientation = 'not measured'
+    if before.rms_mrad is not None and after.rms_mrad is not None:
+        orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
+    tolerance = 'none given (--tolerance MM)'
+    if found.tolerance is not None:
+        tolerance = f'RMS {1e3 * found.tolerance:g} mm'
+    screen.title(*TITLES[found.verdict])
+    screen.table(
+        (
+            ('measured', f'{after.count} times in {found.configurations} configurations'),
+            ('position error', f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm'),
+            ('largest', f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm'),
+            ('orientation error', orientation),
+            (
+                f'{100.0 * found.confidence:g} % sure',
+                f'RMS over poses like these is above {1e3 * found.lower:.4f} and below '
+                f'{1e3 * found.upper:.4f} mm',
+            ),
+            ('tolerance', tolerance),
+        )
+    )
+    if found.each:
+        screen.say('position error [mm] by configuration')
+        screen.say('  pose   measured   before    after   repeatability (mean + 3 sigma)')
+    for k, pose in enumerate(found.each):
+        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        line = f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
+        screen.say(line.rstrip())
+    for remark in remarks(found):
+        screen.bullet(remark)
 
 
 def _sets(

@@ -219,10 +219,12 @@ def posterior_of(
 def _lengths(chain: Chain, system: System) -> dict[str, float]:
     """Return all lengths [m] that positions are made of; none where no device has a scale.
 
-    A ball in a socket is where it is, and a prismatic joint has a length of its own.
+    Balls in sockets and touched planes are where they are, and a prismatic joint has a length of
+    its own.
     """
-    sockets = any(samples.observations.socket for samples in system.sets)
-    if sockets or any(joint.type == 'prismatic' for joint in chain.joints):
+    sets = [samples.observations for samples in system.sets]
+    touching = any(each.socket or each.plane for each in sets)
+    if touching or any(joint.type == 'prismatic' for joint in chain.joints):
         return {}
     names = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]

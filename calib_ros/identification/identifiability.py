@@ -74,6 +74,7 @@ class Kind:
     base: str = 'base'
     tool: str = 'tool'
     socket: bool = False
+    plane: bool = False
 
     @property
     def rows(self) -> int:
@@ -93,9 +94,9 @@ def structurally_independent(
     not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
     by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
-    poses: turning the whole cell about it shows nowhere else than in residuals. A board tells its
-    pose in a camera, and images of it from anywhere tell the camera's lens (Zhang 2000). `extra`
-    returns further equations at a chain.
+    poses: turning the whole cell about it shows nowhere else than in residuals. So does the size
+    of a cell that touches planes alone. A board tells its pose in a camera, and images of it from
+    anywhere tell the camera's lens (Zhang 2000). `extra` returns further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -108,7 +109,7 @@ def structurally_independent(
     velocity = rng.normal(size=joints.shape)
     for number, kind in enumerate(kinds):
         posed = joints
-        if kind.socket:
+        if kind.socket or kind.plane:
             posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
             shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
@@ -116,6 +117,8 @@ def structurally_independent(
         jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
         if kind.distance:
             line = anywhere.forward(posed, approach, kind.base, kind.tool)[:, :3, 3]
+            if kind.plane:
+                line[:] = [0.0, 0.0, 1.0]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
@@ -137,18 +140,21 @@ MEETING_STEPS = 100
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
     """Return joint values (N, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first; the others are led there by damped Gauss-Newton steps.
+    It is that of the first, of planes the height in the middle; the others are led there by damped
+    Gauss-Newton steps.
     """
+    free = [2] if kind.plane else [0, 1, 2]
     driven = [j.driven for j in chain.joints]
     model = ErrorModel(chain, driven, kind.base, kind.tool)
     signs = np.array([joint.sign for joint in chain.joints], dtype=float)
-    wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]
+    places = chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+    wanted = np.array([0.0, 0.0, np.median(places[:, 2])]) if kind.plane else places[0]
     for _ in range(MEETING_STEPS):
-        left = wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+        left = (wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3])[:, free]
         if np.abs(left).max() < MEETING:
             break
-        jacobian = model.jacobian(joints)[:, :3] * signs
-        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        jacobian = model.jacobian(joints)[:, free] * signs
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(len(free))
         step = np.linalg.solve(square, left[..., np.newaxis])
         joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
     return joints, wanted

@@ -118,7 +118,7 @@ class Samples:
             moving = None if velocity is None else velocity[:, part]
             axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving)
             if self.distances is not None:
-                shift = _along(origin, shift, self.distances[part])
+                shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
             if self.oriented:
@@ -240,7 +240,8 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
             chain.effective(q, came), base=observations.base, tool=observations.tool
         )
         if distances is not None:
-            position[part, 0] = distances[part] - np.linalg.norm(origin, axis=0)
+            length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
+            position[part, 0] = distances[part] - length
             continue
         position[part] = observations.positions[part] - origin.T
         if oriented[part].any():
@@ -280,8 +281,17 @@ def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray
     return pixels, shifts
 
 
-def _along(origin: FloatArray, shift: FloatArray, distances: FloatArray) -> FloatArray:
-    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|."""
+def _along(
+    origin: FloatArray, shift: FloatArray, distances: FloatArray, plane: bool
+) -> FloatArray:
+    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|.
+
+    Over a plane they are along its normal z.
+    """
+    if plane:
+        along = np.ascontiguousarray(shift[:, 2:])
+        along[-1, 0] = distances - origin[2]
+        return along
     length = np.maximum(np.linalg.norm(origin, axis=0), 1e-12)
     along = np.einsum('pcb,cb->pb', shift, origin / length)[:, np.newaxis]
     along[-1, 0] = distances - length

@@ -62,6 +62,8 @@ class Problem(Shown):
         ratio weighs position against orientation; the size of the noise is estimated.
     sigma_pixel : float
         Standard deviation [px] of each coordinate of a point of a board in an image.
+    sigma_touch : float
+        Standard deviation [m] of heights over a plane.
     loss : 'redescending', 'huber' or 'none'
         How gross errors are kept from ruining the fit (`robust.py`).
     priors : mapping of str to float
@@ -101,10 +103,11 @@ class Problem(Shown):
     separations: Sequence[tuple[str, str, float]] = ()
     learned: Learned | None = None
     sigma_pixel: float = 0.3
+    sigma_touch: float = 1e-4
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
-        for name in ('sigma_position', 'sigma_orientation', 'sigma_pixel'):
+        for name in ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch'):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
         if self.loss not in LOSSES:
@@ -193,6 +196,7 @@ class Problem(Shown):
                 each.base,
                 each.tool,
                 each.socket,
+                each.plane,
             )
             for each in self.sets
         )
@@ -256,8 +260,14 @@ class Problem(Shown):
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None
-        noises = (self.sigma_position, self.sigma_orientation)
-        samples = [samples_of(each, noises, self.sigma_pixel) for each in sets]
+        samples = [
+            samples_of(
+                each,
+                (self.sigma_touch if each.plane else self.sigma_position, self.sigma_orientation),
+                self.sigma_pixel,
+            )
+            for each in sets
+        ]
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
         return System(tuple(samples), prior, apart)

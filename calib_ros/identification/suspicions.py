@@ -68,7 +68,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 
     `another` asks whether it is another robot: not where a mistake is named already.
     """
-    if any(each.socket for each in problem.sets):
+    if any(each.socket or each.plane for each in problem.sets):
         return result  # one place tells nothing of what follows
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)

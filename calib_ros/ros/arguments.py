@@ -43,7 +43,6 @@ BESIDE_SETTINGS = (
     Parameter(
         'tip_link', '', 'of a URDF: where the arm ends; default: tool0, flange or its only end'
     ),
-    Parameter('executor', 'events', 'events or single_threaded: how messages are taken'),
     Parameter('serial', '', 'serial number of the robot, for the record'),
     Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
     Parameter('resume', False, 'go on with the newest journal of this robot'),

@@ -44,6 +44,8 @@ class Sample(Shown):
         Frame of the measurement, as its message named it.
     socket : bool
         A ball at the target sat in a socket, whose place is not known.
+    plane : bool
+        The target touched a plane, the device; the distance is its height over it.
     eye_in_hand : bool
         The pose is that of a fixed target in a camera on the flange.
     validation : bool
@@ -71,6 +73,7 @@ class Sample(Shown):
     target: str = ''
     frame_id: str = ''
     socket: bool = False
+    plane: bool = False
     eye_in_hand: bool = False
     validation: bool = False
     delay: float = 0.0
@@ -111,9 +114,10 @@ class Frames:
             self._sessions.append(sample.session)
         first = sample.session == self._sessions[0]
         suffix = '' if first else f'_{plain(sample.session)}'
-        if sample.socket:  # none of them is the first
+        if sample.socket or sample.plane:  # none of them is the first
             place = (sample.session, False, True, base)
-            return self._own(f'base{suffix}_{plain(base)}', place), f'tool{suffix}'
+            end = self._end('tool', sample.session, (False, tool)) if sample.plane else ''
+            return self._own(f'base{suffix}_{plain(base)}', place), f'tool{suffix}{end}'
         start = self._end('base', sample.session, (eye, base))
         end = self._end('tool', sample.session, (eye, tool))
         return (
@@ -157,15 +161,16 @@ def collect(
     without a covariance of their own. `frames` remembers the names given to earlier samples.
     """
     frames = Frames() if frames is None else frames
-    groups: dict[tuple[str, str, bool, bool, bool, bool], list[Sample]] = {}
+    groups: dict[tuple[str, str, str, bool, bool], list[Sample]] = {}
     for sample in samples:
         base, tool = frames.of(sample)
-        distance = sample.distance is not None
-        key = (base, tool, distance, sample.socket, sample.eye_in_hand, sample.validation)
+        kind = 'socket' if sample.socket else 'plane' if sample.plane else ''
+        kind = kind or ('distance' if sample.distance is not None else 'pose')
+        key = (base, tool, kind, sample.eye_in_hand, sample.validation)
         groups.setdefault(key, []).append(sample)
     fitted: list[Observations] = []
     held_out: list[Observations] = []
-    for (base, tool, _, _, eye_in_hand, validation), members in groups.items():
+    for (base, tool, _, eye_in_hand, validation), members in groups.items():
         observations = replace(_observations(members), base=base, tool=tool)
         if eye_in_hand:
             observations = observations.inverted(sigmas)
@@ -211,4 +216,5 @@ def _observations(samples: Sequence[Sample]) -> Observations:
         optional('acceleration'),
         optional('delay'),
         socket=samples[0].socket,
+        plane=samples[0].plane,
     )
