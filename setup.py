@@ -19,6 +19,8 @@ BAGS = 'rosbags>=0.11.0'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
 XLSX = 'openpyxl>=3.1.2'
 CAMERA = 'opencv-python-headless>=4.7'
+TERMINAL = ['argcomplete>=3.1.4', 'rich>=13.7.1']
+FLEET = ['distributed>=2024.5.0', 'fsspec>=2024.2.0', 'pyarrow>=14.0.1']
 
 setup(
     name=NAME,
@@ -47,6 +49,10 @@ setup(
         'xlsx': [XLSX],
         # For photographs; Ubuntu has it as python3-opencv.
         'camera': [CAMERA],
+        # Colour, bars with the time left, completion of commands by TAB.
+        'terminal': TERMINAL,
+        # Histories and fleets.
+        'fleet': FLEET,
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
@@ -56,6 +62,8 @@ setup(
             *REPORT,
             XLSX,
             CAMERA,
+            *FLEET,
+            *TERMINAL,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
@@ -63,6 +71,7 @@ setup(
             'hypothesis',
             'kinpy',
             'mypy',
+            'pandas',
             'playwright',
             'pytest',
             'pytest-xdist',

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import of_lens
+from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -51,7 +51,7 @@ def independent(
         rest = column - basis @ (basis.T @ column)
         rest -= basis @ (basis.T @ rest)  # once more: Gram-Schmidt loses orthogonality
         size = float(np.linalg.norm(rest))
-        placed = name.partition('.')[2] in FRAME_KINDS
+        placed = Parameter(name).kind in FRAME_KINDS
         least = (frame_tolerance if placed else RANK_TOLERANCE) * float(np.linalg.norm(column))
         if size > least and size > 0.0:
             basis = np.column_stack([basis, rest / size])
@@ -74,6 +74,7 @@ class Kind:
     base: str = 'base'
     tool: str = 'tool'
     socket: bool = False
+    plane: bool = False
 
     @property
     def rows(self) -> int:
@@ -93,9 +94,9 @@ def structurally_independent(
     not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
     by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
-    poses: turning the whole cell about it shows nowhere else than in residuals. A board tells its
-    pose in a camera, and images of it from anywhere tell the camera's lens (Zhang 2000). `extra`
-    returns further equations at a chain.
+    poses: turning the whole cell about it shows nowhere else than in residuals. So does the size
+    of a cell that touches planes alone. A board tells its pose in a camera, and images of it from
+    anywhere tell the camera's lens (Zhang 2000). `extra` returns further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -108,14 +109,16 @@ def structurally_independent(
     velocity = rng.normal(size=joints.shape)
     for number, kind in enumerate(kinds):
         posed = joints
-        if kind.socket:
+        if kind.socket or kind.plane:
             posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
-            shift = {f'{kind.base}.{axis}': -x for axis, x in zip('xyz', place, strict=True)}
+            shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
         jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
         if kind.distance:
             line = anywhere.forward(posed, approach, kind.base, kind.tool)[:, :3, 3]
+            if kind.plane:
+                line[:] = [0.0, 0.0, 1.0]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
@@ -123,7 +126,7 @@ def structurally_independent(
         rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
     if extra is not None:
         rows = np.concatenate([rows, extra(anywhere, names)[0]])
-    lens = [k for k, name in enumerate(names) if of_lens(name)]
+    lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     rows = np.concatenate([rows, np.eye(len(names))[lens]])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
@@ -137,18 +140,21 @@ MEETING_STEPS = 100
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
     """Return joint values (N, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first; the others are led there by damped Gauss-Newton steps.
+    It is that of the first, of planes the height in the middle; the others are led there by damped
+    Gauss-Newton steps.
     """
-    driven = [f'{j.name}.{"theta" if j.type == "revolute" else "d"}' for j in chain.joints]
+    free = [2] if kind.plane else [0, 1, 2]
+    driven = [j.driven for j in chain.joints]
     model = ErrorModel(chain, driven, kind.base, kind.tool)
     signs = np.array([joint.sign for joint in chain.joints], dtype=float)
-    wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]
+    places = chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+    wanted = np.array([0.0, 0.0, np.median(places[:, 2])]) if kind.plane else places[0]
     for _ in range(MEETING_STEPS):
-        left = wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+        left = (wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3])[:, free]
         if np.abs(left).max() < MEETING:
             break
-        jacobian = model.jacobian(joints)[:, :3] * signs
-        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        jacobian = model.jacobian(joints)[:, free] * signs
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(len(free))
         step = np.linalg.solve(square, left[..., np.newaxis])
         joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
     return joints, wanted

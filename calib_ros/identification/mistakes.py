@@ -28,11 +28,13 @@ from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.start import closed_forms
 from calib_ros.identification.validation import MOST_OUTLIERS
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain, Frame, is_length
+from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import shipped_chains
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
@@ -117,7 +119,7 @@ def remarked(problem: Problem, result: Identification) -> Identification:
     if found is None:
         return result
     if result.refusals:
-        return replace(result, refusals=(str(found), *result.refusals))
+        return replace(result, refusals=(Reason(Rule.MISTAKE, str(found)), *result.refusals))
     return replace(result, remarks=(str(found), *result.remarks))
 
 
@@ -138,9 +140,9 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     arm = problem.chain.joint_names
     return any(
         p.std is not None
-        and p.name.partition('.')[0] in arm
+        and p.name.owner in arm
         and abs(p.offset) - 3.0 * p.std
-        > (problem.largest_length if is_length(p.name) else problem.largest_angle)
+        > (problem.largest_length if p.name.is_length else problem.largest_angle)
         for p in result.parameters
     )
 
@@ -243,14 +245,14 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
     frames = dict.fromkeys(name for each in sets for name in (each.base, each.tool))
     sockets = {each.base for each in sets if each.socket}
     names = [
-        f'{frame}.{kind}'
+        name
         for frame in frames
         if not chain.frame(frame).fixed
-        for kind in FRAME_KINDS
-        if not (kind.startswith('r') and frame in sockets)
+        for name in parameters_of(frame)
+        if name.is_length or frame not in sockets
     ]
-    names = list(excited(triangular_factor(chain, names, system), names))
-    fitted = minimise(chain, names, system, tolerance=1e-2, iterations=ITERATIONS).chain
+    known = excited(triangular_factor(chain, names, system), names)
+    fitted = minimise(chain, known, system, tolerance=1e-2, iterations=ITERATIONS).chain
     spread = trial.error / trial.share if trial.share > 0.0 else np.inf
     return min(trial, _trial(fitted, sets, spread), key=lambda one: one.error)
 

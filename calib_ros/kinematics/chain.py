@@ -31,19 +31,22 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.lens import LENS_KINDS, Lens
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import (
+    DELAY,
+    DH_KINDS,
+    FRAME_KINDS,
+    LENS_KINDS,
+    Parameter,
+    parameters_of,
+)
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 Convention: TypeAlias = Literal['standard', 'modified']
 JointType: TypeAlias = Literal['revolute', 'prismatic']
-Recorder: TypeAlias = Callable[[str, bool, FloatArray, FloatArray], None]
+Recorder: TypeAlias = Callable[[Parameter, bool, FloatArray, FloatArray], None]
 
-DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
-ANGLES = ('alpha', 'theta', 'beta')
-FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
-DELAY = 'delay'
-"""Kind of parameter [s] of a base frame: how late the stamps of its device are."""
 PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
 
@@ -64,11 +67,6 @@ _MOTIONS: dict[str, tuple[tuple[str, bool, int], ...]] = {
         ('d', False, 2),
     ),
 }
-
-
-def is_length(name: str) -> bool:
-    """Tell whether a parameter is a length [m]; the others are angles [rad]."""
-    return name.partition('.')[2] in ('a', 'd', 'x', 'y', 'z')
 
 
 @dataclass(frozen=True)
@@ -109,6 +107,16 @@ class Joint:
                 f'limits of joint "{self.name}": lower {self.lower} must be less than upper '
                 f'{self.upper}'
             )
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the joint's Denavit-Hartenberg parameters, in the order of DH_KINDS."""
+        return parameters_of(self.name, DH_KINDS)
+
+    @cached_property
+    def driven(self) -> Parameter:
+        """Return the parameter that the joint's value is added to."""
+        return Parameter(self.name, 'theta' if self.type == 'revolute' else 'd')
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,19 +237,20 @@ class Chain(Shown):
         return tuple(joint.name for joint in self.joints)
 
     @cached_property
-    def parameter_names(self) -> tuple[str, ...]:
+    def parameter_names(self) -> tuple[Parameter, ...]:
         """Return the names of all parameters of the error model, frames first.
 
         The model holds beta instead of d at the joints named in `parallel`.
         """
-        names = [f'{frame}.{kind}' for frame in self.frame_names for kind in FRAME_KINDS]
-        names += [f'{k}.{DELAY}' for k in self.frame_names if self.frame(k).delay is not None]
+        names = [name for frame in self.frame_names for name in parameters_of(frame)]
+        late = [key for key in self.frame_names if self.frame(key).delay is not None]
+        names += [Parameter(frame, DELAY) for frame in late]
         cameras = [key for key in self.frame_names if self.frame(key).lens is not None]
-        names += [f'{camera}.{kind}' for camera in cameras for kind in LENS_KINDS]
+        names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
-            names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
-        return (*names, *(name for name, _ in self.effects))
+            names += [name for name in joint.parameters if name.kind != left_out]
+        return (*names, *(Parameter(name) for name, _ in self.effects))
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -269,7 +278,7 @@ class Chain(Shown):
         owner, kind = self._split(name)
         if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
             return self.value(name) - nominal.value(name)
-        reference = nominal.frame(name.partition('.')[0])
+        reference = nominal.frame(Parameter(name).owner)
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
@@ -278,7 +287,7 @@ class Chain(Shown):
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""
-        return parameter.partition('.')[0] in self.frame_names
+        return Parameter(parameter).owner in self._frames
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with another base or tool frame, which may be a new one."""
@@ -310,8 +319,8 @@ class Chain(Shown):
         by_owner: dict[str, dict[str, float]] = {}
         for name, offset in offsets.items():
             self._split(name)
-            owner, _, kind = name.partition('.')
-            by_owner.setdefault(owner, {})[kind] = float(offset)
+            named = Parameter(name)
+            by_owner.setdefault(named.owner, {})[named.kind] = float(offset)
         joints = []
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
@@ -363,7 +372,7 @@ class Chain(Shown):
         phi = effects.basis(self, [name for name, _ in self.effects], q, approach)
         q = q.copy()
         for (name, value), row in zip(self.effects, phi, strict=True):
-            q[self.joint_names.index(name.partition('.')[0])] += value * row
+            q[self.joint_names.index(Parameter(name).owner)] += value * row
         return q
 
     def trace(
@@ -402,16 +411,17 @@ class Chain(Shown):
         start, end = self.frame(base).matrix, self.frame(tool).matrix
         axes = [start[:3, k : k + 1] for k in range(3)]
         origin = start[:3, 3:]
+        from_base, to_tool = parameters_of(base), parameters_of(tool)
         for k in range(3):
             unit = np.eye(3)[:, k : k + 1]
-            report(f'{base}.{FRAME_KINDS[k]}', False, unit, origin)
-            report(f'{base}.{FRAME_KINDS[k + 3]}', True, unit, origin)
+            report(from_base[k], False, unit, origin)
+            report(from_base[k + 3], True, unit, origin)
         for joint, values in zip(self.joints, q, strict=True):
-            driven = 'theta' if joint.type == 'revolute' else 'd'
+            own = dict(zip(DH_KINDS, joint.parameters, strict=True))
             for kind, rotates, k in _MOTIONS[self.convention]:
-                report(f'{joint.name}.{kind}', rotates, axes[k], origin)
+                report(own[kind], rotates, axes[k], origin)
                 value = getattr(joint, kind)
-                if kind == driven:
+                if own[kind] == joint.driven:
                     value = value + joint.sign * values
                 elif value == 0.0:
                     continue
@@ -428,11 +438,11 @@ class Chain(Shown):
                 links.append((list(axes), origin))
         flange = list(axes)
         for i in range(3):
-            report(f'{tool}.{FRAME_KINDS[i]}', False, flange[i], origin)
+            report(to_tool[i], False, flange[i], origin)
             axes[i] = sum(end[k, i] * flange[k] for k in range(3))
         origin = origin + sum(end[k, 3] * flange[k] for k in range(3))
         for i in range(3):
-            report(f'{tool}.{FRAME_KINDS[i + 3]}', True, flange[i], origin)
+            report(to_tool[i + 3], True, flange[i], origin)
         return axes, origin
 
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
@@ -451,7 +461,8 @@ class Chain(Shown):
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
-        owner, _, kind = name.partition('.')
+        named = Parameter(name)
+        owner, kind = named.owner, named.kind
         if owner in self._frames and kind in (*FRAME_KINDS, DELAY, *LENS_KINDS):
             return self.frame(owner), kind
         joint = self._joints.get(owner)

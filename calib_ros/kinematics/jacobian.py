@@ -31,8 +31,15 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.chain import ANGLES, DELAY, DH_KINDS, FRAME_KINDS, Chain
-from calib_ros.kinematics.lens import LENS_KINDS
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import (
+    ANGLES,
+    DELAY,
+    DH_KINDS,
+    LENS_KINDS,
+    Parameter,
+    parameters_of,
+)
 from calib_ros.kinematics.se3 import FloatArray
 
 
@@ -57,9 +64,11 @@ class ErrorModel:
         self.chain = chain
         self.names = tuple(names)
         self._ends = (base, tool)
-        joints = tuple((joint.name, joint.type) for joint in chain.joints)
+        driven = tuple(joint.driven for joint in chain.joints)
         fitted = tuple(name for name, _ in chain.effects if name in self.names)
-        self._layout = _layout(self.names, joints, chain.frame_names, fitted, self._ends)
+        self._layout = _layout(
+            self.names, chain.joint_names, driven, chain.frame_names, fitted, self._ends
+        )
         self._signs = {joint.name: joint.sign for joint in chain.joints}
         self.rotations = self._layout.rotations
         """Number of rotational parameters; they come first in the arrays of `linearise`."""
@@ -111,7 +120,8 @@ class ErrorModel:
             phi = dict(zip(fitted, rows, strict=True))
 
         late = None
-        if velocity is not None and f'{self._ends[0]}.{DELAY}' in row:
+        delay = Parameter(self._ends[0], DELAY)
+        if velocity is not None and delay in row:
             late = _Twist(self.chain, velocity)
 
         def put(k: int, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
@@ -121,12 +131,12 @@ class ErrorModel:
             else:
                 shift[k] = axis
 
-        def record(name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
+        def record(name: Parameter, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
             k = row.get(name)
             if k is not None:
                 put(k, rotates, axis, point)
             for effect in self._layout.driven.get(name, ()):
-                sign = self._signs[effect.partition('.')[0]]
+                sign = self._signs[Parameter(effect).owner]
                 put(row[effect], rotates, axis * (sign * phi[effect]), point)
             if late is not None:
                 late.add(name, rotates, axis, point)
@@ -136,7 +146,7 @@ class ErrorModel:
         np.subtract(origin, arm, out=arm)
         cross(turn[:-1], arm, shift[:rotations])
         if late is not None:
-            k = row[f'{self._ends[0]}.{DELAY}']
+            k = row[delay]
             turn[k], shift[k] = late.of(origin)
         return axes, origin, shift, turn
 
@@ -181,24 +191,25 @@ class _Layout(NamedTuple):
 @lru_cache(maxsize=64)
 def _layout(
     names: tuple[str, ...],
-    joints: tuple[tuple[str, str], ...],
+    joints: tuple[str, ...],
+    driven: tuple[Parameter, ...],
     frames: tuple[str, ...],
     fitted: tuple[str, ...],
     ends: tuple[str, str],
 ) -> _Layout:
-    """Return the layout of named parameters of joints (name, type), frames and fitted effects."""
+    """Return the layout of named parameters; each joint drives one of its own."""
     rotates: dict[str, bool] = {}
     for frame in frames:
-        rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
-        rotates[f'{frame}.{DELAY}'] = True
-        rotates |= {f'{frame}.{kind}': False for kind in LENS_KINDS}
-    for joint, _ in joints:
-        rotates |= {f'{joint}.{kind}': kind in ANGLES for kind in DH_KINDS}
-    driven: dict[str, list[str]] = {}
+        rotates |= {name: name.kind.startswith('r') for name in parameters_of(frame)}
+        rotates[Parameter(frame, DELAY)] = True
+        rotates |= dict.fromkeys(parameters_of(frame, LENS_KINDS), False)
+    for joint in joints:
+        rotates |= {name: name.kind in ANGLES for name in parameters_of(joint, DH_KINDS)}
+    moves: dict[str, list[str]] = {}
     for name in fitted:
-        joint = name.partition('.')[0]
-        rotates[name] = dict(joints)[joint] == 'revolute'
-        driven.setdefault(f'{joint}.{"theta" if rotates[name] else "d"}', []).append(name)
+        drives = driven[joints.index(Parameter(name).owner)]
+        rotates[name] = rotates[drives]
+        moves.setdefault(drives, []).append(name)
     for name in names:
         if name not in rotates:
             raise UnknownNameError('parameter', name, rotates)
@@ -209,19 +220,19 @@ def _layout(
     still = [
         k
         for name, k in row.items()
-        if name.partition('.')[2] in (DELAY, *LENS_KINDS) or name.partition('.')[0] in elsewhere
+        if Parameter(name).kind in (DELAY, *LENS_KINDS) or Parameter(name).owner in elsewhere
     ]
     order = np.array([row[name] for name in names], dtype=np.intp)
     order.setflags(write=False)
-    return _Layout(row, len(turning), order, fitted, driven, tuple(still))
+    return _Layout(row, len(turning), order, fitted, moves, tuple(still))
 
 
 class _Twist:
     """The target's velocity, with the sign reversed: what a delay of one second would change."""
 
     def __init__(self, chain: Chain, velocity: FloatArray) -> None:
-        self._rates = {
-            f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}': -joint.sign * values
+        self._rates: dict[str, FloatArray] = {
+            joint.driven: -joint.sign * values
             for joint, values in zip(chain.joints, velocity, strict=True)
         }
         self._turn, self._shift = np.zeros((2, 3, velocity.shape[1]))

@@ -106,9 +106,7 @@ def draw_placements(
 
 def workspace_png(survey: Survey) -> bytes:
     """Return the figure of a survey: what the calibration removes and, if known, what remains."""
-    rows = [('removed by the calibration', survey.removed)]
-    if not np.isnan(survey.sigma).any():
-        rows.append(('sigma of what remains', survey.sigma))
+    rows = list(survey.parts.items())[:2]
     x, y, z = survey.positions.T
     low, high = np.quantile(z, [0.4, 0.6])
     level = (low <= z) & (z <= high)

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from calib_ros.apply import planning, simulation
+from calib_ros.apply import choice, planning, simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates, visit_order
+from calib_ros.apply.choice import choose
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
     Candidates,
@@ -22,7 +23,6 @@ from calib_ros.apply.design import (
     predicted,
 )
 from calib_ros.apply.design import _root_of_inverse as root_of_inverse
-from calib_ros.apply.planning import choose
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.tables import read_table
@@ -237,7 +237,7 @@ def test_worth_by_updates_equals_that_computed_anew(oriented):
     chosen = list(range(12))
     so_far = space.known + information_of(space.rows[chosen])
     by_det, by_task = (
-        planning._score(space, criterion, task)(so_far, space.rows) for criterion in ('d', 'task')
+        choice._score(space, criterion, task)(so_far, space.rows) for criterion in ('d', 'task')
     )
     for k in (3, 20, 29):  # one of them a second time
         more = np.concatenate([q[chosen], q[k : k + 1]])
@@ -253,7 +253,7 @@ def test_indices_are_those_of_the_report(criterion):
     q = some(design.chain, 30)
     space = Candidates(design, q)
     so_far = space.known + information_of(space.rows[:12])
-    worth = planning._score(space, criterion, None)(so_far, space.rows)
+    worth = choice._score(space, criterion, None)(so_far, space.rows)
     rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
     factor = np.linalg.qr(rows, mode='r')
     assert worth[20] == pytest.approx(getattr(observability(factor, 13), criterion), rel=1e-5)
@@ -286,13 +286,13 @@ def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     chosen = choose(design, q, 4)
     share = np.exp((log_det(design, q[chosen]) - best) / size)
     assert 0.95 < share < 1.0 + 1e-6
-    assert planning.efficiency(design, q, chosen, None) <= share + 1e-6
+    assert choice.efficiency(design, q, chosen, None) <= share + 1e-6
 
     best = min(predicted_square(design, q[each], task) for each in choices)
     chosen = choose(design, q, 4, 'task', task)
     share = best / predicted_square(design, q[chosen], task)
     assert 0.8 < share < 1.0 + 1e-6
-    assert planning.efficiency(design, q, chosen, task) <= share + 1e-6
+    assert choice.efficiency(design, q, chosen, task) <= share + 1e-6
 
 
 def test_each_criterion_is_best_by_its_own_measure():
@@ -404,7 +404,7 @@ def test_over_the_whole_range_no_25_poses_are_worth_50_random_ones():
     design = design_of(arm())
     q, unseen = some(design.chain, 1000), some(design.chain, 300, 2)
     chosen = choose(design, q, 25, 'task', unseen)
-    share = planning.efficiency(design, q, chosen, unseen)
+    share = choice.efficiency(design, q, chosen, unseen)
     least = accuracy(design, q[chosen], unseen)[-1] * np.sqrt(share)
     random = [accuracy(design, some(design.chain, 50, k), unseen)[-1] for k in range(50)]
     assert np.mean(random) < least

@@ -9,18 +9,18 @@ from scipy import stats
 from calib_ros.apply import simulation
 from calib_ros.apply.candidates import Visibility
 from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.confidence import rms_limits
 from calib_ros.apply.design import Design
 from calib_ros.apply.iso9283 import iso_9283_poses
-from calib_ros.apply.verification import in_words, rms_limits, verify
-from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.apply.verification import in_words, verify
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.waypoints import csv_of, joint_columns, joints_csv, read_joints
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert, to_quat
-from calib_ros.report.words import as_document, calibration_yaml
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -37,7 +37,7 @@ def cell():
 
 @pytest.fixture(scope='module')
 def arm(cell):
-    return CalibratedArm.of(cell[1])
+    return Calibration.of(cell[1])
 
 
 def design_of(chain, oriented=True):
@@ -53,7 +53,7 @@ def measured(true, joints, repeats=3, noise=NOISE, seed=1):
 
 def with_errors(arm, errors):
     """Return observations whose position errors by the calibrated arm are (N, 3) [m]."""
-    seen = measured(arm.after, UR.random_joints(len(errors), np.random.default_rng(2)), 1, (0, 0))
+    seen = measured(arm.chain, UR.random_joints(len(errors), np.random.default_rng(2)), 1, (0, 0))
     return replace(seen, positions=seen.positions + errors)
 
 
@@ -230,7 +230,7 @@ def test_the_better_calibration_wins_on_a_session_of_its_own(cell, arm):
     seen = [measured(moved, UR.random_joints(40, np.random.default_rng(3)))]
     half = result.chain.with_offsets({'elbow_joint.theta': 5e-4, 'wrist_1_joint.a': 5e-4})
     shifted = half.with_frame('tool', replace(half.frame('tool'), matrix=tool))
-    worse = CalibratedArm(arm.before, shifted)
+    worse = Calibration(shifted, arm.before)
     wrong = [verify(each, seen, None, new_base=True).rms for each in (arm, worse)]
     right = [verify(each, seen, None, new_base=True, new_tool=True).rms for each in (arm, worse)]
     assert wrong[0] > wrong[1]
@@ -289,12 +289,9 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
 
 @pytest.fixture
 def folder(cell, tmp_path, monkeypatch):
-    import json
-
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'result').mkdir()
-    (tmp_path / 'result' / 'calibration.yaml').write_text(calibration_yaml(cell[1]))
-    (tmp_path / 'result' / 'result.json').write_text(json.dumps(as_document(cell[1], {})))
+    (tmp_path / 'result' / 'calibration.yaml').write_text(Calibration.of(cell[1]).dump())
     return tmp_path
 
 
