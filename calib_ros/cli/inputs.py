@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from calib_ros.files.tables import Table
     from calib_ros.identification.problem import Problem
     from calib_ros.identification.reasons import Reason
+    from calib_ros.identification.records import Owner
     from calib_ros.kinematics.chain import Chain
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.settings import Settings
@@ -33,7 +35,7 @@ class Loaded:
 
     `samples` are the counts of it, `read` says them in words; `lines` tells that stamps are the
     lines of a table, `refusals` why a result must not be accepted whatever it is, `instead` that
-    these stand instead of its own.
+    these stand instead of its own; `owners` whose frame each is, of a bag.
     """
 
     problem: Problem
@@ -43,6 +45,7 @@ class Loaded:
     lines: bool = False
     refusals: tuple[Reason, ...] = ()
     instead: bool = False
+    owners: Mapping[str, Owner] = field(default_factory=dict)
 
 
 def replayed(
@@ -61,12 +64,15 @@ def of_bag(
     path: Path, chain: Chain, settings: Settings, screen: Screen, largest_loss: float = 1.0
 ) -> Loaded:
     """Return what is to be fitted of a bag, of which no more than a share may be lost."""
+    from calib_ros.sampling.sample import named
+
     session, read = replayed(path, chain, settings, screen)
     problem = session.problem()
     account = session.account()
     samples = {'recorded': read.recorded, 'read': read.read, **account.as_document()}
     refusals = read.refusals(account, largest_loss)
-    return Loaded(problem, samples, read.warnings, f'{read}; {account}', refusals=refusals)
+    words, owners = f'{read}; {account}', named(session.usable).owners
+    return Loaded(problem, samples, read.warnings, words, refusals=refusals, owners=owners)
 
 
 def table(

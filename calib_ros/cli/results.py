@@ -153,7 +153,7 @@ def result_files(
         contents |= page_of(report, screen, pdf=pdf)
     earlier = out / 'calibration.yaml'
     if result.accepted:
-        contents['calibration.yaml'] = Calibration.of(result).dump()
+        contents['calibration.yaml'] = Calibration.of(result, owners=loaded.owners).dump()
     elif earlier.exists():
         contents['calibration.previous.yaml'] = earlier.read_bytes()
     return contents

@@ -131,6 +131,7 @@ def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None)
 def identified(result: Identification, about: Filing, kind: str = 'identify') -> Row:
     """Return the row of an identification."""
     offsets = {str(each.name): each.offset for each in result.parameters}
+    names = tuple(map(str, result.names))
     which = result.validation or result.fitted
     shown = which.judged & ~np.isnan(which.after.position).any(axis=1)
     errors = which.after
@@ -139,12 +140,12 @@ def identified(result: Identification, about: Filing, kind: str = 'identify') ->
     return Row(
         **_common(about, kind, result.chain),
         verdict='accepted' if result.accepted else 'refused',
-        reasons=result.refusals,
-        remarks=result.remarks,
+        reasons=tuple(map(str, result.refusals)),
+        remarks=tuple(map(str, result.remarks)),
         **_figures(*which.figures, limits),
         freedom=freedom if np.isfinite(freedom) else None,
-        names=result.names,
-        offsets=np.array([offsets[name] for name in result.names]),
+        names=names,
+        offsets=np.array([offsets[name] for name in names]),
         covariance=result.covariance,
     )
 

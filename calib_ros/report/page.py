@@ -111,17 +111,30 @@ class Report:
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
 
 
-def render(report: Report) -> str | None:
-    """Return a report as HTML; None where jinja2 or plotly is not installed."""
+def plotly_script() -> str | None:
+    """Return plotly's JavaScript; None where plotly is not installed."""
     try:
         from plotly.offline import get_plotlyjs
 
-        plotly = get_plotlyjs()
+        return str(get_plotlyjs())
     except (ImportError, FileNotFoundError):
         return None
-    return _filled(
-        report,
-        js=_template('report.js'),
+
+
+def render(report: Report, script: str = '') -> str | None:
+    """Return a report as HTML; None where jinja2 or plotly is not installed.
+
+    With the path of plotly's `script`, which many pages share, the page needs that file besides.
+    """
+    plotly = '' if script else plotly_script()
+    if plotly is None:
+        return None
+    return filled(
+        'report.html.jinja',
+        report=report,
+        marks=MARKS,
+        drawings=None,
+        script=script,
         plotly=plotly,
         data={
             'figures': {each.name: each.figure for each in report.sections if each.figure},
@@ -144,15 +157,20 @@ def on_paper(report: Report) -> bytes | None:
     heights = {each.name: each.height for each in report.sections} | {'cumulated': 260}
     drawn = ((each.name, drawing(each.figure, heights[each.name])) for each in report.sections)
     logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
-    page = _filled(report, drawings={name: each for name, each in drawn if each})
+    page = filled(
+        'report.html.jinja',
+        report=report,
+        marks=MARKS,
+        drawings={name: each for name, each in drawn if each},
+    )
     if page is None:
         return None
     found: bytes = weasyprint.HTML(string=page).write_pdf()
     return found
 
 
-def _filled(report: Report, **parts: Any) -> str | None:
-    """Return the template filled with a report, on paper where there are `drawings`."""
+def filled(template: str, **values: Any) -> str | None:
+    """Return a page with the style and the scripts of all; None where jinja2 is not installed."""
     try:
         import jinja2
     except ImportError:
@@ -164,11 +182,8 @@ def _filled(report: Report, **parts: Any) -> str | None:
         finalize=_shown,
         trim_blocks=True,
     )
-    page: str = environment.get_template('report.html.jinja').render(
-        report=report,
-        marks=MARKS,
-        css=_template('report.css'),
-        **{'drawings': None, **parts},
+    page: str = environment.get_template(template).render(
+        css=_template('report.css'), js=_template('report.js'), **values
     )
     return page
 

@@ -14,7 +14,7 @@ from calib_ros.cli.main import main
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.waypoints import csv_of, read_joints, read_poses
-from calib_ros.identification.calibration import Calibration, load_calibration
+from calib_ros.identification.calibration import MODELS, Calibration, load_calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
@@ -245,7 +245,7 @@ def test_the_joint_values_bring_the_arm_to_the_placed_task(cell, task):
     _, result = cell
     task = task[::4]
     arm = Calibration.of(result)
-    for model in workspace.MODELS:
+    for model in MODELS:
         found = place(arm, task, 'mean', model, cells=5, turns=3)
         chain = arm.commanded_by(model)
         reached = ~np.isnan(found.errors)
