@@ -46,6 +46,7 @@ class Given:
     chain: str
     links: dict[str, str | None]
     serial: str
+    history: str
     data_dir: Path | None
     allowed_folders: tuple[Path, ...]
     resume: bool
@@ -79,6 +80,7 @@ def declare_all(node: Node) -> Given:
         chain=own['chain'],
         links={name: own[name] or None for name in ('base_link', 'tip_link')},
         serial=own['serial'],
+        history=own['history'],
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
         resume=own['resume'],
