@@ -112,6 +112,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove
         )
+        self.session.socket_distance = given.socket_distance
         self._filer = Filer(given.history, given.serial, chain)
         self._last = 'nothing identified yet'
         self._progress = Progress('identifying')
@@ -355,9 +356,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return self._progress.cancel()
 
     def _on_capture(self, request: Any) -> tuple[bool, str]:
-        count, why = self.session.capture()
+        socket = self.get_parameter('socket').value
+        count, why = self.session.capture(socket)
         if not count:
             return False, f'no sample taken: {why}'
+        if socket:
+            return True, f'sample {len(self.session.samples)} taken: ball in socket {socket}'
         taken = self.session.samples[-count:]
         words = ', '.join(
             f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken

@@ -60,6 +60,7 @@ class Given:
     autoload: bool
     candidates: Path | None
     frames: FrameNames
+    socket_distance: float
     settings: Settings
 
 
@@ -94,6 +95,7 @@ def declare_all(node: Node) -> Given:
         autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
+        socket_distance=own['socket_distance'],
         settings=settings,
     )
 
