@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import linalg, special
@@ -104,6 +105,21 @@ def reason_in_words(reasons: Sequence[Explanation]) -> str:
         named = ' or '.join(each.in_words() for each in others)
         text += f', which cannot be told apart from {named}'
     return text
+
+
+def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
+    """Return explanations as plain values."""
+    return [
+        {
+            'owner': each.owner,
+            'parameters': [str(name) for name in each.names],
+            'change': each.change.tolist(),
+            'sigma': each.sigma.tolist(),
+            'chance': each.chance,
+            'share': each.share,
+        }
+        for each in reasons
+    ]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

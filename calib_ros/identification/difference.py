@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import linalg, special
@@ -34,6 +35,7 @@ from calib_ros.identification.changes import (
     Told,
     gauged,
     reason_in_words,
+    reasons_document,
     reasons_of,
 )
 from calib_ros.identification.evidence import TYPICAL, group_of
@@ -49,6 +51,8 @@ from calib_ros.shown import Shown
 
 POSES = 200
 """Random poses at which two arms are held against each other."""
+ROWS = 6
+"""Parameters that are shown."""
 DRAWS = 2000
 """Draws of a difference for the limit of predictions."""
 
@@ -111,6 +115,33 @@ class Difference(Shown):
             reasons = '; '.join(reason_in_words(each) for each in self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
         return f'many parameters are different, by {size}: identify anew, and look at the robot'
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values; lengths of predictions in mm."""
+        changes = zip(self.names, self.change.tolist(), self.sigma.tolist(), strict=True)
+        return {
+            'same': self.same,
+            'words': self.in_words(),
+            'rms_mm': 1e3 * self.rms,
+            'limit_mm': 1e3 * self.limit,
+            'left_mm': 1e3 * self.left,
+            'chance': self.chance,
+            'chance_beyond_models': self.beyond,
+            'changed': [reasons_document(each) for each in self.changed],
+            'unexplained': self.unexplained,
+            'parameters': {str(n): {'change': x, 'sigma': s} for n, x, s in changes},
+        }
+
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """Return the parameters that differ by the most sigmas, in words."""
+        order = np.argsort(-np.abs(self.change) / self.sigma)[:ROWS]
+        return tuple(
+            (
+                self.names[k],
+                f'{1e3 * self.change[k]:+.3f} ± {1e3 * self.sigma[k]:.3f} m{self.names[k].unit}',
+            )
+            for k in order
+        )
 
 
 def difference(first: Calibration, second: Calibration) -> Difference:

@@ -13,8 +13,9 @@ two reasons cannot be told apart, both are free.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -30,6 +31,7 @@ from calib_ros.identification.changes import (
     Explanation,
     Told,
     reason_in_words,
+    reasons_document,
     reasons_of,
 )
 from calib_ros.identification.leastsquares import System, minimise, normal_equations
@@ -90,6 +92,16 @@ class Recalibration(Shown):
         return self.unexplained > FALSE and self.after.rms_mm <= max(
             self.before.rms_mm, WORSE * 1e3 * (self.calibration.residual or 0.0)
         )
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            'accepted': self.accepted,
+            'changed': [reasons_document(each) for each in self.changed],
+            'unexplained': self.unexplained,
+            'before': asdict(self.before),
+            'after': asdict(self.after),
+        }
 
     def in_words(self) -> str:
         """Return what has changed."""
