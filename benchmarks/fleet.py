@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plant of simulated robots, night by night: what is found, what it costs, what survives.
 
-    python benchmarks/fleet.py [--quick] [--json] [--part nights|workers|scheduler|kills]
+    python benchmarks/fleet.py [--quick] [--json] [--part PART] [--robots N]
 
 nights: 200 robots x 30 nights x 60 poses (0.05 mm, 0.2 mrad). Five robots are bumped in some night
 but the first three: one parameter of the arm moves by 0.1 mm or 0.2 mrad. Found: the joint named
@@ -191,12 +191,14 @@ def main():
     parser.add_argument('--quick', action='store_true', help='a few robots')
     parser.add_argument('--json', action='store_true')
     parser.add_argument('--part', choices=('nights', 'workers', 'scheduler', 'kills'))
+    parser.add_argument('--robots', type=int, help='for the nights')
     parser.add_argument('--workers', type=int, default=0, help='for the nights')
     options = parser.parse_args()
     quick = options.quick
+    robots, nights, bumped = (10, 8, 2) if quick else (200, 30, 5)
     parts = {
         'nights': lambda folder: nights_part(
-            folder, *((10, 8, 2) if quick else (200, 30, 5)), options.workers
+            folder, options.robots or robots, nights, bumped, options.workers
         ),
         'workers': lambda folder: workers_part(folder, 6 if quick else 20, 3000),
         'scheduler': lambda folder: scheduler_part(folder, 500 if quick else 3000),
