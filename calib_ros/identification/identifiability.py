@@ -113,9 +113,10 @@ def structurally_independent(
             shift = {f'{kind.base}.{axis}': -x for axis, x in zip('xyz', place, strict=True)}
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
-        jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
+        came, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
+        jacobian = model.jacobian(posed, came, rates)
         if kind.distance:
-            line = anywhere.forward(posed, approach, kind.base, kind.tool)[:, :3, 3]
+            line = anywhere.forward(posed, came, kind.base, kind.tool)[:, :3, 3]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
@@ -135,9 +136,10 @@ MEETING_STEPS = 100
 
 
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
-    """Return joint values (N, n) that bring the target to one place, and that place (3,) [m].
+    """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first; the others are led there by damped Gauss-Newton steps.
+    It is that of the first; the others are led there by damped Gauss-Newton steps. Those few
+    that do not arrive, stretched, are left out.
     """
     driven = [f'{j.name}.{"theta" if j.type == "revolute" else "d"}' for j in chain.joints]
     model = ErrorModel(chain, driven, kind.base, kind.tool)
@@ -145,13 +147,14 @@ def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, 
     wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]
     for _ in range(MEETING_STEPS):
         left = wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
-        if np.abs(left).max() < MEETING:
+        met = np.abs(left).max(axis=1) < MEETING
+        if met.all():
             break
         jacobian = model.jacobian(joints)[:, :3] * signs
         square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
         step = np.linalg.solve(square, left[..., np.newaxis])
         joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
-    return joints, wanted
+    return joints[met], wanted
 
 
 def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:
@@ -210,6 +213,8 @@ class Uncertainty(Shown):
 
 TRADE = 1e-4
 """Least share of a parameter in a trade to be named."""
+ROUNDING = 1e-12
+"""Length of a column beside the longest one from which on it is more than rounding."""
 
 
 def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
@@ -217,19 +222,20 @@ def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dic
 
     Moving the one, and the others by the right amounts, leaves every measured pose as it is.
     """
-    columns = dict(zip(names, factor.T, strict=True))
-    scales = {name: float(np.linalg.norm(column)) for name, column in columns.items()}
-    basis = np.array([columns[name] / (scales[name] or 1.0) for name in kept]).T
-    partners: dict[str, list[str]] = {}
-    for name in names:
-        if name in kept:
-            continue
-        if scales[name] == 0.0:
-            partners[name] = []
-            continue
-        shares = np.linalg.lstsq(basis, columns[name] / scales[name], rcond=None)[0]
-        strong = np.abs(shares) > TRADE * np.abs(shares).max()
-        partners[name] = [other for other, yes in zip(kept, strong, strict=True) if yes]
+    sizes = np.linalg.norm(factor, axis=0)
+    known = sizes > ROUNDING * sizes.max(initial=0.0)
+    scaled = factor[:, known] / sizes[known]
+    number = {
+        name: k for k, name in enumerate(n for n, yes in zip(names, known, strict=True) if yes)
+    }
+    fitted = [name for name in kept if name in number]
+    left_out = [name for name in number if name not in set(kept)]
+    basis, columns = (scaled[:, [number[n] for n in part]] for part in (fitted, left_out))
+    shares = np.abs(np.linalg.lstsq(basis, columns, rcond=None)[0])
+    strong = (shares > TRADE * shares.max(axis=0, initial=0.0)).T
+    partners: dict[str, list[str]] = {name: [] for name in names if name not in set(kept)}
+    for name, marks in zip(left_out, strong, strict=True):
+        partners[name] = [other for other, yes in zip(fitted, marks, strict=True) if yes]
     return partners
 
 

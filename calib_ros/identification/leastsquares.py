@@ -261,8 +261,6 @@ def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray
     q = np.ascontiguousarray(then.joints[first].T)
     came = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
     axes, origin = chain.trace(chain.effective(q, came), base=then.base, tool=then.tool)
-    origin = np.broadcast_to(origin, (3, len(first)))
-    axes = [np.broadcast_to(axis, (3, len(first))) for axis in axes]
     pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
     for start in range(0, len(then), BLOCK):
         part = slice(start, start + BLOCK)

@@ -9,7 +9,7 @@ i - 1 (their eq. 3 and 4). Moved to the world, the link errors add up to the pos
 
 (eq. 6 as printed adds the Delta_i without moving them; `docs/model.md` lists the errata). Every
 Denavit-Hartenberg parameter is one elementary motion along or about one axis u through a point c,
-both met by `Chain.trace`. So the twist needs no table, for either convention:
+both met by a walk along the chain. So the twist needs no table, for either convention:
 
     translation (a, d)              dp = u              domega = 0
     rotation (alpha, theta, beta)   dp = u x (p - c)    domega = u
@@ -22,7 +22,7 @@ Arrays are laid out (parameter, component, sample): each operation runs over man
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -59,8 +59,8 @@ class ErrorModel:
         self._ends = (base, tool)
         joints = tuple((joint.name, joint.type) for joint in chain.joints)
         fitted = tuple(name for name, _ in chain.effects if name in self.names)
-        self._layout = _layout(self.names, joints, chain.frame_names, fitted, self._ends)
-        self._signs = {joint.name: joint.sign for joint in chain.joints}
+        standard = chain.convention == 'standard'
+        self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
         self.rotations = self._layout.rotations
         """Number of rotational parameters; they come first in the arrays of `linearise`."""
         self.order = self._layout.order
@@ -71,7 +71,7 @@ class ErrorModel:
         q: FloatArray,
         approach: FloatArray | None = None,
         velocity: FloatArray | None = None,
-    ) -> tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return pose and derivatives for one block of samples.
 
         Parameters
@@ -85,8 +85,8 @@ class ErrorModel:
 
         Returns
         -------
-        axes : list of three (3, B)
-            The target's x, y and z axis.
+        axes : (3, 3, B)
+            The target's x, y and z axis; the first index counts them.
         origin : (3, B)
             Its position [m].
         shift : (P + 1, 3, B)
@@ -96,49 +96,42 @@ class ErrorModel:
             Derivative of the orientation as a rotation vector in the world. Likewise.
 
         """
-        samples, rotations, row = q.shape[1], self.rotations, self._layout.row
-        shift = np.empty((len(row) + 1, 3, samples))
-        turn = np.empty((rotations + 1, 3, samples))
-        arm = np.empty((rotations, 3, samples))
-        for k in self._layout.still:
-            (turn if k < rotations else shift)[k] = 0.0
-            if k < rotations:
-                arm[k] = 0.0
-        fitted = self._layout.effects
-        phi: dict[str, FloatArray] = {}
-        if fitted:
-            rows = effects.basis(self.chain, fitted, q, approach)
-            phi = dict(zip(fitted, rows, strict=True))
-
-        late = None
-        if velocity is not None and f'{self._ends[0]}.{DELAY}' in row:
-            late = _Twist(self.chain, velocity)
-
-        def put(k: int, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-            if rotates:
-                turn[k] = axis
-                arm[k] = point
-            else:
-                shift[k] = axis
-
-        def record(name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-            k = row.get(name)
-            if k is not None:
-                put(k, rotates, axis, point)
-            for effect in self._layout.driven.get(name, ()):
-                sign = self._signs[effect.partition('.')[0]]
-                put(row[effect], rotates, axis * (sign * phi[effect]), point)
-            if late is not None:
-                late.add(name, rotates, axis, point)
-
-        effective = self.chain.effective(q, approach)
-        axes, origin = self.chain.trace(effective, record, *self._ends)
-        np.subtract(origin, arm, out=arm)
-        cross(turn[:-1], arm, shift[:rotations])
-        if late is not None:
-            k = row[f'{self._ends[0]}.{DELAY}']
-            turn[k], shift[k] = late.of(origin)
-        return axes, origin, shift, turn
+        layout, walk, base = self._layout, self.chain.walk, self.chain.frame(self._ends[0]).matrix
+        count, samples = q.shape
+        phi = None
+        if layout.effects:
+            phi = effects.basis(self.chain, layout.effects, q, approach)
+        # frames before the joints, of the flange, of the flange's axes at the target, and of the
+        # world's axes at the base: axes, origins, and what turns about the axes do to the target
+        lines = np.empty((count + 3, 7, 3, samples))
+        walk.frames(self.chain.effective(q, approach), base, lines[: count + 1, :4])
+        target = self.chain.at_the_tool(lines[count, :4], self._ends[1])
+        lines[count + 1, :3], lines[count + 1, 3] = lines[count, :3], target[3]
+        lines[count + 2, :4] = np.eye(4, 3)[..., np.newaxis]
+        lines[count + 2, 3] += base[:3, 3, np.newaxis]
+        if walk.beta.any():  # a and alpha come before beta
+            behind = lines[layout.behind]
+            behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
+            behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
+        arm = target[3] - lines[:, 3]
+        cross(lines[:, :3], arm[:, np.newaxis], lines[:, 4:])
+        flat = lines.reshape(-1, 3, samples)
+        shift = np.empty((len(layout.row) + 1, 3, samples))
+        turn = np.empty((self.rotations + 1, 3, samples))
+        np.take(flat, layout.shifts, axis=0, out=shift[:-1], mode='clip')
+        np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')
+        if phi is not None:
+            phi *= walk.signs[layout.joints]
+            shift[layout.driven] *= phi[:, np.newaxis]
+            turning = layout.driven < self.rotations
+            turn[layout.driven[turning]] *= phi[turning, np.newaxis]
+        if velocity is not None and layout.delay is not None:
+            rates = -walk.signs * velocity
+            turning = walk.turning
+            turn[layout.delay] = np.einsum('jb,jcb->cb', rates[turning], lines[:-3, 2][turning])
+            moved = np.where(turning[:, np.newaxis, np.newaxis], lines[:-3, 6], lines[:-3, 2])
+            shift[layout.delay] = np.einsum('jb,jcb->cb', rates, moved)
+        return target[:3], target[3], shift, turn
 
     def jacobian(
         self,
@@ -166,84 +159,84 @@ class _Layout(NamedTuple):
     """Where the columns of parameters stand.
 
     `row` of each parameter, rotations first, of which there are so many; `order` of the rows in
-    the order of the names; the `effects` among them, and which of them every joint's parameter
-    drives; `still` the rows of what does not move a target between these frames.
+    the order of the names; `shifts` and `turns` the rows that they take of the lines of a walk;
+    `behind` the frames behind the constant part of each link; `effects` among the parameters,
+    with the rows `driven` and the `joints` that they drive; `delay` the row of a delay.
     """
 
     row: Mapping[str, int]
     rotations: int
     order: NDArray[np.intp]
+    shifts: NDArray[np.intp]
+    turns: NDArray[np.intp]
+    behind: slice
     effects: tuple[str, ...]
-    driven: Mapping[str, Sequence[str]]
-    still: tuple[int, ...]
+    driven: NDArray[np.intp]
+    joints: NDArray[np.intp]
+    delay: int | None
 
 
 @lru_cache(maxsize=64)
 def _layout(
     names: tuple[str, ...],
     joints: tuple[tuple[str, str], ...],
+    standard: bool,
     frames: tuple[str, ...],
     fitted: tuple[str, ...],
     ends: tuple[str, str],
 ) -> _Layout:
     """Return the layout of named parameters of joints (name, type), frames and fitted effects."""
-    rotates: dict[str, bool] = {}
+    count = len(joints)
+    nowhere = (count + 1, 4, True)  # turned about itself the target stays where it is
+    lines = {}  # of each parameter: frame, row of it, and whether it turns
     for frame in frames:
-        rotates |= {f'{frame}.{kind}': kind.startswith('r') for kind in FRAME_KINDS}
-        rotates[f'{frame}.{DELAY}'] = True
-        rotates |= {f'{frame}.{kind}': False for kind in LENS_KINDS}
-    for joint, _ in joints:
-        rotates |= {f'{joint}.{kind}': kind in ANGLES for kind in DH_KINDS}
-    driven: dict[str, list[str]] = {}
-    for name in fitted:
-        joint = name.partition('.')[0]
-        rotates[name] = dict(joints)[joint] == 'revolute'
-        driven.setdefault(f'{joint}.{"theta" if rotates[name] else "d"}', []).append(name)
+        at = {ends[1]: count + 1, ends[0]: count + 2}.get(frame)
+        for k, kind in enumerate(FRAME_KINDS):
+            here = (at or 0, k % 3, kind.startswith('r'))
+            lines[f'{frame}.{kind}'] = here if at else (*nowhere[:2], kind.startswith('r'))
+        lines[f'{frame}.{DELAY}'] = nowhere
+        lines |= {f'{frame}.{kind}': (*nowhere[:2], False) for kind in LENS_KINDS}
+    number = {}
+    for i, (joint, _) in enumerate(joints):
+        number[joint] = i
+        axes = {'a': 0, 'alpha': 0, 'beta': 1}
+        for parameter in DH_KINDS:
+            at = i + 1 if standard and parameter in axes else i
+            lines[f'{joint}.{parameter}'] = (at, axes.get(parameter, 2), parameter in ANGLES)
+    owners = [name.partition('.')[0] for name in fitted]
+    for name, owner in zip(fitted, owners, strict=True):
+        turns = joints[number[owner]][1] == 'revolute'
+        lines[name] = (number[owner], 2, turns)
     for name in names:
-        if name not in rotates:
-            raise UnknownNameError('parameter', name, rotates)
-    turning = [name for name in names if rotates[name]]
-    shifting = [name for name in names if not rotates[name]]
+        if name not in lines:
+            raise UnknownNameError('parameter', name, lines)
+    turning = [name for name in names if lines[name][2]]
+    shifting = [name for name in names if not lines[name][2]]
     row = {name: k for k, name in enumerate(turning + shifting)}
-    elsewhere = set(frames) - set(ends)
-    still = [
-        k
-        for name, k in row.items()
-        if name.partition('.')[2] in (DELAY, *LENS_KINDS) or name.partition('.')[0] in elsewhere
+    directions = [7 * lines[name][0] + lines[name][1] for name in turning]
+    levers = [
+        7 * lines[name][0] + (4 if lines[name][:2] == nowhere[:2] else 4 + lines[name][1])
+        for name in turning
     ]
-    order = np.array([row[name] for name in names], dtype=np.intp)
-    order.setflags(write=False)
-    return _Layout(row, len(turning), order, fitted, driven, tuple(still))
+    shifts = [7 * lines[name][0] + lines[name][1] for name in shifting]
+    return _Layout(
+        row,
+        len(turning),
+        _indices(row[name] for name in names),
+        _indices(levers + shifts),
+        _indices(directions),
+        slice(1, count + 1) if standard else slice(0, count),
+        fitted,
+        _indices(row[name] for name in fitted),
+        _indices(number[owner] for owner in owners),
+        row.get(f'{ends[0]}.{DELAY}'),
+    )
 
 
-class _Twist:
-    """The target's velocity, with the sign reversed: what a delay of one second would change."""
-
-    def __init__(self, chain: Chain, velocity: FloatArray) -> None:
-        self._rates = {
-            f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}': -joint.sign * values
-            for joint, values in zip(chain.joints, velocity, strict=True)
-        }
-        self._turn, self._shift = np.zeros((2, 3, velocity.shape[1]))
-
-    def add(self, name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-        """Add what the motion of one joint does."""
-        rate = self._rates.get(name)
-        if rate is None:
-            return
-        if not rotates:
-            self._shift += rate * axis
-            return
-        self._turn += rate * axis
-        moment = np.empty_like(self._shift)
-        cross(np.broadcast_to(axis, moment.shape), np.broadcast_to(point, moment.shape), moment)
-        self._shift -= rate * moment
-
-    def of(self, origin: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return turn and shift (3, B) of a target at a position (3, B)."""
-        shift = np.empty_like(self._shift)
-        cross(self._turn, np.broadcast_to(origin, shift.shape), shift)
-        return self._turn, shift + self._shift
+def _indices(numbers: Iterable[int]) -> NDArray[np.intp]:
+    found = np.array([*numbers], dtype=np.intp)
+    found.setflags(write=False)
+    return found
 
 
 def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:
@@ -254,15 +247,15 @@ def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:
         out[..., k, :] -= first[..., j, :] * second[..., i, :]
 
 
-def orientation_error(measured: FloatArray, axes: Sequence[FloatArray]) -> FloatArray:
+def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
     """Return the rotation vector (3, B) in world axes that turns the model onto the measurement.
 
     Parameters
     ----------
     measured : (3, 3, B)
         Measured rotation matrices; the first index counts their columns.
-    axes : three (3, B)
-        Columns of the model's rotation matrices.
+    model : (3, 3, B)
+        The same of the model.
 
     Notes
     -----
@@ -270,7 +263,6 @@ def orientation_error(measured: FloatArray, axes: Sequence[FloatArray]) -> Float
     1/2 sum_k r_k x m_k, which is as long as log(R^T R_measured).
 
     """
-    model = np.stack([np.broadcast_to(axis, measured.shape[1:]) for axis in axes])
     parts = np.empty_like(model)
     cross(model, measured, parts)
     sine_vector = 0.5 * parts.sum(axis=0)
