@@ -101,25 +101,29 @@ class ErrorModel:
         phi = None
         if layout.effects:
             phi = effects.basis(self.chain, layout.effects, q, approach)
-        # frames before the joints, of the flange, of the flange's axes at the target, and of the
-        # world's axes at the base: axes, origins, and what turns about the axes do to the target
-        lines = np.empty((count + 3, 7, 3, samples))
-        walk.frames(self.chain.effective(q, approach), base, lines[: count + 1, :4])
-        target = self.chain.at_the_tool(lines[count, :4], self._ends[1])
-        lines[count + 1, :3], lines[count + 1, 3] = lines[count, :3], target[3]
-        lines[count + 2, :4] = np.eye(4, 3)[..., np.newaxis]
-        lines[count + 2, 3] += base[:3, 3, np.newaxis]
-        if walk.beta.any():  # a and alpha come before beta
-            behind = lines[layout.behind]
+        # frames before the joints, of the flange, of the world at the base, of the flange's axes
+        # at the target
+        frames = np.empty((count + 3, 4, 3, samples))
+        walk.frames(self.chain.effective(q, approach), base, frames[: count + 1])
+        target = self.chain.at_the_tool(frames[count], self._ends[1])
+        frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
+        frames[count + 1, 3] += base[:3, 3, np.newaxis]
+        frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]
+        if layout.bent and walk.beta.any():  # a and alpha come before beta
+            behind = frames[layout.behind]
             behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
             behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
-        arm = target[3] - lines[:, 3]
-        cross(lines[:, :3], arm[:, np.newaxis], lines[:, 4:])
-        flat = lines.reshape(-1, 3, samples)
+        flat = frames.reshape(-1, 3, samples)
+        axes = flat[layout.axes]
+        levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
+        cross(axes, target[3] - flat[layout.points], levers[:-1])
         shift = np.empty((len(layout.row) + 1, 3, samples))
         turn = np.empty((self.rotations + 1, 3, samples))
-        np.take(flat, layout.shifts, axis=0, out=shift[:-1], mode='clip')
+        np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
+        np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
         np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')
+        for k in layout.still:
+            (turn if k < self.rotations else shift)[k] = 0.0
         if phi is not None:
             phi *= walk.signs[layout.joints]
             shift[layout.driven] *= phi[:, np.newaxis]
@@ -128,8 +132,11 @@ class ErrorModel:
         if velocity is not None and layout.delay is not None:
             rates = -walk.signs * velocity
             turning = walk.turning
-            turn[layout.delay] = np.einsum('jb,jcb->cb', rates[turning], lines[:-3, 2][turning])
-            moved = np.where(turning[:, np.newaxis, np.newaxis], lines[:-3, 6], lines[:-3, 2])
+            driven, points = frames[:count, 2], frames[:count, 3]
+            turn[layout.delay] = np.einsum('jb,jcb->cb', rates[turning], driven[turning])
+            moved = np.empty_like(driven)
+            cross(driven, target[3] - points, moved)
+            moved[~turning] = driven[~turning]
             shift[layout.delay] = np.einsum('jb,jcb->cb', rates, moved)
         return target[:3], target[3], shift, turn
 
@@ -159,17 +166,25 @@ class _Layout(NamedTuple):
     """Where the columns of parameters stand.
 
     `row` of each parameter, rotations first, of which there are so many; `order` of the rows in
-    the order of the names; `shifts` and `turns` the rows that they take of the lines of a walk;
-    `behind` the frames behind the constant part of each link; `effects` among the parameters,
-    with the rows `driven` and the `joints` that they drive; `delay` the row of a delay.
+    the order of the names. Of the rows of all frames, four each, `axes` and `points` are those
+    that something turns about; `levers` (of these), `shifts` and `turns` the ones that each
+    parameter takes, `still` those that move nothing. `behind` are the frames behind the constant
+    part of each link, `bent` where something goes along or about x there; `effects` stand among
+    the parameters, with the rows `driven` and the `joints` that they drive; `delay` is the row of
+    a delay.
     """
 
     row: Mapping[str, int]
     rotations: int
     order: NDArray[np.intp]
+    axes: NDArray[np.intp]
+    points: NDArray[np.intp]
+    levers: NDArray[np.intp]
     shifts: NDArray[np.intp]
     turns: NDArray[np.intp]
+    still: tuple[int, ...]
     behind: slice
+    bent: bool
     effects: tuple[str, ...]
     driven: NDArray[np.intp]
     joints: NDArray[np.intp]
@@ -186,49 +201,52 @@ def _layout(
     ends: tuple[str, str],
 ) -> _Layout:
     """Return the layout of named parameters of joints (name, type), frames and fitted effects."""
-    count = len(joints)
-    nowhere = (count + 1, 4, True)  # turned about itself the target stays where it is
-    lines = {}  # of each parameter: frame, row of it, and whether it turns
+    number = {joint: i for i, (joint, _) in enumerate(joints)}
+    at = {ends[0]: len(joints) + 1, ends[1]: len(joints) + 2}
+    lines: dict[str, tuple[int | None, int, bool]] = {}  # frame, axis, and whether it turns
     for frame in frames:
-        at = {ends[1]: count + 1, ends[0]: count + 2}.get(frame)
         for k, kind in enumerate(FRAME_KINDS):
-            here = (at or 0, k % 3, kind.startswith('r'))
-            lines[f'{frame}.{kind}'] = here if at else (*nowhere[:2], kind.startswith('r'))
-        lines[f'{frame}.{DELAY}'] = nowhere
-        lines |= {f'{frame}.{kind}': (*nowhere[:2], False) for kind in LENS_KINDS}
-    number = {}
-    for i, (joint, _) in enumerate(joints):
-        number[joint] = i
-        axes = {'a': 0, 'alpha': 0, 'beta': 1}
-        for parameter in DH_KINDS:
-            at = i + 1 if standard and parameter in axes else i
-            lines[f'{joint}.{parameter}'] = (at, axes.get(parameter, 2), parameter in ANGLES)
-    owners = [name.partition('.')[0] for name in fitted]
-    for name, owner in zip(fitted, owners, strict=True):
-        turns = joints[number[owner]][1] == 'revolute'
-        lines[name] = (number[owner], 2, turns)
+            lines[f'{frame}.{kind}'] = (at.get(frame), k % 3, kind.startswith('r'))
+        lines[f'{frame}.{DELAY}'] = (None, 0, True)
+        lines |= {f'{frame}.{kind}': (None, 0, False) for kind in LENS_KINDS}
+    along = {'a': 0, 'alpha': 0, 'beta': 1}
+    for joint, i in number.items():
+        for kind in DH_KINDS:
+            here = i + 1 if standard and kind in along else i
+            lines[f'{joint}.{kind}'] = (here, along.get(kind, 2), kind in ANGLES)
+    owners = [number[name.partition('.')[0]] for name in fitted]
+    for name, i in zip(fitted, owners, strict=True):
+        lines[name] = (i, 2, joints[i][1] == 'revolute')
     for name in names:
         if name not in lines:
             raise UnknownNameError('parameter', name, lines)
-    turning = [name for name in names if lines[name][2]]
-    shifting = [name for name in names if not lines[name][2]]
-    row = {name: k for k, name in enumerate(turning + shifting)}
-    directions = [7 * lines[name][0] + lines[name][1] for name in turning]
+    ordered = sorted(names, key=lambda name: not lines[name][2])
+    row = {name: k for k, name in enumerate(ordered)}
+    rotations = sum(lines[name][2] for name in names)
+    taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
+    moved = [lines[name][0] is not None for name in ordered]
+    # turned about itself the target stays where it is
+    lever = [yes and lines[n][0] != at[ends[1]] for yes, n in zip(moved, ordered, strict=True)]
+    axes = sorted({k for k, yes in zip(taken[:rotations], lever, strict=False) if yes})
     levers = [
-        7 * lines[name][0] + (4 if lines[name][:2] == nowhere[:2] else 4 + lines[name][1])
-        for name in turning
+        axes.index(k) if yes else len(axes)
+        for k, yes in zip(taken[:rotations], lever, strict=False)
     ]
-    shifts = [7 * lines[name][0] + lines[name][1] for name in shifting]
     return _Layout(
         row,
-        len(turning),
+        rotations,
         _indices(row[name] for name in names),
-        _indices(levers + shifts),
-        _indices(directions),
-        slice(1, count + 1) if standard else slice(0, count),
+        _indices(axes),
+        _indices(k // 4 * 4 + 3 for k in axes),
+        _indices(levers),
+        _indices(taken[rotations:]),
+        _indices(taken[:rotations]),
+        tuple(k for k, yes in enumerate(moved) if not yes),
+        slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
+        any(name.endswith(('.a', '.alpha')) for name in names),
         fitted,
         _indices(row[name] for name in fitted),
-        _indices(number[owner] for owner in owners),
+        _indices(owners),
         row.get(f'{ends[0]}.{DELAY}'),
     )
 
