@@ -20,7 +20,13 @@ from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior, considered, posterior_of
-from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import (
+    System,
+    factor_of,
+    factor_of_some,
+    minimise,
+    triangular_factor,
+)
 from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import Observations
@@ -228,10 +234,12 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     )
     wanted = [n for n in problem.free if n in structural or n in priors]
     few = problem.system([_some(each) for each in problem.sets])
-    names = identifiability.excited(triangular_factor(start, wanted, few), wanted)
-    if len(names) < len(wanted):  # more samples may determine more
+    factor = factor_of(start, wanted, few)
+    names = identifiability.excited(factor, wanted)
+    if len(names) < len(wanted) and few.count < system.count:  # more samples may determine more
         names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
-    problem = _guarded(problem, names, triangular_factor(start, names, few), simpler)
+    factor = factor_of_some(factor, [wanted.index(name) for name in names])
+    problem = _guarded(problem, names, factor, simpler)
     rough = start
     if simpler is not None:
         rough = simpler.chain.with_effects([name for name, _ in model.effects])

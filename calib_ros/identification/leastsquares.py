@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy.linalg import lapack
 
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
@@ -378,10 +378,13 @@ class Normal:
     def factor(self) -> FloatArray | None:
         """Return R (P, P) with R^T R = H; None where H has lost too many digits for it."""
         scale = np.sqrt(np.diag(self.matrix))
-        scaled = self.matrix / np.outer(scale, scale)
-        if not np.linalg.cond(scaled) < WELL_CONDITIONED:
+        if not (scale.all() and np.isfinite(scale).all()):
             return None
-        return np.asarray(linalg.cholesky(scaled) * scale)
+        scaled = self.matrix / np.outer(scale, scale)
+        sizes = np.linalg.eigvalsh(scaled) if len(scaled) else np.ones(1)
+        if not sizes[-1] < WELL_CONDITIONED * sizes[0]:
+            return None
+        return np.asarray(np.linalg.cholesky(scaled).T * scale)
 
     def rms(self, system: System) -> float:
         """Return the RMS of the weighted residuals, in sigma."""
@@ -391,17 +394,22 @@ class Normal:
 def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Normal:
     """Return the normal equations (P, P), (P,) and the sum of squared weighted residuals."""
     size = len(names) + 1
-    by_position, by_orientation = np.zeros((size, size)), np.zeros((size, size))
+    by_position, by_orientation = np.zeros((2, size, size))
     order = np.arange(size)
     for samples in system.sets:
         for shift, turn, model in samples.blocks(chain, names):
             by_position += shift @ shift.T
             if len(turn):
-                inner = np.r_[: len(turn) - 1, size - 1]
-                by_orientation[np.ix_(inner, inner)] += turn @ turn.T
-            order = np.append(model.order, size - 1)
-    parts = tuple(part[np.ix_(order, order)] for part in (by_position, by_orientation))
-    total = parts[0] + parts[1]
+                products, last = turn @ turn.T, len(turn) - 1
+                by_orientation[:last, :last] += products[:-1, :-1]
+                by_orientation[:last, -1] += products[:-1, -1]
+                by_orientation[-1, -1] += products[-1, -1]
+            order[:-1] = model.order
+    by_orientation[-1, :-1] = by_orientation[:-1, -1]
+    by_position, by_orientation = (
+        part[order[:, np.newaxis], order] for part in (by_position, by_orientation)
+    )
+    total = by_position + by_orientation
     extra, residual = system.extra_rows(chain, names)
     if len(extra):
         total[:-1, :-1] += extra.T @ extra
@@ -411,8 +419,21 @@ def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Norm
         total[:-1, :-1],
         total[:-1, -1],
         float(total[-1, -1]),
-        (parts[0][:-1, :-1], parts[1][:-1, :-1]),
+        (by_position[:-1, :-1], by_orientation[:-1, :-1]),
     )
+
+
+def factor_of(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
+    """Return R (P, P), upper triangular, with R^T R the normal matrix, by the shortest way."""
+    factor = normal_equations(chain, names, system).factor()
+    return triangular_factor(chain, names, system) if factor is None else factor
+
+
+def factor_of_some(factor: FloatArray, which: Sequence[int]) -> FloatArray:
+    """Return R (K, K) of some of the columns of a factor R (P, P)."""
+    if len(which) == len(factor):
+        return factor
+    return np.asarray(np.linalg.qr(factor[:, which], mode='r'))
 
 
 def triangular_factor(
@@ -423,14 +444,14 @@ def triangular_factor(
     factor = system.extra_rows(chain, names)[0] if priors else np.zeros((0, size))
     for samples in system.sets:
         for shift, turn, model in samples.blocks(chain, names):
-            rows = [factor, shift[model.order].T]
+            known, wide = len(factor), shift.shape[1]
+            columns = np.zeros((size, known + wide + turn.shape[1]))
+            columns[:, :known] = factor.T
+            columns[:, known : known + wide] = shift[model.order]
             if len(turn):
-                oriented = np.zeros((turn.shape[1], size))
                 rotational = model.order < model.rotations
-                oriented[:, rotational] = turn[model.order[rotational]].T
-                rows.append(oriented)
-            stacked = np.concatenate(rows)
-            factor = np.asarray(linalg.qr(stacked, mode='r', check_finite=False)[0])[:size]
+                columns[rotational, known + wide :] = turn[model.order[rotational]]
+            factor = np.triu(lapack.dgeqrf(columns.T, 32 * size, overwrite_a=True)[0][:size])
     if len(factor) < size:
         factor = np.concatenate([factor, np.zeros((size - len(factor), size))])
     return factor
@@ -540,9 +561,9 @@ def _solve(normal: Normal, damping: float) -> FloatArray:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal.matrix), 1e-300))
     matrix = normal.matrix * np.outer(scale, scale)
     while True:
-        try:
-            factor = linalg.cho_factor(matrix + damping * np.eye(len(scale)), check_finite=False)
-        except linalg.LinAlgError:
-            damping = max(10.0 * damping, 1e-14)
-            continue
-        return np.asarray(scale * linalg.cho_solve(factor, scale * normal.gradient))
+        _, step, failed = lapack.dposv(
+            matrix + damping * np.eye(len(scale)), scale * normal.gradient
+        )
+        if not failed:
+            return np.asarray(scale * step)
+        damping = max(10.0 * damping, 1e-14)

@@ -127,9 +127,19 @@ class Frame:
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
         """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""
-        start = np.eye(4) if reference is None else reference.matrix
-        turn = se3.log_rotation(self.matrix[:3, :3] @ start[:3, :3].T)
-        return np.concatenate([self.matrix[:3, 3] - start[:3, 3], turn])
+        return _offsets(self, reference or ANYWHERE)
+
+
+@lru_cache(maxsize=256)
+def _offsets(frame: Frame, reference: Frame) -> FloatArray:
+    start = reference.matrix
+    turn = se3.log_rotation(frame.matrix[:3, :3] @ start[:3, :3].T)
+    found = np.concatenate([frame.matrix[:3, 3] - start[:3, 3], turn])
+    found.setflags(write=False)
+    return found
+
+
+ANYWHERE = Frame()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -263,7 +273,7 @@ class Chain(Shown):
 
     def frame(self, name: str) -> Frame:
         """Return a base or tool frame by its name, the identity when nothing is known."""
-        return self._frames[name] or Frame()
+        return self._frames[name] or ANYWHERE
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""

@@ -95,6 +95,8 @@ def members(chain: Chain, group: str) -> tuple[str, ...]:
 
 
 WAVES = ('sin', 'cos')
+ROUNDING = 1e-12
+"""Share of gravity below which what turns a joint is a rounding error."""
 
 
 def resolve(chain: Chain, name: str) -> tuple[str, ...]:
@@ -212,6 +214,7 @@ def _torques(
         ],
         axis=1,
     )
+    turned[np.abs(turned) < ROUNDING * np.linalg.norm(down)] = 0.0  # of a vertical axis
     turned *= chain.walk.signs[..., np.newaxis]
     places = found[1, :-1]
     if ends is not None:
