@@ -8,6 +8,7 @@ matrix, which squares the condition number.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -45,16 +46,18 @@ def independent(
         Least share of a frame's column; of other columns RANK_TOLERANCE.
 
     """
-    basis = np.zeros((len(factor), 0))
-    kept = []
-    for name, column in zip(names, factor.T, strict=True):
-        rest = column - basis @ (basis.T @ column)
-        rest -= basis @ (basis.T @ rest)  # once more: Gram-Schmidt loses orthogonality
-        size = float(np.linalg.norm(rest))
-        placed = name.partition('.')[2] in FRAME_KINDS
-        least = (frame_tolerance if placed else RANK_TOLERANCE) * float(np.linalg.norm(column))
-        if size > least and size > 0.0:
-            basis = np.column_stack([basis, rest / size])
+    least = np.where(
+        [name.partition('.')[2] in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
+    ) * np.linalg.norm(factor, axis=0)
+    basis = np.zeros(factor.shape)
+    kept: list[str] = []
+    for name, column, short in zip(names, factor.T, least.tolist(), strict=True):
+        known = basis[:, : len(kept)]
+        rest = column - known @ (known.T @ column)
+        rest -= known @ (known.T @ rest)  # once more: Gram-Schmidt loses orthogonality
+        size = math.sqrt(rest @ rest)
+        if size > short and size > 0.0:
+            basis[:, len(kept)] = rest / size
             kept.append(name)
     return tuple(kept)
 

@@ -270,7 +270,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     )
     validation, validated_by = validate(problem, before.chain, fit.chain, names, robust, explained)
     parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
-    chance = _chance(replace(problem, learned=None), before.chain, names, robust)
+    chance = _chance(problem, before.chain, names, robust)
     converged = before.converged and fit.converged and robust.settled
     if not noise.consistent:  # targets of one stop share what the model lacks
         whole *= _targets(problem)
@@ -434,7 +434,7 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     ]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
-    return chance_of_gain(before, frames, arm, problem.system(sets))
+    return chance_of_gain(before, frames, arm, problem.system(sets, learned=False))
 
 
 def _weak(problem: Problem, parameters: Sequence[Parameter]) -> tuple[str, ...]:

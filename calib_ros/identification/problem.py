@@ -250,8 +250,13 @@ class Problem(Shown):
         """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
         return (self.largest_length if is_length(name) else self.largest_angle) / 3.0
 
-    def system(self, sets: Sequence[Observations]) -> System:
-        """Return sets of observations, and the priors, as the solver takes them."""
+    def system(self, sets: Sequence[Observations], learned: bool = True) -> System:
+        """Return sets of observations, and the priors, as the solver takes them.
+
+        Without the priors that were `learned` from the data if asked.
+        """
+        if not learned and self.learned is not None:
+            return replace(self, learned=None).system(sets)
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None
@@ -270,19 +275,19 @@ class Problem(Shown):
         """
         model = self.model
         used = {name for each in self.sets for name in (each.base, each.tool)}
-        held = [f'{k}.*' for k in model.frame_names if k not in used]
+        held: set[str] = set()
         for key in model.frame_names:
             frame = model.frame(key)
-            held += [f'{key}.{kind}' for kind in (*FRAME_KINDS, DELAY) if frame.fixed]
-            fixed = frame.lens is None or frame.lens.fixed
-            held += [f'{key}.{kind}' for kind in LENS_KINDS if fixed]
-        held += [f'{each.base}.r?' for each in self.sets if each.socket]
+            place = [f'{key}.{kind}' for kind in (*FRAME_KINDS, DELAY)]
+            lens = [f'{key}.{kind}' for kind in LENS_KINDS]
+            held.update(place if frame.fixed or key not in used else ())
+            unseen = frame.lens is None or frame.lens.fixed or key not in used
+            held.update(lens if unseen else ())
+        held.update(
+            f'{each.base}.{kind}' for each in self.sets if each.socket for kind in FRAME_KINDS[3:]
+        )
+        for pattern in self.fixed:
+            held.update(fnmatch.filter(model.parameter_names, pattern))
         known = dict(model.effects)
-        ordered = sorted(
-            model.parameter_names, key=lambda name: 2 * (name in known) + name.endswith('.d')
-        )
-        return tuple(
-            name
-            for name in ordered
-            if not any(fnmatch.fnmatchcase(name, pattern) for pattern in (*self.fixed, *held))
-        )
+        names = [name for name in model.parameter_names if name not in held]
+        return tuple(sorted(names, key=lambda name: 2 * (name in known) + name.endswith('.d')))

@@ -225,12 +225,16 @@ class _Judge:
         frames = [f'{ends.base}.{kind}' for kind in FRAME_KINDS]
         frames += [f'{ends.tool}.{kind}' for kind in FRAME_KINDS[:3]]
         every = list(dict.fromkeys([*frames, *names]))
-        rows = ErrorModel(chain, every, ends.base, ends.tool).jacobian(joints)[:, :3]
-        column = {name: k for k, name in enumerate(every)}
+        model = ErrorModel(chain, every, ends.base, ends.tool)
+        shift = model.linearise(np.ascontiguousarray(joints.T))[2]
+        row = dict(zip(every, model.order.tolist(), strict=True))
         own = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
-        self.sigma = _length(rows[:, :, [column[name] for name in names]], posterior.square)
-        self._frames = rows[:, :, : len(frames)]
-        self._rows = rows[:, :, [column[names[k]] for k in own]]
+        found = shift[[row[name] for name in names]]
+        flat = found.reshape(len(names), -1)
+        squares = ((posterior.square @ flat) * flat).sum(axis=0).reshape(3, -1).sum(axis=0)
+        self.sigma = np.sqrt(np.maximum(squares, 0.0))
+        self._frames = shift[model.order[: len(frames)]]
+        self._rows = found[own]
         self._offsets = posterior.offsets[own]
         self._doubted = [
             (weight, mean[own], covariance[np.ix_(own, own)])
@@ -240,10 +244,15 @@ class _Judge:
 
     def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
         """Return it for some poses, in frames fitted to those around."""
-        frames, rows = self._frames[around], self._rows[around]
-        known = frames.reshape(-1, frames.shape[2])
-        taken = np.linalg.lstsq(known, rows.reshape(len(known), -1), rcond=1e-9)[0]
-        left = (self._rows[which] - self._frames[which] @ taken).reshape(-1, rows.shape[2])
+        known, rows = (
+            part[:, :, around].reshape(len(part), -1).T for part in (self._frames, self._rows)
+        )
+        taken = np.linalg.lstsq(known, rows, rcond=1e-9)[0]
+        if which is not around:
+            known, rows = (
+                part[:, :, which].reshape(len(part), -1).T for part in (self._frames, self._rows)
+            )
+        left = rows - known @ taken
         gain = left @ self._offsets
         slope = left.T @ gain
         risk = 0.0

@@ -106,8 +106,8 @@ class _Stops:
             far, nearest = cKDTree(self.place).query(self.place, k=NEAREST + 1)
             first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < APART / 2)
-            pairs = np.sort(np.column_stack([first, second])[good], axis=1)
-            first, second = np.unique(pairs, axis=0).T
+            ends = np.sort([first[good], second[good]], axis=0)
+            first, second = np.divmod(np.unique(count * ends[0] + ends[1]), count)
         links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
         return csr_array(links + links.T)
 
