@@ -558,12 +558,13 @@ def without_each(
 
 def _solve(normal: Normal, damping: float) -> FloatArray:
     """Return the damped step; a matrix that rounding made singular is damped a little more."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal.matrix), 1e-300))
-    matrix = normal.matrix * np.outer(scale, scale)
+    size = np.arange(len(normal.matrix))
+    scale = 1.0 / np.sqrt(np.maximum(normal.matrix[size, size], 1e-300))
+    matrix = normal.matrix * scale * scale[:, np.newaxis]
+    unit = matrix[size, size]
     while True:
-        _, step, failed = lapack.dposv(
-            matrix + damping * np.eye(len(scale)), scale * normal.gradient
-        )
+        matrix[size, size] = unit + damping
+        _, step, failed = lapack.dposv(matrix, scale * normal.gradient)
         if not failed:
             return np.asarray(scale * step)
         damping = max(10.0 * damping, 1e-14)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import ROUNDING, Posterior
 from calib_ros.identification.leastsquares import BLOCK
 from calib_ros.identification.observations import Observations
@@ -180,16 +181,17 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     near, far = np.split(judge.sigma, [len(measured)])
     limit = float(near.max())
     order = np.argsort(far)
-    own = [*range(len(measured))]
-    inner = [*own, *(len(measured) + order[far[order] <= limit]).tolist()]
+    own = judge.products([*range(len(measured))])
+    inner = own + judge.products(len(measured) + order[far[order] <= limit])
     if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
         return None
     shells = len(measured) + order[far[order] > limit]
     for first in range(0, len(shells), SHELL):
-        shell = shells[first : first + SHELL].tolist()
-        if not judge.risk(shell, inner + shell) < RISK:
+        shell = shells[first : first + SHELL]
+        added = judge.products(shell)
+        if not judge.risk(added, inner + added) < RISK:
             break
-        inner += shell
+        inner = inner + added
         limit = float(judge.sigma[shell[-1]])
     share = float(np.mean(far <= limit))
     return Region(
@@ -233,8 +235,8 @@ class _Judge:
         flat = found.reshape(len(names), -1)
         squares = ((posterior.square @ flat) * flat).sum(axis=0).reshape(3, -1).sum(axis=0)
         self.sigma = np.sqrt(np.maximum(squares, 0.0))
-        self._frames = shift[model.order[: len(frames)]]
-        self._rows = found[own]
+        self._placed = len(frames)
+        self._rows = shift[[row[name] for name in [*frames, *(names[k] for k in own)]]]
         self._offsets = posterior.offsets[own]
         self._doubted = [
             (weight, mean[own], covariance[np.ix_(own, own)])
@@ -242,22 +244,23 @@ class _Judge:
         ]
         self._freedom = freedom
 
-    def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
-        """Return it for some poses, in frames fitted to those around."""
-        known, rows = (
-            part[:, :, around].reshape(len(part), -1).T for part in (self._frames, self._rows)
-        )
-        taken = np.linalg.lstsq(known, rows, rcond=1e-9)[0]
-        if which is not around:
-            known, rows = (
-                part[:, :, which].reshape(len(part), -1).T for part in (self._frames, self._rows)
-            )
-        left = rows - known @ taken
-        gain = left @ self._offsets
-        slope = left.T @ gain
+    def products(self, which: Sequence[int] | NDArray[np.intp]) -> FloatArray:
+        """Return (K, K) the products of the columns with each other, over some poses."""
+        rows = self._rows[:, :, which].reshape(len(self._rows), -1)
+        return np.asarray(rows @ rows.T)
+
+    def risk(self, which: FloatArray, around: FloatArray) -> float:
+        """Return it for some poses, in frames fitted to those around; both by their products."""
+        frames, arm = np.s_[: self._placed], np.s_[self._placed :]
+        root = inverse_root(around[frames, frames], np.diag(around)[frames])
+        taken = root @ (root.T @ around[frames, arm])
+        cross = taken.T @ which[frames, arm]
+        left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
+        slope = left @ self._offsets
+        gain = float(slope @ self._offsets)
         risk = 0.0
         for weight, mean, covariance in self._doubted:
-            margin = float(slope @ mean) - 0.5 * float(gain @ gain)
+            margin = float(slope @ mean) - 0.5 * gain
             spread = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
             if spread == 0.0:
                 risk += weight * (margin <= 0.0)

@@ -114,9 +114,9 @@ class Frame:
         """
         matrix = self.matrix.copy()
         matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
-        turn = np.array([offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]])
-        if turn.any():
-            matrix[:3, :3] = se3.exp_rotation(turn) @ matrix[:3, :3]
+        turn = [offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]]
+        if any(turn):
+            matrix[:3, :3] = se3.turned(*turn) @ matrix[:3, :3]
         delay = self.delay
         if DELAY in offsets:
             delay = (delay or 0.0) + offsets[DELAY]

@@ -39,16 +39,27 @@ class Walk:
     def __init__(
         self, table: FloatArray, signs: FloatArray, turning: NDArray[np.bool_], standard: bool
     ) -> None:
-        a, alpha, d, self._theta, self.beta = table.T
+        a, alpha, d, theta, self.beta = table.T
+        self._theta = theta[:, np.newaxis]
         self.signs = signs[:, np.newaxis]
         self.turning = turning
+        self._all_turning = bool(turning.all())
+        self._turns = turning[:, np.newaxis]
         self.standard = standard
         cos, sin = np.cos(alpha), np.sin(alpha)
         self.cos, self.sin = np.cos(self.beta), np.sin(self.beta)
         links = np.zeros((len(table), 4, 4))
-        links[:, 0] = np.stack([self.cos, sin * self.sin, -cos * self.sin, 0.0 * a], axis=1)
-        links[:, 1] = np.stack([0.0 * a, cos, sin, 0.0 * a], axis=1)
-        links[:, 2] = np.stack([self.sin, -sin * self.cos, cos * self.cos, 0.0 * a], axis=1)
+        links[:, 0, 0], links[:, 0, 1], links[:, 0, 2] = (
+            self.cos,
+            sin * self.sin,
+            -cos * self.sin,
+        )
+        links[:, 1, 1], links[:, 1, 2] = cos, sin
+        links[:, 2, 0], links[:, 2, 1], links[:, 2, 2] = (
+            self.sin,
+            -sin * self.cos,
+            cos * self.cos,
+        )
         links[:, 3, 0], links[:, 3, 3] = a, 1.0
         if standard:  # d moves along z, first or last
             links[:, 3, 2] = d
@@ -73,7 +84,7 @@ class Walk:
 
         """
         values = self.signs * q
-        angles = self._theta[:, np.newaxis] + np.where(self.turning[:, np.newaxis], values, 0.0)
+        angles = self._theta + (values if self._all_turning else values * self._turns)
         cos, sin = np.cos(angles), np.sin(angles)
         here, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
         here[:] = base[:3].T[..., np.newaxis]
