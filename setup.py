@@ -17,8 +17,13 @@ AMENT = (
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
+# Ubuntu 24.04 has it with the libraries that it needs.
+PDF = 'weasyprint>=61.1'
+DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.24']
 XLSX = 'openpyxl>=3.1.2'
 CAMERA = 'opencv-python-headless>=4.7'
+TERMINAL = ['argcomplete>=3.1.4', 'rich>=13.7.1']
+FLEET = ['distributed>=2024.5.0', 'fsspec>=2024.2.0', 'pyarrow>=14.0.1']
 
 setup(
     name=NAME,
@@ -43,10 +48,18 @@ setup(
         'bags': [BAGS],
         # report.html; without it the other files are written.
         'report': REPORT,
+        # report.pdf, a certificate on paper.
+        'pdf': [*REPORT, PDF],
+        # The site: `make docs`.
+        'docs': DOCS,
         # Workbooks as tables.
         'xlsx': [XLSX],
         # For photographs; Ubuntu has it as python3-opencv.
         'camera': [CAMERA],
+        # Colour, bars with the time left, completion of commands by TAB.
+        'terminal': TERMINAL,
+        # Histories and fleets.
+        'fleet': FLEET,
         # Where ROS 2 Jazzy is installed, rclpy and the messages come from there.
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-jazzy-common-interfaces==5.3.6'],
         # Leads `make fuzz` by the branches reached; not built for every Python.
@@ -54,8 +67,11 @@ setup(
         'test': [
             BAGS,
             *REPORT,
+            PDF,
             XLSX,
             CAMERA,
+            *FLEET,
+            *TERMINAL,
             'cmake<4',
             'colcon-core',
             'colcon-python-setup-py',
@@ -63,6 +79,7 @@ setup(
             'hypothesis',
             'kinpy',
             'mypy',
+            'pandas',
             'playwright',
             'pytest',
             'pytest-xdist',
@@ -80,7 +97,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
-        (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
+        (f'{SHARE}/config', glob('config/*.*')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
         (f'{SHARE}/config/tables', glob('config/tables/*.yaml')),
         (f'{SHARE}/security', glob('security/*.xml')),

@@ -41,13 +41,13 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
-from calib_ros.apply import planning
+from calib_ros.apply import choice
 from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.choice import choose
 from calib_ros.apply.design import Candidates, Design, accuracy, predicted
 from calib_ros.apply.placement import place
-from calib_ros.apply.planning import choose
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
@@ -77,7 +77,7 @@ def naive(design, candidates, count):
     space = Candidates(design, candidates)
     rows, size = space.rows, space.rows.shape[2]
     each = [row.T @ row for row in rows]
-    start = space.known + planning.RIDGE * np.eye(size)
+    start = space.known + choice.RIDGE * np.eye(size)
 
     def best(others, free):
         information = start + sum(each[k] for k in others)
@@ -117,7 +117,7 @@ def speed():
         theirs = timed('naive_d', lambda: naive(design, candidates, 30))
     timed('choose_o5', lambda: choose(design, candidates, 30, 'o5'))
     true = faulty(chain, Cell(), rng)
-    arm = CalibratedArm.of(identify(Problem(chain, measure(true, candidates[:60], rng, *SIGMAS))))
+    arm = Calibration.of(identify(Problem(chain, measure(true, candidates[:60], rng, *SIGMAS))))
     postures = chain.random_joints(10000, rng)
 
     def mapped(joints):
@@ -179,7 +179,7 @@ def simulated(arm, oriented, draws):
                     ]
                 )
             )
-        share = planning.efficiency(design, candidates, chosen, unseen)
+        share = choice.efficiency(design, candidates, chosen, unseen)
         least = accuracy(design, candidates[chosen], unseen)[-1] * np.sqrt(share)
         row['bound'] = 1e3 * float(least)
         for count in (25, 50):
@@ -204,7 +204,7 @@ def placement(draws):
         identify(Problem(nominal, measure(true, joints, np.random.default_rng(seed), *SIGMAS)))
         for seed in range(draws)
     ]
-    arm = CalibratedArm.of(results[0])
+    arm = Calibration.of(results[0])
     angle = 2.0 * np.pi * np.arange(12) / 12
     circle = np.column_stack([0.15 * np.cos(angle), 0.15 * np.sin(angle), np.zeros(12)])
     task = transform(np.tile(np.diag([1.0, -1.0, -1.0]), (12, 1, 1)), circle)

@@ -27,11 +27,12 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
+from calib_ros.apply.confidence import freedom_of, rms_limits
 from calib_ros.apply.design import Design
 from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.apply.verification import _freedom, rms_limits, verify
-from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.apply.verification import verify
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify, residuals
 from calib_ros.kinematics import inverse
 from calib_ros.kinematics.chain_file import load_chain
@@ -89,7 +90,7 @@ def drawn(kind, draws):
             for _ in range(draws // len(arms)):
                 chosen = errors[rng.integers(0, len(errors), count)]
                 moments = chosen[:, :, None] * chosen[:, None]
-                freedom = np.array([count * _freedom(moments)])
+                freedom = np.array([count * freedom_of(moments)])
                 lower, upper = rms_limits(rms(chosen), freedom, 0.95)
                 held.append((upper[0] >= truth, lower[0] <= truth))
         upper, lower = np.mean(held, axis=0).tolist()
@@ -101,11 +102,11 @@ def measured(name, session, draws):
     """Return how often the limits hold on a measured robot, by the number of poses."""
     problem = problem_of(name, session, 'chain.yaml')
     result = identify(problem)
-    arm = CalibratedArm.of(result)
+    arm = Calibration.of(result)
     held_out = problem.judging[0].select(result.validation.judged)
     _, first = np.unique(held_out.configurations, return_index=True)
     held_out = held_out.select(first)
-    truth = rms(residuals(arm.after, held_out).position)
+    truth = rms(residuals(arm.chain, held_out).position)
     rng = np.random.default_rng(0)
     row = {}
     for count in (5, 10, 20):
@@ -130,7 +131,7 @@ def simulated(draws):
         design = Design.of(problem, result)
         tests = iso_9283_poses(design, np.random.default_rng(seed))
         found.append(
-            verify(CalibratedArm.of(result), [measure(true, tests.joints, rng, *NOISE)], 1e-4)
+            verify(Calibration.of(result), [measure(true, tests.joints, rng, *NOISE)], 1e-4)
         )
         poses = np.repeat(design.targets(tests.joints[:1]), 500, axis=0)
         turn = result.chain.base.matrix[:3, :3]

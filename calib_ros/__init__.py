@@ -12,13 +12,14 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib_ros.apply.compensation import Compensator, Program, compensate
+    from calib_ros.apply.compensation import Compensator, compensate
     from calib_ros.apply.planning import Plan, plan
+    from calib_ros.apply.program import Program
     from calib_ros.apply.verification import Verification, verify
-    from calib_ros.apply.workspace import CalibratedArm
     from calib_ros.errors import CalibrationError
     from calib_ros.files.bags import replay
     from calib_ros.files.tables import read_table
+    from calib_ros.identification.calibration import Calibration, load_calibration
     from calib_ros.identification.identification import Identification, identify
     from calib_ros.identification.model_choice import identify_model
     from calib_ros.identification.observations import Observations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 __version__ = '0.1.0'
 
 __all__ = [
-    'CalibratedArm',
+    'Calibration',
     'CalibrationError',
     'CalibrationSession',
     'Chain',
@@ -50,6 +51,7 @@ __all__ = [
     'dump_chain',
     'identify',
     'identify_model',
+    'load_calibration',
     'load_chain',
     'plan',
     'read_table',
@@ -58,7 +60,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    'CalibratedArm': 'apply.workspace',
+    'Calibration': 'identification.calibration',
     'CalibrationError': 'errors',
     'CalibrationSession': 'sampling.session',
     'Chain': 'kinematics.chain',
@@ -67,7 +69,7 @@ _HOMES = {
     'Observations': 'identification.observations',
     'Plan': 'apply.planning',
     'Problem': 'identification.problem',
-    'Program': 'apply.compensation',
+    'Program': 'apply.program',
     'Settings': 'settings',
     'Verification': 'apply.verification',
     'chain_from_urdf': 'kinematics.urdf',
@@ -76,6 +78,7 @@ _HOMES = {
     'dump_chain': 'kinematics.chain_file',
     'identify': 'identification.identification',
     'identify_model': 'identification.model_choice',
+    'load_calibration': 'identification.calibration',
     'load_chain': 'kinematics.chain_file',
     'plan': 'apply.planning',
     'read_table': 'files.tables',

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
-ORDER = 'kinematics < identification < sampling < apply < files < report < ros, cli'
+ORDER = 'kinematics < identification < sampling < apply < files < report < fleet < ros, cli'
 LEVEL = {name: k for k, names in enumerate(ORDER.split(' < ')) for name in names.split(', ')}
 MODULES = {
     '.'.join(path.relative_to(PACKAGE).with_suffix('').parts): path
@@ -23,8 +23,14 @@ ONLY = {
     **dict.fromkeys(ROS, ('ros.',)),
     'rosbags': ('files.bags',),
     'matplotlib': ('report.plots',),
-    **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
+    **dict.fromkeys(('jinja2', 'plotly'), ('report.page', 'fleet.page')),
+    'weasyprint': ('report.page',),
     'cv2': ('files.images',),
+    'pyarrow': ('files.history',),
+    'fsspec': ('files.history', 'fleet.'),
+    'distributed': ('fleet.',),
+    'rich': ('fleet.', 'cli.screen'),
+    'argcomplete': ('cli.main',),
     'yaml': (
         *('texts', 'kinematics.chain_file', 'files.export', 'files.trajectories'),
         *('files.vendors', 'ros.arguments'),
@@ -85,7 +91,8 @@ def test_no_two_modules_import_each_other():
 
 
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
-    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'cv2']
+    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'weasyprint', 'cv2']
+    blocked += ['pyarrow', 'fsspec', 'distributed', 'rich']
     apart = ('ros.', 'files.bags', 'report.plots')
     core = [name for name in MODULES if not name.startswith(apart)]
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]

@@ -75,9 +75,9 @@ def test_versions_agree():
 def test_package_xml_names_everything_that_is_imported():
     package = ET.parse(ROOT / 'package.xml').getroot()
     declared = {element.text for element in package.iter('exec_depend')}
-    declared.add('openpyxl')  # for workbooks only: `pip install calib_ros[xlsx]`
-    declared.add('rosbags')  # for bags only: not in Ubuntu, `pip install calib_ros[bags]`
-    declared |= {'cv2', 'openpyxl'}  # for photographs and workbooks only, extras as well
+    # Extras of pip, imported only where they are used (setup.py).
+    declared |= {'rosbags', 'openpyxl', 'cv2', 'distributed', 'fsspec', 'pyarrow'}
+    declared |= {'argcomplete', 'rich', 'weasyprint'}
     keys = {'yaml': 'python3-yaml'}
     keys |= {
         name: f'python3-{name}' for name in ('jinja2', 'matplotlib', 'numpy', 'plotly', 'scipy')

@@ -15,7 +15,7 @@ JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
 SEEN = measure(CHAIN, JOINTS, np.random.default_rng(2), 1e-4, 1e-4)
 PROBLEM = calib_ros.Problem(CHAIN, SEEN)
 RESULT = calib_ros.identify(PROBLEM)
-ARM = calib_ros.CalibratedArm.of(RESULT)
+ARM = calib_ros.Calibration.of(RESULT)
 VALUES = (CHAIN, SEEN, PROBLEM, RESULT, ARM, RESULT.posterior)
 
 

@@ -16,7 +16,6 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.following import Follower
@@ -33,8 +32,6 @@ from calib_ros.shown import Shown
 
 EXACT, COMPROMISE = 1e-6, 0.02
 """Orientation errors [rad] tolerated of arms that can reach every orientation, and of others."""
-NUDGE = 0.01
-"""Step of the differences for velocities, in units of the largest correction."""
 CHANGE_FLOOR = 1e-5
 """Changes of the correction that are never a jump, in units of the largest correction."""
 ON_LIMIT = 1e-6
@@ -172,31 +169,6 @@ class Compensation(Shown):
         return self.joints - self.command
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Program(Shown):
-    """A robot's program as joint values by name.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Columns of the arrays; joints that are not of the arm may be among them.
-    positions : (N, m)
-        Joint values [rad or m], in the order in which they are run through.
-    velocities, accelerations : (N, m), optional
-        Their derivatives.
-    approach : (N, n), optional
-        Signs of the velocities with which the arm's joints come to their values, for backlash.
-        Found from the order of the positions when None.
-
-    """
-
-    names: tuple[str, ...]
-    positions: FloatArray
-    velocities: FloatArray | None = None
-    accelerations: FloatArray | None = None
-    approach: FloatArray | None = None
-
-
 def compensate(
     compensator: Compensator, joints: FloatArray, approach: FloatArray | None = None
 ) -> Compensation:
@@ -234,54 +206,9 @@ def compensate(
         damped=solution.damped,
         refusals=(),
     )
-    result = _refused(result, _outside(compensator, result))
-    result = _refused(result, _unreached(compensator, result))
-    return _refused(result, _jumps(compensator, result))
-
-
-def compensate_program(compensator: Compensator, program: Program) -> tuple[Program, Compensation]:
-    """Return a program with corrected joint values, and what became of each sample.
-
-    Velocities and accelerations follow the corrected path; times stay. Joints that are not of the
-    arm stay as they are. Refused samples are NaN.
-
-    Raises
-    ------
-    InputError, UnknownNameError
-        For a joint of the arm that is missing, and arrays that do not fit the names.
-
-    """
-    columns = _columns(compensator.nominal.joint_names, program)
-    positions = program.positions[:, columns]
-    approach = approaches(positions) if program.approach is None else program.approach
-    result = compensate(compensator, positions, approach)
-    if program.velocities is None:
-        return replace(program, positions=_put(program.positions, columns, result.joints)), result
-    given = program.accelerations
-    curve = np.zeros_like(program.velocities) if given is None else given
-    speeds = program.velocities[:, columns]
-    velocities, accelerations = _derivatives(
-        compensator, result, speeds, curve[:, columns], approach
-    )
-    result = _refused(result, _held(result))
-    result = _refused(result, _swings(compensator, result, speeds, velocities - speeds))
-    refused = np.where(np.isnan(result.joints), np.nan, 0.0)
-    return (
-        replace(
-            program,
-            positions=_put(program.positions, columns, result.joints),
-            velocities=_put(program.velocities, columns, velocities + refused),
-            accelerations=None if given is None else _put(given, columns, accelerations + refused),
-        ),
-        result,
-    )
-
-
-def approaches(positions: FloatArray) -> FloatArray:
-    """Return the sign (N, n) of the last move of each joint, 0 before it first moves."""
-    moves = np.sign(np.diff(positions, axis=0, prepend=positions[:1]))
-    last = np.where(moves != 0.0, np.arange(len(moves))[:, np.newaxis], 0)
-    return np.asarray(np.take_along_axis(moves, np.maximum.accumulate(last, axis=0), axis=0))
+    result = refused(result, _outside(compensator, result))
+    result = refused(result, _unreached(compensator, result))
+    return refused(result, _jumps(compensator, result))
 
 
 def in_words(compensator: Compensator, result: Compensation) -> str:
@@ -370,50 +297,30 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
 
 def _jumps(compensator: Compensator, result: Compensation) -> list[Refusal]:
     """Return the samples whose correction jumps against that of the sample before."""
-    moves = np.abs(np.diff(result.command, axis=0))
-    changes = np.abs(np.diff(result.correction, axis=0))  # NaN beside refused samples
+    moves, changes = (
+        np.abs(np.diff(each, axis=0)) for each in (result.command, result.correction)
+    )  # NaN beside refused samples
+    return [
+        Refusal(
+            k + 1,
+            f'the correction of {compensator.nominal.joint_names[i]} jumps by {changes[k, i]:.4g} '
+            f'while the joints move by {moves[k].max():.4g} at most',
+        )
+        for k, i in too_fast(compensator, changes, moves)
+    ]
+
+
+def too_fast(
+    compensator: Compensator, changes: FloatArray, moves: FloatArray
+) -> list[tuple[int, int]]:
+    """Return sample and joint where a correction changes (N, n) too much for its moves (N, n)."""
     shares = changes / compensator.largest
     allowed = compensator.largest_change * (moves / compensator.largest).max(axis=1)
-    found = []
-    for k in np.flatnonzero(shares.max(axis=1) > allowed + CHANGE_FLOOR).tolist():
-        i = int(shares[k].argmax())
-        reason = (
-            f'the correction of {compensator.nominal.joint_names[i]} jumps by {changes[k, i]:.4g} '
-            f'while the joints move by {moves[k].max():.4g} at most'
-        )
-        found.append(Refusal(k + 1, reason))
-    return found
+    rows = np.flatnonzero(shares.max(axis=1) > allowed + CHANGE_FLOOR)
+    return [(k, int(shares[k].argmax())) for k in rows.tolist()]
 
 
-def _held(result: Compensation) -> list[Refusal]:
-    """Return the samples with a joint at its limit that are not refused yet."""
-    held = np.flatnonzero(result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1))
-    reason = 'a joint is held at its limit, where its velocity is not defined'
-    return [Refusal(sample, reason) for sample in held.tolist()]
-
-
-def _swings(
-    compensator: Compensator, result: Compensation, speeds: FloatArray, changes: FloatArray
-) -> list[Refusal]:
-    """Return the samples whose correction changes (N, n) too fast for their speeds (N, n).
-
-    The limit is that of jumps, which samples far from each other do not show.
-    """
-    sizes = np.where(np.isnan(result.joints), 0.0, np.abs(changes))
-    shares = sizes / compensator.largest
-    allowed = compensator.largest_change * np.abs(speeds / compensator.largest).max(axis=1)
-    found = []
-    for k in np.flatnonzero(shares.max(axis=1) > allowed + CHANGE_FLOOR).tolist():
-        i = int(shares[k].argmax())
-        reason = (
-            f'the correction of {compensator.nominal.joint_names[i]} moves at {sizes[k, i]:.4g} '
-            f'while the joints move at {np.abs(speeds[k]).max():.4g} a second at most'
-        )
-        found.append(Refusal(k, reason))
-    return found
-
-
-def _refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
+def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     """Return the result with further samples refused, their joint values set to NaN."""
     joints = result.joints.copy()
     joints[[refusal.sample for refusal in more]] = np.nan
@@ -421,68 +328,6 @@ def _refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     new = [refusal for refusal in more if refusal.sample not in known]
     refusals = sorted([*result.refusals, *new], key=lambda refusal: refusal.sample)
     return replace(result, joints=joints, refusals=tuple(refusals))
-
-
-def _derivatives(
-    compensator: Compensator,
-    result: Compensation,
-    velocities: FloatArray,
-    accelerations: FloatArray,
-    approach: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Return velocities and accelerations (N, n) along the corrected path.
-
-    Central differences of the correction along q + v t + a t^2 / 2, with a time step in which the
-    command moves by a small part of the largest correction.
-    """
-    speed, bend = (
-        np.abs(rates / compensator.largest).max(axis=1) for rates in (velocities, accelerations)
-    )
-    moving = speed + np.sqrt(speed**2 + 2.0 * NUDGE * bend)
-    step = np.where(moving > 0.0, 2.0 * NUDGE / np.where(moving > 0.0, moving, 1.0), 1.0)
-    step = step[:, np.newaxis]
-
-    def correction(time: FloatArray) -> FloatArray:
-        joints = result.command + time * velocities + 0.5 * time**2 * accelerations
-        return compensator.follower.solve(joints, approach, bounded=False).change
-
-    ahead, here, behind = correction(step), correction(0.0 * step), correction(-step)
-    return (
-        velocities + (ahead - behind) / (2.0 * step),
-        accelerations + (ahead - 2.0 * here + behind) / step**2,
-    )
-
-
-def _columns(names: Sequence[str], program: Program) -> list[int]:
-    """Return the columns of the arm's joints in a program."""
-    shape = program.positions.shape
-    if len(shape) != 2 or shape[1] != len(program.names):
-        raise InputError(f'{len(program.names)} joint names do not fit positions of shape {shape}')
-    for rates in (program.velocities, program.accelerations):
-        if rates is not None and rates.shape != shape:
-            raise InputError(f'rates of shape {rates.shape} do not fit positions of shape {shape}')
-        if rates is not None and not np.isfinite(rates).all():
-            raise InputError('velocities and accelerations must be finite numbers')
-    if program.accelerations is not None and program.velocities is None:
-        raise InputError('a program with accelerations needs velocities as well')
-    for name in names:
-        if program.names.count(name) > 1:
-            raise InputError(f'joint "{name}" comes twice in the program')
-    missing = [name for name in names if name not in program.names]
-    others = [name for name in program.names if name not in names]
-    if missing and others:
-        (strange,) = difflib.get_close_matches(missing[0], others, n=1, cutoff=0.0)
-        raise UnknownNameError('joint in the program', strange, names)
-    if missing:
-        raise InputError(f'the program has no values of {", ".join(missing)}')
-    return [program.names.index(name) for name in names]
-
-
-def _put(values: FloatArray, columns: Sequence[int], new: FloatArray) -> FloatArray:
-    """Return values (N, m) with some columns replaced."""
-    replaced = values.copy()
-    replaced[:, columns] = new
-    return replaced
 
 
 def _listed(joints: Sequence[tuple[str, str]]) -> str:

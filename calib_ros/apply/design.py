@@ -81,7 +81,7 @@ class Design(Shown):
         model = problem.model
         priors = problem.prior_sigmas
         structural = structurally_independent(model, problem.free, problem.kinds)
-        names = tuple(n for n in problem.free if n in structural or n in priors)
+        names: tuple[str, ...] = tuple(n for n in problem.free if n in structural or n in priors)
         scales = (1.0, 1.0)
         if result is None:
             model = _with_assumed_tool(model, kind.tool)

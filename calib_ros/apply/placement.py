@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from calib_ros.apply.workspace import CalibratedArm, Model, in_base
+from calib_ros.apply.workspace import in_base
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.identification.calibration import Calibration, Model
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
@@ -69,7 +70,7 @@ class Placements(Shown):
 
 
 def place(
-    arm: CalibratedArm,
+    arm: Calibration,
     task: FloatArray,
     aim: Aim = 'mean',
     model: Model = 'corrected',
@@ -81,7 +82,7 @@ def place(
 
     Parameters
     ----------
-    arm : CalibratedArm
+    arm : Calibration
         Before and after.
     task : (K, 4, 4)
         Poses of the target in the task's frame, whose axes are those of the base at turn 0.
@@ -128,21 +129,27 @@ def place(
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
     for _ in range(REFINEMENTS):
         step = 0.5 * step
-        best = grid[np.nanargmin(errors)]
-        around = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
-        near = np.column_stack([best[:3] + step * around, np.full(len(around), best[3])])
-        near[:, :3] = np.clip(near[:, :3], corners[0], corners[1])
-        more_errors, more_joints = search.errors(near)
-        grid, errors = np.concatenate([grid, near]), np.concatenate([errors, more_errors])
-        joints = np.concatenate([joints, more_joints])
+        near = _around(grid[np.nanargmin(errors)], step, corners)
+        more = search.errors(near)
+        grid, errors, joints = (
+            np.concatenate(both)
+            for both in zip((grid, errors, joints), (near, *more), strict=True)
+        )
     best = int(np.nanargmin(errors))
     return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
+
+
+def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:
+    """Return the placements (26, 4) a step (3,) away from the best (4,), within corners (2, 3)."""
+    steps = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
+    places = np.clip(best[:3] + step * steps, corners[0], corners[1])
+    return np.column_stack([places, np.full(len(places), best[3])])
 
 
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad]."""
 
-    def __init__(self, arm: CalibratedArm, task: FloatArray, aim: Aim, model: Model) -> None:
+    def __init__(self, arm: Calibration, task: FloatArray, aim: Aim, model: Model) -> None:
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
         self._chain = arm.commanded_by(model)
         self._base = self._chain.frame('base').matrix

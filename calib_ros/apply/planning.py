@@ -1,233 +1,26 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which poses to measure.
-
-A pose with the rows A (m, P) of information (`design.py`) is judged by a matrix of m x m:
-
-    d       ln det(M + A^T A) - ln det M = ln det(I + A C A^T)          (O1, Borm and Menq 1991)
-    task    tr V C - tr V (M + A^T A)^-1 = tr (I + A C A^T)^-1 A C V C A^T
-            with V the mean of J^T J over the poses of a task: tr V C is the mean squared error
-    o2-o5   observability indices (`identifiability.observability`), from eigenvalues
-
-Poses are chosen one by one, the best first, and then exchanged one by one while that helps
-(Fedorov 1972, Mitchell 1974). The indices o2 to o5 say nothing while M is singular: there the
-choice by `d` is where exchanges start.
-"""
+"""How many poses to measure, which, in what order, and what they promise."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from calib_ros.apply.candidates import travel_times, visit_order
-from calib_ros.apply.design import Candidates, Design, accuracy, information_of, predicted, times
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.apply.choice import Criterion, choose, efficiency
+from calib_ros.apply.design import Design, accuracy, predicted
+from calib_ros.errors import InputError
 from calib_ros.identification.observations import STILL
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
-Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
-CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
-Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
-"""Returns the worth (N,) of candidates from information (P, P) and their rows (N, m, P)."""
-
-RIDGE = 1e-9
-"""Information about everything, in that of an average candidate, that keeps M invertible."""
-SWEEPS = 20
-"""Most rounds of exchanges."""
-GAIN = 1e-9
-"""Least relative gain of an exchange."""
 RANDOM_DRAWS = 25
 """Random choices that a plan is compared with."""
 FIRST_COUNT = 25
 """Poses with which the search for the number that is needed begins."""
-
-
-def choose(
-    design: Design,
-    candidates: FloatArray,
-    count: int,
-    criterion: Criterion = 'd',
-    task: FloatArray | None = None,
-    apart: float = STILL,
-) -> NDArray[np.intp]:
-    """Choose the poses to measure.
-
-    Parameters
-    ----------
-    design : Design
-        What is to be identified and what is known about it.
-    candidates : (N, n)
-        Joint values [rad or m] that the arm may be moved to.
-    count : int
-        How many of them.
-    criterion : Criterion
-        What is to be large, by its name.
-    task : (T, n), optional
-        Joint values at which the arm is to be accurate, for the criterion `task`.
-    apart : float
-        Least distance of two poses: of the joint that moves most [rad or m].
-
-    Returns
-    -------
-    (count,)
-        Indices of the chosen, the best first: with the first of them alone most is determined.
-
-    Raises
-    ------
-    InputError
-        With fewer candidates than poses, at that distance from each other.
-
-    """
-    if count < 1:
-        raise ConfigError(f'at least one pose must be chosen, not {count}')
-    space = Candidates(design, candidates)
-    score = _score(space, criterion, task)
-    first = score if criterion == 'task' else _by_determinant
-    pick = _Pick(space, apart)
-    for _ in range(count):
-        pick.add(pick.best(first))
-    for _ in range(SWEEPS):
-        if not pick.exchange(score):
-            break
-    again = _Pick(space, apart)
-    for _ in range(count):
-        again.add(again.best(first, pick.chosen))
-    return np.array(again.chosen)
-
-
-class _Pick:
-    """The candidates chosen so far, and the information that they bring."""
-
-    def __init__(self, space: Candidates, apart: float) -> None:
-        self._joints, self._rows = space.joints, space.rows
-        self._start = space.known + RIDGE * np.eye(len(space.known))
-        self._apart = apart
-        self._near: list[NDArray[np.bool_]] = []
-        self._blocked = np.zeros(len(space.rows), dtype=np.intp)
-        self.information = self._start
-        self.chosen: list[int] = []
-
-    def best(self, score: Score, among: list[int] | None = None) -> int:
-        """Return the best candidate that is free to be chosen."""
-        worth = np.where(self._blocked > 0, -np.inf, score(self.information, self._rows))
-        index = np.arange(len(worth)) if among is None else np.array(among)
-        best = int(index[worth[index].argmax()])
-        if self._blocked[best]:
-            raise InputError(
-                f'only {len(self.chosen)} of {len(worth)} candidates are {self._apart:g} apart '
-                'from each other: give more candidates, or plan fewer poses'
-            )
-        return best
-
-    def add(self, index: int, place: int | None = None) -> None:
-        """Choose a candidate."""
-        near = np.abs(self._joints - self._joints[index]).max(axis=1) <= self._apart
-        place = len(self.chosen) if place is None else place
-        self.chosen.insert(place, index)
-        self._near.insert(place, near)
-        self._blocked += near
-        self.information = self.information + information_of(self._rows[index])
-
-    def exchange(self, score: Score) -> bool:
-        """Exchange every chosen candidate for the best one; return whether any was changed."""
-        rows = self._rows[self.chosen]
-        self.information = self._start + information_of(rows)  # no rounding left
-        changed = False
-        for place in range(len(self.chosen)):
-            old = self.chosen.pop(place)
-            self._blocked -= self._near.pop(place)
-            self.information = self.information - information_of(self._rows[old])
-            worth = np.where(self._blocked > 0, -np.inf, score(self.information, self._rows))
-            new = int(worth.argmax())
-            if worth[new] - worth[old] > GAIN * abs(worth[old]):
-                changed = True
-            else:
-                new = old
-            self.add(new, place)
-        return changed
-
-
-def _score(space: Candidates, criterion: Criterion, task: FloatArray | None) -> Score:
-    """Return the score of a criterion."""
-    if criterion not in CRITERIA:
-        raise UnknownNameError('criterion', criterion, CRITERIA)
-    if criterion == 'd':
-        return _by_determinant
-    if criterion == 'task':
-        if task is None:
-            raise ConfigError('the criterion "task" needs the poses of a task')
-        wanted = space.of_task(task)
-        return lambda information, rows: _by_task(information, rows, wanted)
-    return lambda information, rows: _by_index(information, rows, criterion, space.factor)
-
-
-def _by_determinant(information: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return ln det(I + A C A^T)."""
-    seen = times(rows, _root(information))
-    return np.asarray(np.linalg.slogdet(_with_unit(seen))[1])
-
-
-def _by_task(information: FloatArray, rows: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return tr (I + A C A^T)^-1 A C V C A^T."""
-    root = _root(information)
-    seen = times(rows, root)
-    spread = times(seen, root.T @ wanted @ root) @ np.swapaxes(seen, 1, 2)
-    return np.asarray(np.trace(np.linalg.solve(_with_unit(seen), spread), axis1=1, axis2=2))
-
-
-def _by_index(
-    information: FloatArray, rows: FloatArray, criterion: Criterion, factor: FloatArray
-) -> FloatArray:
-    """Return an observability index of M + A^T A, in sigma per metre or radian."""
-    back = times(rows, factor)
-    total = factor.T @ information @ factor + np.swapaxes(back, 1, 2) @ back
-    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
-    smallest, largest = singular[:, 0], singular[:, -1]
-    if criterion == 'o2':
-        return np.asarray(smallest / largest)
-    if criterion == 'o3':
-        return np.asarray(smallest)
-    if criterion == 'o4':
-        return np.asarray(smallest**2 / largest)
-    return np.asarray(1.0 / np.sum(1.0 / singular, axis=1))
-
-
-def _root(information: FloatArray) -> FloatArray:
-    """Return L (P, P) with L L^T = M^-1."""
-    lower = linalg.cholesky(information, lower=True)
-    return np.asarray(linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
-
-
-def _with_unit(seen: FloatArray) -> FloatArray:
-    """Return I + Y Y^T (N, m, m) of (N, m, P)."""
-    return np.asarray(np.eye(seen.shape[1]) + seen @ np.swapaxes(seen, 1, 2))
-
-
-def efficiency(
-    design: Design, candidates: FloatArray, chosen: NDArray[np.intp], task: FloatArray | None
-) -> float:
-    """Return a lower bound of how good a choice is against the best of as many candidates.
-
-    For the criterion `d`, or `task` with the poses of one, as a share of poses: with 0.9 even the
-    best choice would need 90 % of them. Both criteria are convex, and the tangent at the choice
-    (Kiefer and Wolfowitz 1960) bounds what the candidates with the steepest slopes would bring.
-    """
-    space = Candidates(design, candidates)
-    ridge = RIDGE * np.eye(len(space.known))
-    root = _root(space.known + information_of(space.rows[chosen]) + ridge)
-    slope = root @ root.T
-    if task is not None:
-        slope = slope @ space.of_task(task) @ slope
-    each = np.einsum('nmp,nmp->n', times(space.rows, slope), space.rows)
-    start = float(np.sum(slope * space.known))
-    steepest = np.sort(each)[-len(chosen) :]
-    return float((start + each[chosen].sum()) / (start + steepest.sum()))
 
 
 @dataclass(frozen=True, eq=False)

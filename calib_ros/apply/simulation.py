@@ -16,6 +16,7 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
 
@@ -42,10 +43,10 @@ def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
     names = [
         name
         for name in structurally_independent(chain, chain.parameter_names)
-        if name.partition('.')[0] not in ('base', 'tool')
+        if Parameter(name).owner not in ('base', 'tool')
     ]
     sizes = [
-        cell.length_error if name.endswith(('.a', '.d')) else cell.angle_error for name in names
+        cell.length_error if Parameter(name).is_length else cell.angle_error for name in names
     ]
     offsets = dict(zip(names, rng.normal(scale=sizes), strict=True))
     return replace(

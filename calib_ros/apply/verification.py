@@ -8,17 +8,8 @@ measured - N(q). Both are known from the joint values that the controller report
 program is known as it was before its correction, the pose wanted is N(q_commanded), and a
 correction that did not arrive shows as well.
 
-The figure is the RMS position error over poses like those measured. Of K configurations with
-errors e_k the sum of squares is taken for theta / nu chi2(nu) (Satterthwaite 1946) with
-
-    S = mean of e_k e_k^T        nu = K min((tr S)^2 / tr S^2, 2 / c^2)
-
-between K (all errors in one direction) and 3 K (in all directions alike), and fewer where the
-errors are larger at some places than at others, as compliance and eccentricities leave them: c^2
-is the variance of the squared errors over the square of their mean, taken together with that of
-POOLED errors in one direction (2), and larger by its own standard deviation. Few configurations
-make nu too small rather than too large. Measurements of one configuration share its error and
-count for one. The limits of the RMS are one-sided, each at the confidence wanted:
+The figure is the RMS position error over poses like those measured, with its limits
+(`confidence.py`):
 
     PASS        the upper limit is within the tolerance
     FAIL        the lower limit is beyond it
@@ -38,16 +29,17 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
-from calib_ros.apply.workspace import CalibratedArm
+from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations, configurations
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -56,20 +48,35 @@ LEAST = 5
 """Configurations from which a verdict is given, those of a fitted frame not counted."""
 MOST = 10_000
 """Configurations up to which it is said how many would decide."""
-POOLED = 2
-"""Configurations with errors in one direction that the scatter of the squares is pooled with."""
-BASE_SHARE = 2
-"""Configurations whose errors a new base frame takes up: it has six freedoms, each has three."""
-TOOL_SHARE = 1
-"""The same of a new tool frame: its turn does not move the target."""
+LOST = {'base': 2, 'tool': 1}
+"""Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
+three; the turn of a tool does not move the target."""
 FAR = 0.1
 """Distance [rad or m] from commanded joint values that no correction makes."""
 UNIT = (1e-3, 1e-3)
 """Sigmas [m, rad] that weigh all samples alike."""
-MOST_LINES = 20
-"""Configurations up to which each has a line in the report."""
+LISTED = 20
+"""Configurations up to which each is told of."""
 MOVED = 0.3
 """Share of the error that is left without one common motion, below which that is suspected."""
+
+
+@dataclass(frozen=True)
+class Attained:
+    """Accuracy before and after [mm] and repeatability [mm] of a configuration (ISO 9283)."""
+
+    cycles: int
+    before: float
+    after: float
+    repeatability: float | None
+
+    @classmethod
+    def of(cls, before: FloatArray, after: FloatArray) -> Attained:
+        """Return the figures of errors (N, 3) [mm]."""
+        first, last = (float(np.linalg.norm(each.mean(axis=0))) for each in (before, after))
+        apart = np.linalg.norm(after - after.mean(axis=0), axis=1)
+        again = float(apart.mean() + 3.0 * apart.std(ddof=1)) if len(after) > 1 else None
+        return cls(len(after), first, last, again)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -119,9 +126,20 @@ class Verification(Shown):
         """Return how many different configurations were measured."""
         return int(self.group.max()) + 1
 
+    @property
+    def each(self) -> tuple[Attained, ...]:
+        """Return what was attained at each configuration; nothing with more than LISTED."""
+        if self.configurations > LISTED:
+            return ()
+        both = (self.comparison.before.position, self.comparison.after.position)
+        return tuple(
+            Attained.of(*(1e3 * errors[self.group == k] for errors in both))
+            for k in range(self.configurations)
+        )
+
 
 def verify(
-    arm: CalibratedArm,
+    arm: Calibration,
     sets: Sequence[Observations],
     tolerance: float | None,
     confidence: float = 0.95,
@@ -133,7 +151,7 @@ def verify(
 
     Parameters
     ----------
-    arm : CalibratedArm
+    arm : Calibration
         Before and after.
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
@@ -164,8 +182,8 @@ def verify(
             f'{tolerance} and {confidence}'
         )
     for each in sets:
-        _check(arm.after, each)
-    before, after = arm.before, arm.after
+        _check(arm.chain, each)
+    before, after = arm.before, arm.chain
     wanted = sets
     if commanded is not None:
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
@@ -176,31 +194,22 @@ def verify(
     )
     comparison = replace(compare(before, after, sets), after=compare(before, after, wanted).after)
     group = configurations(np.concatenate([each.joints for each in sets]))
-    moments = _moments(comparison.after.position, group)
-    lost = BASE_SHARE * new_base + TOOL_SHARE * new_tool
-    count = len(moments)
+    moments = moments_of(comparison.after.position, group)
+    fitted = ('base',) * new_base + ('tool',) * new_tool
+    count, lost = len(moments), sum(LOST[frame] for frame in fitted)
     if count - lost < LEAST:
         raise InputError(
             f'{count} configurations were measured, at least {LEAST + lost} are needed: five are '
             'usual (calib_ros plan --iso9283)'
         )
-    spread = moments.sum(axis=0) / (count - lost)
-    freedom = _freedom(moments)
-    rms = float(np.sqrt(np.trace(spread)))
-
-    shaped = compare(before, _rebased(after, wanted), wanted).after
-    left = np.trace(_moments(shaped.position, group).sum(axis=0)) / max(count - BASE_SHARE, 1)
-    common = 1.0 if new_base else float(np.sqrt(left)) / rms
+    rms = _rms(moments, lost)
     numbers = np.unique(np.geomspace(count, MOST, 200).astype(int))
-    lower, upper = rms_limits(rms, freedom * (numbers - lost), confidence)
-    verdict: Verdict = 'JUDGED'
-    needed = None
-    if tolerance is not None:
-        decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
-        needed = int(numbers[decided[0]]) if decided.size else None
-        verdict = 'PASS' if upper[0] <= tolerance else 'FAIL'
-        if lower[0] <= tolerance < upper[0]:
-            verdict = 'UNDECIDED'
+    lower, upper = rms_limits(rms, freedom_of(moments) * (numbers - lost), confidence)
+    verdict, needed = _decided(tolerance, lower, upper, numbers)
+    common = 1.0
+    if not new_base:
+        shaped = compare(before, _rebased(after, wanted), wanted).after
+        common = _rms(moments_of(shaped.position, group), LOST['base']) / rms
     return Verification(
         comparison,
         tolerance,
@@ -213,39 +222,26 @@ def verify(
         needed,
         common,
         commanded is not None,
-        ('base',) * new_base + ('tool',) * new_tool,
+        fitted,
     )
 
 
-def rms_limits(
-    rms: float, freedom: FloatArray, confidence: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the one-sided limits (N,) of an RMS found with (N,) degrees of freedom."""
-    lower, upper = (
-        rms / np.sqrt(special.chdtri(freedom, 1.0 - level) / freedom)
-        for level in (confidence, 1.0 - confidence)
-    )
-    return lower, upper
+def _rms(moments: FloatArray, lost: int) -> float:
+    """Return the RMS error [m] of configurations, some of which a fitted frame took up."""
+    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(len(moments) - lost, 1)))
 
 
-def rms_interval(
-    errors: FloatArray, group: NDArray[np.intp], confidence: float
-) -> tuple[float, float]:
-    """Return the one-sided limits [m] of the RMS of errors (N, 3) over poses like these.
-
-    `group` (N,) are the configurations, of which each counts for one. With a single one nothing
-    is known: (0, inf).
-    """
-    _, place = np.unique(group, return_inverse=True)
-    moments = _moments(errors, place)
-    if len(moments) < 2:
-        return 0.0, np.inf
-    rms = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
-    if rms == 0.0:
-        return 0.0, 0.0
-    freedom = np.array([_freedom(moments) * len(moments)])
-    lower, upper = rms_limits(rms, freedom, confidence)
-    return float(lower[0]), float(upper[0])
+def _decided(
+    tolerance: float | None, lower: FloatArray, upper: FloatArray, numbers: NDArray[np.intp]
+) -> tuple[Verdict, int | None]:
+    """Return the verdict by the first limits, and which of the numbers of poses would decide."""
+    if tolerance is None:
+        return 'JUDGED', None
+    decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
+    needed = int(numbers[decided[0]]) if decided.size else None
+    if lower[0] <= tolerance < upper[0]:
+        return 'UNDECIDED', needed
+    return ('PASS' if upper[0] <= tolerance else 'FAIL'), needed
 
 
 def _check(chain: Chain, observations: Observations) -> None:
@@ -283,9 +279,9 @@ def _in_new_frames(
         chain = _rebased(chain, sets)
     if not new_tool:
         return chain
-    names = [f'{each.tool}.{axis}' for each in sets for axis in 'xyz']
+    names = [name for each in sets for name in parameters_of(each.tool)[:3]]
     if new_base:
-        names = [f'{each.base}.{kind}' for each in sets for kind in FRAME_KINDS] + names
+        names = [name for each in sets for name in parameters_of(each.base)] + names
     unoriented = [replace(each, oriented=np.zeros(len(each), bool)) for each in sets]
     system = System(tuple(Samples(replace(each, covariance=None), *UNIT) for each in unoriented))
     names = list(dict.fromkeys(names))
@@ -322,24 +318,6 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
     return chain
 
 
-def _freedom(moments: FloatArray) -> float:
-    """Return the degrees of freedom of one of the configurations with moments (K, 3, 3)."""
-    spread, count = moments.mean(axis=0), len(moments)
-    squares = np.trace(moments, axis1=1, axis2=2)
-    scatter = squares.var(ddof=1) / squares.mean() ** 2
-    scatter = ((count - 1) * scatter + 2.0 * POOLED) / (count - 1 + POOLED)
-    scatter *= 1.0 + np.sqrt(scatter / count)
-    return float(min(np.trace(spread) ** 2 / np.trace(spread @ spread), 2.0 / scatter))
-
-
-def _moments(errors: FloatArray, group: NDArray[np.intp]) -> FloatArray:
-    """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
-    each = errors[:, :, np.newaxis] * errors[:, np.newaxis]
-    sums = np.zeros((int(group.max()) + 1, 3, 3))
-    np.add.at(sums, group, each)
-    return sums / np.bincount(group)[:, np.newaxis, np.newaxis]
-
-
 def in_words(found: Verification) -> str:
     """Return the verdict with all that it rests on."""
     before, after = found.comparison.figures
@@ -355,15 +333,25 @@ def in_words(found: Verification) -> str:
             f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
             f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
         )
-    lines += _by_configuration(found)
-    if found.fitted:
-        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
+    if found.each:
+        lines.append('  pose   measured   before    after   repeatability (mean + 3 sigma)')
+    for k, pose in enumerate(found.each):
+        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        lines.append(f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}')
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
     wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
     lines.append(
         f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
         f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
     )
+    return '\n'.join([*lines, *remarks(found)])
+
+
+def remarks(found: Verification) -> list[str]:
+    """Return what to know besides the figures, and what to do."""
+    lines = []
+    if found.fitted:
+        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     if not found.by_program:
         lines.append(
             'this is about the calibration: whether its correction arrives at the arm shows only '
@@ -377,26 +365,5 @@ def in_words(found: Verification) -> str:
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
             'the error would be left: was the measuring device moved? If it stands elsewhere on '
             'purpose, --new-base fits its frame, and --new-tool that of another target'
-        )
-    return '\n'.join(lines)
-
-
-def _by_configuration(found: Verification) -> list[str]:
-    """Return the accuracy and repeatability (ISO 9283) of a few configurations, line by line."""
-    if found.configurations > MOST_LINES:
-        return []
-    lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
-    for k in range(found.configurations):
-        before, after = (
-            1e3 * each.position[found.group == k]
-            for each in (found.comparison.before, found.comparison.after)
-        )
-        apart = np.linalg.norm(after - after.mean(axis=0), axis=1)
-        again = ''
-        if len(after) > 1:
-            again = f'{apart.mean() + 3.0 * apart.std(ddof=1):8.4f}'
-        lines.append(
-            f'  {k + 1:4} {len(after):10} {np.linalg.norm(before.mean(axis=0)):8.4f} '
-            f'{np.linalg.norm(after.mean(axis=0)):8.4f} {again}'
         )
     return lines

@@ -5,17 +5,17 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from calib_ros.atomic import whole_folder
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
     from calib_ros.files.foreign import Foreign
     from calib_ros.kinematics.chain import Chain
     from calib_ros.report.page import Origin, Report
@@ -25,34 +25,111 @@ NOT_ACCEPTED = 3
 """Exit status when the input was used, but what came out does not do."""
 
 
-def add_chain(parser: argparse.ArgumentParser) -> None:
+Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
+SETTINGS = {
+    'the fit': ('model', 'fixed', 'priors', 'loss', 'folds'),
+    'how the device measures': ('sigma_position', 'sigma_orientation', 'frame_id'),
+    'what is not accepted': ('largest_length', 'largest_angle', 'largest_error'),
+    'bags: what is read': ('joint_topics', 'sources', 'joint_names', 'delay'),
+    'bags: how samples are taken': (
+        *('mode', 'still', 'settle', 'shortest_stop', 'longest_stop', 'max_gap', 'lateness'),
+        *('joint_buffer', 'pose_buffer', 'wanted_accuracy'),
+    ),
+}
+"""Settings by the groups in which a help shows them."""
+OF_BAGS = (
+    *SETTINGS['how the device measures'],
+    *SETTINGS['bags: what is read'],
+    *SETTINGS['bags: how samples are taken'],
+)
+"""Settings by which samples are made of a bag."""
+
+
+def add_chain(parser: Group, default: str | None = None, needed: bool = True) -> None:
     """Add the option that names the nominal robot."""
-    parser.add_argument(
-        '--chain', required=True, help='chain file, URDF, or a robot by its name (ur10e, ...)'
+    action = parser.add_argument(
+        '--chain',
+        default=default,
+        required=needed and default is None,
+        metavar='ROBOT',
+        help='its name (calib_ros robots), a chain file, or a URDF',
     )
+    action.completer = _robots  # type: ignore[attr-defined]
+
+
+def _robots(prefix: str, **_: Any) -> list[str]:
+    """Return what may be meant by the beginning of the name of a robot or file."""
+    from glob import glob
+
+    from calib_ros.kinematics.chain_file import shipped_robots
+
+    return [*shipped_robots(), *glob(f'{prefix}*')]
 
 
 def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
-    """Add options for the settings of some names, or for all."""
+    """Add options for the settings of some names, or for all, in their groups."""
     from calib_ros.settings import Settings
 
-    for item in fields(Settings):
-        if names and item.name not in names:
-            continue
-        many = isinstance(item.default, tuple)
-        parser.add_argument(
-            f'--{item.name.replace("_", "-")}',
-            type=str if many else type(item.default),
-            action='append' if many else 'store',
-            default=[] if many else item.default,
-            help=item.metadata['text'],
-        )
+    known = {item.name: item for item in fields(Settings)}
+    for title, members in SETTINGS.items():
+        wanted = [known[name] for name in members if not names or name in names]
+        group = parser.add_argument_group(title) if wanted else parser
+        for item in wanted:
+            many = isinstance(item.default, tuple)
+            kind = str if many else type(item.default)
+            group.add_argument(
+                f'--{item.name.replace("_", "-")}',
+                type=kind,
+                action='append' if many else 'store',
+                default=[] if many else item.default,
+                metavar={float: 'X', int: 'N'}.get(kind, 'NAME'),
+                help=item.metadata['text'],
+            )
+
+
+def add_calibration(parser: Group) -> None:
+    """Add the option that names a calibration."""
+    parser.add_argument(
+        '--calibration',
+        type=Path,
+        required=True,
+        metavar='RESULT',
+        help='folder of identify --out, or calibration.yaml alone',
+    )
+
+
+def add_out(
+    parser: Group,
+    text: str,
+    what: str = 'FOLDER',
+    needed: bool = False,
+    default: Path | None = None,
+) -> None:
+    """Add the options that say where results go."""
+    add = parser.add_argument
+    add('--out', type=Path, default=default, required=needed, metavar=what, help=text)
+    add('--force', action='store_true', help='replace what is there already')
+
+
+def add_storage(parser: Group) -> None:
+    """Add the option that says how a bag is stored."""
+    parser.add_argument(
+        '--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of the bag'
+    )
+
+
+def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
+    """Refuse to write what is there already, before any work is done."""
+    for path in paths:
+        if path.exists() and not options.force:
+            raise InputError(f'{path} exists already: choose another name or --force')
 
 
 def add_layout(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say how a table of others is laid out (docs/tables.md)."""
-    group = parser.add_argument_group('tables of others (docs/tables.md)')
-    add = group.add_argument
+    """Add the options that say how a table of others is laid out."""
+    add = parser.add_argument_group(
+        'tables of others (docs/tables.md); what is not given is guessed'
+    ).add_argument
     add('--preset', default='', metavar='NAME', help='a layout by name, or your own .yaml')
     add(
         '--columns',
@@ -61,17 +138,32 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
         metavar='OURS=THEIRS,...',
         help='q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints',
     )
-    add('--length', default='', help='unit of lengths: m, cm, mm, um, in')
-    add('--angle', default='', help='unit of angles, joint values included: rad, deg')
-    add('--joint-angle', default='', help='unit of joint values where it is another one')
+    add('--length', default='', metavar='UNIT', help='of lengths: m, cm, mm, um, in')
+    add(
+        '--angle',
+        default='',
+        metavar='UNIT',
+        help='unit of angles, joint values included: rad, deg',
+    )
+    add(
+        '--joint-angle',
+        default='',
+        metavar='UNIT',
+        help='unit of joint values where it is another one',
+    )
     add('--euler', default='', metavar='ZYX', help='rx ry rz are Euler angles; zyx: fixed axes')
     add('--quaternion', default='', metavar='wxyz', help='order of qx qy qz qw, else xyzw')
     add('--rotation-vector', action='store_true', help='rx ry rz are a rotation vector')
     add('--inverse', action='store_true', help='the poses are those of the device in the target')
     add('--shift', type=int, default=0, metavar='ROWS', help='joint values stand so much below')
-    add('--separator', default='', help='comma, semicolon, tab or space; guessed if not given')
-    add('--decimal', default='', help='point or comma; guessed if not given')
-    add('--sheet', default='', help='of a workbook (.xlsx), else its first')
+    add(
+        '--separator',
+        default='',
+        metavar='NAME',
+        help='comma, semicolon, tab or space; guessed if not given',
+    )
+    add('--decimal', default='', metavar='NAME', help='point or comma')
+    add('--sheet', default='', metavar='NAME', help='of a workbook (.xlsx), else its first')
     add('--joints', type=Path, metavar='FILE', help='log of the joint values, row by row')
     add('--joints-preset', default='', metavar='NAME', help='layout of that log')
 
@@ -108,6 +200,11 @@ def settings_of(options: argparse.Namespace) -> Settings:
     return Settings(**given)
 
 
+def sessions_of(options: argparse.Namespace) -> tuple[str, ...]:
+    """Return the sessions of a table that are asked for."""
+    return tuple(options.session.split(',')) if options.session else ()
+
+
 def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContextManager[Path]:
     """Return the folder --out to be made in a `with` block; see `whole_folder`.
 
@@ -117,14 +214,17 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContex
     return whole_folder(options.out, names, overwrite=options.force)
 
 
-def add_identity(parser: argparse.ArgumentParser) -> None:
-    """Add the options by which a report says what it is of."""
+def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
+    """Add the options by which a report says what it is of; `pdf` adds that for paper."""
+    add = parser.add_argument_group('for the report').add_argument
     for name, text in (
-        ('operator', 'who measured, for the report'),
-        ('serial', 'serial number of the robot, for the report'),
-        ('device', 'measuring device and its serial number, for the report'),
+        ('operator', 'who measured'),
+        ('serial', 'serial number of the robot'),
+        ('device', 'measuring device and its serial number'),
     ):
-        parser.add_argument(f'--{name}', default='', metavar='NAME', help=text)
+        add(f'--{name}', default='', metavar='NAME', help=text)
+    if pdf:
+        add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
 
 
 def origin_of(
@@ -135,19 +235,25 @@ def origin_of(
 
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    told = (options.operator, options.serial, options.device)
-    return Origin(inputs_of(known), *told, settings=settings)
+    names = ('operator', 'serial', 'device')
+    told = {name: getattr(options, name, '') for name in names}
+    return Origin(inputs_of(known), settings=settings, **told)
 
 
-def page_of(report: Report, name: str = 'report.html') -> dict[str, str]:
-    """Return a report as the content of a file, by its name; nothing where its extra is missing.
+def page_of(
+    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
+) -> dict[str, str | bytes]:
+    """Return a report as the content of files by name; nothing where an extra is missing.
 
-    That is said once.
+    That is said once. `pdf` asks for report.pdf as well.
     """
-    from calib_ros.report.page import MISSING, render
+    from calib_ros.report.page import MISSING, MISSING_PDF, on_paper, render
 
-    text = render(report)
-    if text is None:
-        print(f'note: {MISSING}', file=sys.stderr)
-        return {}
-    return {name: text}
+    found: dict[str, str | bytes | None] = {name: render(report)}
+    if found[name] is None:
+        screen.warn(MISSING, 'note')
+    if pdf:
+        found['report.pdf'] = on_paper(report)
+        if found['report.pdf'] is None:
+            screen.warn(MISSING_PDF, 'note')
+    return {each: content for each, content in found.items() if content is not None}

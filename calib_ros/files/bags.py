@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
@@ -39,6 +39,7 @@ from calib_ros.files.salvage import (
     unpacked_files,
 )
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
@@ -86,15 +87,17 @@ class Replayed:
             return f'read {self.read} messages of the bag; how many are lost is not known'
         return f'read {self.read} of {self.recorded} messages of the bag'
 
-    def refusals(self, account: Account, largest_loss: float) -> tuple[str, ...]:
+    def refusals(self, account: Account, largest_loss: float) -> tuple[Reason, ...]:
         """Return why a result must not be accepted: more was lost than a share allows.
 
         Lost is what could not be read and, of joint states and measurements each, what was
         dropped for its stamp or for want of room. What the device did not see is not.
         """
         if self.recorded is None and largest_loss < 1.0:
-            return (f'how much of the bag is lost is not known, {ALLOW} 1',)
-        lost = {'of the messages could not be read': _share(self.recorded, self.read)}
+            text = f'how much of the bag is lost is not known, {ALLOW} 1'
+            return (Reason(Rule.UNKNOWN_LOSS, text),)
+        share = _share(self.recorded, self.read)
+        lost = {'of the messages could not be read': (Rule.UNREADABLE, share)}
         for name, all_of_them in (('joints', account.joint_states), ('poses', account.poses)):
             dropped = sum(
                 count
@@ -102,10 +105,10 @@ class Replayed:
                 if cause.startswith(name) and _LOSS.search(cause) and not _TWICE.search(cause)
             )
             cause = f'of the {name} were dropped for their stamps or for want of room'
-            lost[cause] = _share(all_of_them, all_of_them - dropped)
+            lost[cause] = (Rule.DROPPED, _share(all_of_them, all_of_them - dropped))
         return tuple(
-            f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}'
-            for cause, share in lost.items()
+            Reason(rule, f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}')
+            for cause, (rule, share) in lost.items()
             if share > largest_loss
         )
 
@@ -115,7 +118,9 @@ def _share(expected: int | None, found: int) -> float:
     return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
-def replay(path: Path, session: CalibrationSession) -> Replayed:
+def replay(
+    path: Path, session: CalibrationSession, told: Callable[[float], None] = lambda share: None
+) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
     Parameters
@@ -124,15 +129,19 @@ def replay(path: Path, session: CalibrationSession) -> Replayed:
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
         Takes the messages; its settings name topics where the types leave a choice.
+    told : callable, optional
+        Called with the share of the messages that are read.
 
     """
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
     with unpacked_files(path) as folder:
-        return _replay(path, folder, session)
+        return _replay(path, folder, session, told)
 
 
-def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
+def _replay(
+    path: Path, folder: Path, session: CalibrationSession, told: Callable[[float], None]
+) -> Replayed:
     """Feed the files in a folder, which are those of a bag or were unpacked from it."""
     library = _rosbag2()
     try:
@@ -150,7 +159,12 @@ def _replay(path: Path, folder: Path, session: CalibrationSession) -> Replayed:
         streams, deserialise = _chosen(session, available, partial(read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
-        count, problem = _feed(session, read(reader, streams), deserialise)
+        count, problem = _feed(
+            session,
+            read(reader, streams),
+            deserialise,
+            lambda count: told(count / max(expected, count, 1)),
+        )
     if problem is not None and count == 0:
         found = salvage(folder)
         if found is not None:
@@ -410,8 +424,9 @@ def _feed(
     session: CalibrationSession,
     messages: Iterator[tuple[Stream, bytes]],
     deserialise: Deserialise,
+    told: Callable[[int], None] = lambda count: None,
 ) -> tuple[int, str | None]:
-    """Feed serialised messages; return how many, and what is wrong with the others if any."""
+    """Feed serialised messages, and tell how many so far; return that and what is wrong if any."""
     count, problem, ended = 0, None, False
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
@@ -426,6 +441,7 @@ def _feed(
         if len(usable) < len(batch):
             problems.append(f'messages without data, or of more than {LARGEST_MESSAGE} bytes')
         problem = (problem, *problems)[-1]
+        told(count)
     session.finish()
     return count, problem
 

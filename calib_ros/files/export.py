@@ -33,8 +33,9 @@ from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import Samples, System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import DH_KINDS, Chain, Frame, Joint, JointType
+from calib_ros.kinematics.chain import Chain, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash
+from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
 EXACT = 1e-9
@@ -282,14 +283,12 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         frames=(),
         effects=(),
     )
-    driven = {
-        f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}' for joint in start.joints
-    }
+    driven = {joint.driven for joint in start.joints}
     names = [
         name
         for name in start.parameter_names
         if start.owns_frame(name)
-        or name.partition('.')[2] in kinds
+        or Parameter(name).kind in kinds
         or ('zero' in kinds and name in driven)
     ]
     joints = joints[:: max(1, len(joints) // FITTED)]

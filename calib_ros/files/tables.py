@@ -3,8 +3,9 @@
 """Tables of samples (CSV), described in docs/formats.md: measured elsewhere, or a journal.
 
 Joint values are in q1 ... qn. What was measured shows in the cells of the row that are filled: a
-pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), or that
-a ball sat in a socket (location, socket), whose place is not known. Rows of all kinds may stand in
+pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), that a
+ball sat in a socket (location, socket) or that a plane was touched (plane), whose places are not
+known. Rows of all kinds may stand in
 one table.
 """
 
@@ -213,6 +214,15 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     return [*row, split or ('test' if sample.validation else 'train')]
 
 
+def table_text(samples: Sequence[Sample], joints: int) -> str:
+    """Return samples as a table, with the columns that any of them fills."""
+    names = columns(joints)
+    rows = [cells(sample) for sample in samples]
+    used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
+    lines = [','.join(row[k] for k in used) for row in (names, *rows)]
+    return '\n'.join(lines) + '\n'
+
+
 class _Reader:
     """Turns rows into samples."""
 
@@ -224,7 +234,7 @@ class _Reader:
         self._places: dict[tuple[str, str, str], Sample] = {}
         self._lines: dict[Sample, int] = {}
         needed = [f'q{k + 1}' for k in range(joints)]
-        if not {'distance', 'socket'} & self._header or set(POSITION) & self._header:
+        if not {'distance', 'socket', 'plane'} & self._header or set(POSITION) & self._header:
             needed += POSITION
         if self._quaternion:
             needed += QUATERNION
@@ -237,7 +247,8 @@ class _Reader:
             raise InputError(
                 f'{path} has no column {", ".join(missing)}; expected {expected} '
                 f'and, with orientation, {", ".join(QUATERNION)} as well (or '
-                f'distance, or location and socket); found {", ".join(header) or "nothing"}. '
+                'distance, plane, or location and socket); found '
+                f'{", ".join(header) or "nothing"}. '
                 'Columns of other names: --columns q1=NAME,x=NAME,...'
             )
 
@@ -324,7 +335,7 @@ class _Reader:
 
     def _measured(self, line: int, row: Row, plain: Sample) -> Sample:
         """Return the sample with what was measured."""
-        kinds = [name for name in ('x', 'distance', 'socket') if row.get(name)]
+        kinds = [name for name in ('x', 'distance', 'socket', 'plane') if row.get(name)]
         if len(kinds) > 1:
             raise InputError(
                 f'{self._path}, line {line} has both {" and ".join(kinds)}: give each kind of '
@@ -335,6 +346,8 @@ class _Reader:
             if not device and 'x' in self._header:  # the origin of a tracker is another one
                 device = 'distance'
             return replace(plain, distance=self._number(line, row, 'distance'), device=device)
+        if kinds == ['plane']:
+            return replace(plain, plane=True, distance=0.0, device=from_cell(str(row['plane'])))
         if kinds == ['socket']:
             place = f'{row["location"]}_{row["socket"]}'
             sample = replace(plain, socket=True, device=place)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.apply.compensation import Program
+from calib_ros.apply.program import Program
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_lines, parse_yaml, read_text

@@ -39,8 +39,9 @@ from scipy.linalg import lapack
 
 from calib_ros.identification.leastsquares import System, normal_equations
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -75,8 +76,8 @@ def group_of(chain: Chain, name: str) -> str | None:
     """Return the group of parameters whose errors are of one size; None for frames."""
     if chain.owns_frame(name):
         return None
-    if name.partition('.')[2] in DH_KINDS:
-        return 'length' if is_length(name) else 'angle'
+    if Parameter(name).of_dh:
+        return 'length' if Parameter(name).is_length else 'angle'
     group = effects.group_of(name)
     return group if group in BENDING else 'drive'
 
@@ -219,13 +220,15 @@ def posterior_of(
 def _lengths(chain: Chain, system: System) -> dict[str, float]:
     """Return all lengths [m] that positions are made of; none where no device has a scale.
 
-    A ball in a socket is where it is, and a prismatic joint has a length of its own.
+    Balls in sockets and touched planes are where they are, and a prismatic joint has a length of
+    its own.
     """
-    sockets = any(samples.observations.socket for samples in system.sets)
-    if sockets or any(joint.type == 'prismatic' for joint in chain.joints):
+    sets = [samples.observations for samples in system.sets]
+    touching = any(each.socket or each.plane for each in sets)
+    if touching or any(joint.type == 'prismatic' for joint in chain.joints):
         return {}
-    names = [f'{frame}.{kind}' for frame in chain.frame_names for kind in FRAME_KINDS[:3]]
-    names += [f'{joint.name}.{kind}' for joint in chain.joints for kind in ('a', 'd')]
+    names = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
+    names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
     return {name: chain.value(name) for name in names}
 
 

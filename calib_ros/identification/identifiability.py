@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import of_lens
+from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -47,7 +47,7 @@ def independent(
 
     """
     least = np.where(
-        [name.partition('.')[2] in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
+        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
     ) * np.linalg.norm(factor, axis=0)
     basis = np.zeros(factor.shape)
     kept: list[str] = []
@@ -77,6 +77,7 @@ class Kind:
     base: str = 'base'
     tool: str = 'tool'
     socket: bool = False
+    plane: bool = False
 
     @property
     def rows(self) -> int:
@@ -96,9 +97,9 @@ def structurally_independent(
     not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
     minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
     by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
-    poses: turning the whole cell about it shows nowhere else than in residuals. A board tells its
-    pose in a camera, and images of it from anywhere tell the camera's lens (Zhang 2000). `extra`
-    returns further equations at a chain.
+    poses: turning the whole cell about it shows nowhere else than in residuals. So does the size
+    of a cell that touches planes alone. A board tells its pose in a camera, and images of it from
+    anywhere tell the camera's lens (Zhang 2000). `extra` returns further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -111,15 +112,17 @@ def structurally_independent(
     velocity = rng.normal(size=joints.shape)
     for number, kind in enumerate(kinds):
         posed = joints
-        if kind.socket:
+        if kind.socket or kind.plane:
             posed, place = _meeting(anywhere, np.roll(joints, number, axis=0), kind)
-            shift = {f'{kind.base}.{axis}': -x for axis, x in zip('xyz', place, strict=True)}
+            shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
         came, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
         jacobian = model.jacobian(posed, came, rates)
         if kind.distance:
             line = anywhere.forward(posed, came, kind.base, kind.tool)[:, :3, 3]
+            if kind.plane:
+                line[:] = [0.0, 0.0, 1.0]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
@@ -127,7 +130,7 @@ def structurally_independent(
         rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
     if extra is not None:
         rows = np.concatenate([rows, extra(anywhere, names)[0]])
-    lens = [k for k, name in enumerate(names) if of_lens(name)]
+    lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     rows = np.concatenate([rows, np.eye(len(names))[lens]])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
@@ -141,20 +144,22 @@ MEETING_STEPS = 100
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
     """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first; the others are led there by damped Gauss-Newton steps. Those few
-    that do not arrive, stretched, are left out.
+    It is that of the first, of planes the height in the middle; the others are led there by damped
+    Gauss-Newton steps. Those few that do not arrive, stretched, are left out.
     """
-    driven = [f'{j.name}.{"theta" if j.type == "revolute" else "d"}' for j in chain.joints]
+    free = [2] if kind.plane else [0, 1, 2]
+    driven = [j.driven for j in chain.joints]
     model = ErrorModel(chain, driven, kind.base, kind.tool)
     signs = np.array([joint.sign for joint in chain.joints], dtype=float)
-    wanted = chain.forward(joints[:1], base=kind.base, tool=kind.tool)[0, :3, 3]
+    places = chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+    wanted = np.array([0.0, 0.0, np.median(places[:, 2])]) if kind.plane else places[0]
     for _ in range(MEETING_STEPS):
-        left = wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
+        left = (wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3])[:, free]
         met = np.abs(left).max(axis=1) < MEETING
         if met.all():
             break
-        jacobian = model.jacobian(joints)[:, :3] * signs
-        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(3)
+        jacobian = model.jacobian(joints)[:, free] * signs
+        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(len(free))
         step = np.linalg.solve(square, left[..., np.newaxis])
         joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
     return joints[met], wanted

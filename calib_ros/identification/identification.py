@@ -31,6 +31,7 @@ from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Learned, Problem
+from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import KNOWN, Region, region_of
 from calib_ros.identification.robust import OUTLIER, Robust, reweighted, thorough_fit
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
@@ -38,7 +39,7 @@ from calib_ros.identification.start import start_frames
 from calib_ros.identification.steps import Step, find_step
 from calib_ros.identification.validation import (
     Comparison,
-    Parameter,
+    ParameterRow,
     compare,
     refusals,
     remarks,
@@ -46,8 +47,9 @@ from calib_ros.identification.validation import (
     validate,
 )
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 from calib_ros.shown import Shown
 
@@ -81,7 +83,7 @@ class Identification(Shown):
         Corrected chain with fitted frames.
     before : Chain
         Nominal chain with fitted frames.
-    parameters : tuple of Parameter
+    parameters : tuple of ParameterRow
         Every parameter of the model.
     names, uncertainty : tuple of str, Uncertainty
         Fitted parameters and their covariance for the noise found in the residuals.
@@ -103,7 +105,7 @@ class Identification(Shown):
     chance : float or None
         Probability that errors shared by what was measured in succession, as of a drifting
         tracker, would let the arm's parameters explain as much. None for a target in sockets.
-    refusals : tuple of str
+    refusals : tuple of Reason
         Rules of acceptance that failed, in words; none when the result is accepted.
     posterior : Posterior
         What is known of the arm, effects that the model leaves out included.
@@ -123,7 +125,7 @@ class Identification(Shown):
 
     chain: Chain
     before: Chain
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[ParameterRow, ...]
     names: tuple[str, ...]
     uncertainty: identifiability.Uncertainty
     fitted: Comparison
@@ -139,7 +141,7 @@ class Identification(Shown):
     iterations: int
     converged: bool
     chance: float | None
-    refusals: tuple[str, ...]
+    refusals: tuple[Reason, ...]
     posterior: Posterior
     region: Region | None
     weak: tuple[str, ...] = ()
@@ -238,7 +240,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     names = identifiability.excited(factor, wanted)
     if len(names) < len(wanted) and few.count < system.count:  # more samples may determine more
         names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
-    factor = factor_of_some(factor, [wanted.index(name) for name in names])
+    factor = factor_of_some(factor, [k for k, name in enumerate(wanted) if name in names])
     problem = _guarded(problem, names, factor, simpler)
     rough = start
     if simpler is not None:
@@ -437,7 +439,7 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     return chance_of_gain(before, frames, arm, problem.system(sets, learned=False))
 
 
-def _weak(problem: Problem, parameters: Sequence[Parameter]) -> tuple[str, ...]:
+def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
     """Return the DH parameters that the poses tell less of than what is known of other arms."""
     if problem.learned is None:
         return ()
@@ -501,7 +503,7 @@ def _parameters(
     structural: Sequence[str],
     names: Sequence[str],
     uncertainty: identifiability.Uncertainty,
-) -> tuple[Parameter, ...]:
+) -> tuple[ParameterRow, ...]:
     change = _to_values(chain, names)
     variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
     std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
@@ -517,7 +519,7 @@ def _parameters(
             status = 'gauge' if name in free else 'fixed'
         offset = chain.offset(name, problem.model)
         value, spread = chain.value(name), std.get(name)
-        rows.append(Parameter(name, value, offset, spread, status, freedom.get(name, np.inf)))
+        rows.append(ParameterRow(name, value, offset, spread, status, freedom.get(name, np.inf)))
     return tuple(rows)
 
 
@@ -528,8 +530,7 @@ def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
     """
     change = np.eye(len(names))
     for frame in chain.frame_names:
-        turns = [f'{frame}.{kind}' for kind in FRAME_KINDS[3:]]
-        index = [names.index(name) for name in turns if name in names]
+        index = [names.index(name) for name in parameters_of(frame)[3:] if name in names]
         if len(index) == 3:
             vector = chain.frame(frame).offsets()[3:]
             change[np.ix_(index, index)] = left_jacobian_inverse(vector)

@@ -29,7 +29,8 @@ from scipy.linalg import lapack
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.lens import at_the_board, of_lens, require_lens, view
+from calib_ros.kinematics.lens import at_the_board, require_lens, view
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -117,7 +118,7 @@ class Samples:
             moving = None if velocity is None else velocity[:, part]
             axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving)
             if self.distances is not None:
-                shift = _along(origin, shift, self.distances[part])
+                shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
             if self.oriented:
@@ -239,7 +240,8 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
             chain.effective(q, came), base=observations.base, tool=observations.tool
         )
         if distances is not None:
-            position[part, 0] = distances[part] - np.linalg.norm(origin, axis=0)
+            length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
+            position[part, 0] = distances[part] - length
             continue
         position[part] = observations.positions[part] - origin.T
         if oriented[part].any():
@@ -277,8 +279,17 @@ def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray
     return pixels, shifts
 
 
-def _along(origin: FloatArray, shift: FloatArray, distances: FloatArray) -> FloatArray:
-    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|."""
+def _along(
+    origin: FloatArray, shift: FloatArray, distances: FloatArray, plane: bool
+) -> FloatArray:
+    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|.
+
+    Over a plane they are along its normal z.
+    """
+    if plane:
+        along = np.ascontiguousarray(shift[:, 2:])
+        along[-1, 0] = distances - origin[2]
+        return along
     length = np.maximum(np.linalg.norm(origin, axis=0), 1e-12)
     along = np.einsum('pcb,cb->pb', shift, origin / length)[:, np.newaxis]
     along[-1, 0] = distances - length
@@ -347,9 +358,9 @@ class System(Shown):
             length = max(float(np.linalg.norm(apart)), 1e-12)
             residual[i] = (distance - length) / SEPARATION_SIGMA
             for frame, sign in ((first, -1.0), (second, 1.0)):
-                for k, axis in enumerate('xyz'):
-                    if f'{frame}.{axis}' in column:
-                        rows[i, column[f'{frame}.{axis}']] = sign * apart[k] / length
+                for k, name in enumerate(parameters_of(frame)[:3]):
+                    if name in column:
+                        rows[i, column[name]] = sign * apart[k] / length
         return rows / SEPARATION_SIGMA, residual
 
     @property
@@ -541,7 +552,7 @@ def without_each(
         yield from [chain] * len(systems)
         return
     curved = [
-        k for k, name in enumerate(names) if not of_lens(name)
+        k for k, name in enumerate(names) if not Parameter(name).of_lens
     ]  # pixels are linear in a lens
     parts = [normal_equations(chain, names, System(system.sets)) for system in systems]
     extra, residual = systems[0].extra_rows(chain, names)  # the same in every part

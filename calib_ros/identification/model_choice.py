@@ -165,7 +165,7 @@ class _Linear:
         self._columns: dict[str, FloatArray] = {}
         self._seen: dict[str, Columns] = {}
         self._pairs = [
-            tuple(f'{joint.name}.{wave}_{harmonic}' for wave in effects.WAVES)
+            effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
             if joint.type == 'revolute'
             for harmonic in HARMONICS
@@ -213,7 +213,7 @@ class _Linear:
             return None
         known = self._moved([*self._names, *chosen])
         moved: list[Columns] = []
-        for joint, own in groupby(pairs, lambda pair: pair[0].partition('.')[0]):
+        for joint, own in groupby(pairs, lambda pair: pair[0].owner):
             progress(f'harmonics of {joint}')
             moved += [self._moved(pair) for pair in own]
         shares = self._shifts.shares(known, moved)

@@ -60,6 +60,8 @@ class Observations(Shown):
     distances : (N,), optional
         Distances [m] from the origin of the world to the target, for draw-wires and ball-bars.
         Positions and rotations count for nothing then.
+    plane : bool
+        The distances are heights over the plane z = 0 of the world: zero where it was touched.
     velocity, acceleration : (N, n), optional
         Of the joints, where the arm was moving when it was measured.
     delay : (N,), optional
@@ -99,6 +101,7 @@ class Observations(Shown):
     pixels: FloatArray | None = None
     points: FloatArray | None = None
     on_flange: bool = False
+    plane: bool = False
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""
@@ -118,6 +121,8 @@ class Observations(Shown):
                 shapes[name] = self.joints.shape
         if self.distances is not None:
             shapes['distances'] = (count,)
+        elif self.plane:
+            raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):
             raise InputError('pixels need the points of the board that they show, and points them')
         if self.pixels is not None:
@@ -175,6 +180,13 @@ class Observations(Shown):
             points=np.asarray(points, dtype=np.float64),
             on_flange=on_flange,
         )
+
+    @classmethod
+    def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
+        """Make observations (N) of a point at the tool that touched one plane."""
+        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
+        heights = np.zeros(len(joints))
+        return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
     def select(self, mask: NDArray[np.generic]) -> Observations:
         """Return the pairs chosen by a mask or by indices."""

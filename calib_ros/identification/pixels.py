@@ -24,7 +24,8 @@ from calib_ros.identification.leastsquares import Samples, seen_residuals
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import LENS_KINDS, View, at_the_board, require_lens, view
+from calib_ros.kinematics.lens import View, at_the_board, require_lens, view
+from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 BOUNDED = 3.0
@@ -150,7 +151,8 @@ class PixelSamples(Samples):
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
         lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
-        kinds = [kind for kind in LENS_KINDS if f'{seen_by.camera}.{kind}' in names]
+        own = [name for name in parameters_of(seen_by.camera, LENS_KINDS) if name in names]
+        kinds = [name.kind for name in own]
         row = dict(zip(names, model.order.tolist(), strict=True))
         joints, velocity = self.moving(chain)
         ends = np.append(self._begins, self.count)
@@ -183,8 +185,7 @@ class PixelSamples(Samples):
             twist = np.zeros((len(names), 6, len(images)))
             twist[:, :3] = shift[:-1]
             twist[: model.rotations, 3:] = turn[:-1]
-            own = [row[f'{seen_by.camera}.{kind}'] for kind in kinds]
-            yield _Block(part, owner, columns, twist, own, seen, model)
+            yield _Block(part, owner, columns, twist, [row[n] for n in own], seen, model)
             first = last
 
 

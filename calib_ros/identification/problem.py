@@ -19,8 +19,9 @@ from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.robust import LOSSES
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import DELAY, FRAME_KINDS, Chain, is_length
-from calib_ros.kinematics.lens import LENS_KINDS, of_lens, require_lens
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
 from calib_ros.shown import Shown
 
 
@@ -61,6 +62,8 @@ class Problem(Shown):
         ratio weighs position against orientation; the size of the noise is estimated.
     sigma_pixel : float
         Standard deviation [px] of each coordinate of a point of a board in an image.
+    sigma_touch : float
+        Standard deviation [m] of heights over a plane.
     loss : 'redescending', 'huber' or 'none'
         How gross errors are kept from ruining the fit (`robust.py`).
     priors : mapping of str to float
@@ -100,10 +103,11 @@ class Problem(Shown):
     separations: Sequence[tuple[str, str, float]] = ()
     learned: Learned | None = None
     sigma_pixel: float = 0.3
+    sigma_touch: float = 1e-4
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
-        for name in ('sigma_position', 'sigma_orientation', 'sigma_pixel'):
+        for name in ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch'):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
         if self.loss not in LOSSES:
@@ -161,8 +165,8 @@ class Problem(Shown):
 
     def _places(self, pattern: str) -> bool:
         """Tell whether a pattern is that of the place of a frame, not of a lens there."""
-        frame, _, kinds = pattern.partition('.')
-        return frame in self.model.frame_names and not fnmatch.filter(LENS_KINDS, kinds)
+        place = self.model.owns_frame(pattern)
+        return place and not fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
 
     @cached_property
     def sets(self) -> tuple[Observations, ...]:
@@ -192,6 +196,7 @@ class Problem(Shown):
                 each.base,
                 each.tool,
                 each.socket,
+                each.plane,
             )
             for each in self.sets
         )
@@ -231,7 +236,7 @@ class Problem(Shown):
         for name in self.free:
             for pattern, sigma in self.priors.items():
                 if fnmatch.fnmatchcase(name, pattern) and (
-                    not self.model.owns_frame(name) or of_lens(name)
+                    not self.model.owns_frame(name) or Parameter(name).of_lens
                 ):
                     sigmas.setdefault(name, sigma)
         return sigmas
@@ -248,7 +253,7 @@ class Problem(Shown):
 
     def common_sense(self, name: str) -> float:
         """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
-        return (self.largest_length if is_length(name) else self.largest_angle) / 3.0
+        return (self.largest_length if Parameter(name).is_length else self.largest_angle) / 3.0
 
     def system(self, sets: Sequence[Observations], learned: bool = True) -> System:
         """Return sets of observations, and the priors, as the solver takes them.
@@ -260,14 +265,20 @@ class Problem(Shown):
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None
-        noises = (self.sigma_position, self.sigma_orientation)
-        samples = [samples_of(each, noises, self.sigma_pixel) for each in sets]
+        samples = [
+            samples_of(
+                each,
+                (self.sigma_touch if each.plane else self.sigma_position, self.sigma_orientation),
+                self.sigma_pixel,
+            )
+            for each in sets
+        ]
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
         return System(tuple(samples), prior, apart)
 
     @cached_property
-    def free(self) -> tuple[str, ...]:
+    def free(self) -> tuple[Parameter, ...]:
         """Return the parameters that may be fitted, in the order of their priority.
 
         Of parameters that trade against each other the last are kept nominal: effects, and before
@@ -278,16 +289,14 @@ class Problem(Shown):
         held: set[str] = set()
         for key in model.frame_names:
             frame = model.frame(key)
-            place = [f'{key}.{kind}' for kind in (*FRAME_KINDS, DELAY)]
-            lens = [f'{key}.{kind}' for kind in LENS_KINDS]
-            held.update(place if frame.fixed or key not in used else ())
-            unseen = frame.lens is None or frame.lens.fixed or key not in used
-            held.update(lens if unseen else ())
-        held.update(
-            f'{each.base}.{kind}' for each in self.sets if each.socket for kind in FRAME_KINDS[3:]
-        )
+            if frame.fixed or key not in used:
+                held.update(parameters_of(key, (*FRAME_KINDS, DELAY)))
+            if frame.lens is None or frame.lens.fixed or key not in used:
+                held.update(parameters_of(key, LENS_KINDS))
+        for each in self.sets:
+            held.update(parameters_of(each.base)[3:] if each.socket else ())
         for pattern in self.fixed:
             held.update(fnmatch.filter(model.parameter_names, pattern))
         known = dict(model.effects)
         names = [name for name in model.parameter_names if name not in held]
-        return tuple(sorted(names, key=lambda name: 2 * (name in known) + name.endswith('.d')))
+        return tuple(sorted(names, key=lambda name: 2 * (name in known) + (name.kind == 'd')))

@@ -27,11 +27,13 @@ from scipy import special
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.drift import inverse_root
-from calib_ros.identification.evidence import ROUNDING, Posterior
+from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.leastsquares import BLOCK
 from calib_ros.identification.observations import Observations
-from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain
+from calib_ros.identification.records import packed, unpacked
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -108,16 +110,13 @@ class Region(Shown):
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values: the squares by the rows of their Cholesky factor."""
-        scale = np.sqrt(np.maximum(np.diag(self.square), 1e-300))
-        scaled = self.square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
-        root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
         return {
             'limit': None if self.whole else self.limit,
             'share': self.share,
             'base': self.base,
             'tool': self.tool,
             'names': list(self.names),
-            'root': [' '.join(f'{x:.6e}' for x in row[: k + 1]) for k, row in enumerate(root)],
+            'root': packed(self.square),
         }
 
 
@@ -135,16 +134,13 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         return None
     try:
         names = tuple(str(name) for name in document['names'])
-        root = np.zeros((len(names), len(names)))
-        for k, row in enumerate(document['root']):
-            root[k, : k + 1] = [float(part) for part in row.split()]
         chain = chain.with_effects([n for n in names if not _is_geometric(chain, n)])
         ErrorModel(chain, names)
         limit = document['limit']
         region = Region(
             chain,
             names,
-            root @ root.T,
+            unpacked(document['root'], len(names)),
             np.inf if limit is None else float(limit),
             float(document['share']),
             str(document['base']),
@@ -154,8 +150,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         raise ConfigError(
             f'{where}: calibration.region is damaged ({type(err).__name__}): identify again'
         ) from err
-    known = np.isfinite(region.square).all() and region.limit > 0.0 and 0.0 <= region.share <= 1.0
-    if not known or len(document['root']) != len(names):
+    if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
         raise ConfigError(f'{where}: calibration.region is damaged: identify again')
     for frame in (region.base, region.tool):
         if frame not in chain.frame_names:
@@ -166,7 +161,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
 
 
 def _is_geometric(chain: Chain, name: str) -> bool:
-    return chain.owns_frame(name) or name.partition('.')[2] in DH_KINDS
+    return chain.owns_frame(name) or Parameter(name).of_dh
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
@@ -224,8 +219,7 @@ class _Judge:
         self, posterior: Posterior, joints: FloatArray, ends: Observations, freedom: float
     ) -> None:
         chain, names = posterior.chain, posterior.names
-        frames = [f'{ends.base}.{kind}' for kind in FRAME_KINDS]
-        frames += [f'{ends.tool}.{kind}' for kind in FRAME_KINDS[:3]]
+        frames = [*parameters_of(ends.base), *parameters_of(ends.tool)[:3]]
         every = list(dict.fromkeys([*frames, *names]))
         model = ErrorModel(chain, every, ends.base, ends.tool)
         shift = model.linearise(np.ascontiguousarray(joints.T))[2]

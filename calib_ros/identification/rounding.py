@@ -23,7 +23,8 @@ from scipy import linalg
 
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import DH_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
@@ -58,13 +59,12 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
     most poses share hardly averages out.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
-    found = {}
+    found: dict[str, float] = {}
     for joint, values in zip(problem.chain.joints, joints.T, strict=True):
         if joint.name in coarse:
             shares = np.unique(values, return_counts=True)[1] / len(values)
-            kind = 'theta' if joint.type == 'revolute' else 'd'
             size = coarse[joint.name] / np.sqrt(12.0) * np.sqrt(np.sum(shares**2))
-            found[f'{joint.name}.{kind}'] = float(size)
+            found[joint.driven] = float(size)
     return found
 
 
@@ -103,7 +103,7 @@ def may_be_rounding(
     for number, joint in enumerate(problem.chain.joints):
         value, level = np.unique(joints[:, number], return_inverse=True)
         if joint.name in steps and len(value) <= FEW * len(joints):
-            levels[f'{joint.name}.{"theta" if joint.type == "revolute" else "d"}'] = level
+            levels[joint.driven] = level
     if not levels:
         return False
     arm = [name for name in names if not before.owns_frame(name)]
@@ -119,7 +119,7 @@ def may_be_rounding(
     columns = rows[:, len(frames) : len(frames) + len(arm)] * [_usual(name) for name in arm]
     alike = []
     for name, level in levels.items():
-        size = steps[name.partition('.')[0]] / np.sqrt(12.0)
+        size = steps[Parameter(name).owner] / np.sqrt(12.0)
         column = size * rows[:, [wanted.index(name)]]
         alike.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
     everything = np.column_stack([*alike, columns, rows[:, -1]])
@@ -140,8 +140,8 @@ def may_be_rounding(
 
 
 def _usual(name: str) -> float:
-    kind = name.partition('.')[2]
-    return USUAL[0 if is_length(name) else 1] if kind in DH_KINDS else effects.expected(name)
+    parameter = Parameter(name)
+    return USUAL[not parameter.is_length] if parameter.of_dh else effects.expected(name)
 
 
 def _evidence(columns: FloatArray, values: FloatArray, freedom: int) -> float:

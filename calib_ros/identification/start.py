@@ -11,9 +11,10 @@ out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknow
 Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
 is the shortest one, the base takes the rest, and rotations come from the registration.
 Distances: their squares are linear in the base's position and its square, solved for the better
-half of the samples. Pixels: the pose of the board in each image (`resection.py`). Every start is
-polished by least squares on the frames alone; the best one counts. Where none fits (few or
-degenerate poses), the 24 rotations of a cube are tried as well.
+half of the samples. A touched plane: n p_K + n R_K t = d is linear in n, n t^T and d, or with the
+tool given it is the plane through the points. Pixels: the pose of the board in each image
+(`resection.py`). Every start is polished by least squares on the frames alone; the best one
+counts. Where none fits (few or degenerate poses), the 24 rotations of a cube are tried as well.
 """
 
 from __future__ import annotations
@@ -25,16 +26,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
-from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import (
+    Samples,
+    System,
+    minimise,
+    residual_arrays,
+    triangular_factor,
+)
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain, Frame
+from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 SUBSET = 200
+PLANE_AND_TOOL = 14
+"""Touches of a plane, one more than unknowns, from which they tell tool and plane at once."""
 DRAWS, DRAWN = 500, 8
 """How many starts a place by distances has, and from how many samples, of 4 unknowns."""
 ONE_ORIENTATION = 0.9999
@@ -87,11 +97,11 @@ def _start_one(
     """Return the chain with frames for one set of observations."""
     oriented = bool(observations.oriented.any()) and observations.distances is None
     names = [
-        f'{key}.{kind}'
+        name
         for key in ('base', 'tool')
         if not chain.frame(key).fixed
-        for kind in FRAME_KINDS
-        if oriented or key == 'base' or not kind.startswith('r')
+        for name in parameters_of(key)
+        if oriented or key == 'base' or name.is_length
     ]
     if not names:
         return chain
@@ -101,12 +111,21 @@ def _start_one(
     subset = observations.select(index)
     system = System((Samples(subset, sigma_position, sigma_orientation),))
     arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
+    determined: tuple[str, ...] = ()
+    if subset.plane:
+        best, least = chain, np.inf
+        for start in _on_plane(chain, arm, subset):
+            determined = excited(triangular_factor(start, names, system), names)
+            fitted = robust_fit(start, determined, system, loss).fit.chain
+            height = float(np.median(np.abs(residual_arrays(fitted, subset)[0])))
+            if height < least:
+                best, least = fitted, height
+        return best
     if subset.distances is not None:
         start = _trilaterated(chain, arm, subset, loss != 'none')
         return robust_fit(start, names, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     best, best_error = chain, np.inf
-    determined: tuple[str, ...] = ()
     for candidates in (_closed_form(chain, arm, subset), _search()):
         for rotation in candidates:
             start = _complete(chain, arm, subset, rotation)
@@ -152,6 +171,34 @@ def _typical_error(chain: Chain, observations: Observations) -> float:
     """Return the median distance [m], which gross errors do not touch."""
     predicted = chain.forward(observations.joints, observations.approach)[:, :3, 3]
     return float(np.median(np.linalg.norm(observations.positions - predicted, axis=1)))
+
+
+def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
+    """Yield the chain with the plane z = 0 of the world through the places (N, 4, 4) of the arm.
+
+    With the tool as it is given, and with one that is told by the heights alone.
+    """
+    assert observations.distances is not None
+    base, tool = chain.frame('base'), chain.frame('tool')
+    tips = [tool.matrix[:3, 3]]
+    if not tool.fixed and len(arm) >= PLANE_AND_TOOL:
+        turned = arm[:, :3, :3].reshape(-1, 9)
+        columns = np.column_stack([arm[:, :3, 3], turned, np.ones(len(arm))])
+        least = np.linalg.svd(columns, full_matrices=False)[2][-1]
+        normal = least[:3]
+        tips.append(normal @ least[3:12].reshape(3, 3) / max(float(normal @ normal), 1e-12))
+    for tip in tips:
+        matrix = tool.matrix.copy()
+        matrix[:3, 3] = tip
+        start = chain if tool.fixed else replace(chain, tool=replace(tool, matrix=matrix))
+        if not base.fixed:
+            points = arm[:, :3, 3] + arm[:, :3, :3] @ tip
+            axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+            axes[2] = np.cross(axes[0], axes[1])
+            place = se3.transform(axes, -axes @ points.mean(axis=0))
+            place[2, 3] += observations.distances.mean()
+            start = replace(start, base=replace(base, matrix=place))
+        yield start
 
 
 def _trilaterated(

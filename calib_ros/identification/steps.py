@@ -29,9 +29,10 @@ from scipy import special
 from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.observations import stops
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import Robust, weights_of
-from calib_ros.kinematics.chain import FRAME_KINDS
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 MOVED = 0.5
@@ -92,6 +93,11 @@ class Step:
     def harmful(self) -> bool:
         """Tell whether the fit is that of no arm: of none before or after, or of one no more."""
         return self.kind == 'joint' or not self.outside
+
+    @property
+    def reason(self) -> Reason:
+        """Return why a result is refused for it."""
+        return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
 
     def __str__(self) -> str:
         """Return what moved and what to do about it."""
@@ -290,10 +296,7 @@ class _Scan:
         change = np.sqrt((np.concatenate(moved) ** 2).mean(axis=0))
         shift, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
         if group.kind == 'joint':
-            size, unit = (
-                abs(float(found.size[0])),
-                'rad' if group.names[0].endswith('theta') else 'm',
-            )
+            size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
         elif self._oriented and turn * self._sigmas[0] > shift * self._sigmas[1]:
             size, unit = turn, 'rad'
         else:
@@ -311,12 +314,11 @@ def _groups(problem: Problem) -> list[_Group]:
         for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
             sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
             socket = kind == 'base' and problem.sets[sets[0]].socket  # the ball turns in it
-            names = tuple(f'{frame}.{k}' for k in FRAME_KINDS[: 3 if socket else 6])
+            names = parameters_of(frame)[: 3 if socket else 6]
             found.append(_Group(frame, kind, names, tuple(sets)))
     everywhere = tuple(range(len(problem.sets)))
     for joint in problem.chain.joints:
-        zero = 'theta' if joint.type == 'revolute' else 'd'
-        found.append(_Group(joint.name, 'joint', (f'{joint.name}.{zero}',), everywhere))
+        found.append(_Group(joint.name, 'joint', (joint.driven,), everywhere))
     return found
 
 

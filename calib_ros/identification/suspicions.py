@@ -33,11 +33,13 @@ from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import FRAME_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
@@ -66,11 +68,11 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 
     `another` asks whether it is another robot: not where a mistake is named already.
     """
-    if any(each.socket for each in problem.sets):
+    if any(each.socket or each.plane for each in problem.sets):
         return result  # one place tells nothing of what follows
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
-    refusals = (*result.refusals, scale) if certain else result.refusals
+    refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
     found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
@@ -83,8 +85,8 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
     """
     chain = result.chain
     arm = [n for n in chain.parameter_names if not chain.owns_frame(n)]
-    lengths = [n for n in arm if n.endswith(('.a', '.d')) and chain.value(n) != 0.0]
-    fitted = [i for i, n in enumerate(result.names) if n in arm and n.endswith(('.a', '.d'))]
+    lengths = [n for n in arm if Parameter(n).is_length and chain.value(n) != 0.0]
+    fitted = [i for i, n in enumerate(result.names) if n in arm and Parameter(n).is_length]
     if len(fitted) < 3 or not lengths:
         return 0.0, np.inf, 0.0
     grown = np.array([problem.model.value(n) for n in lengths])
@@ -100,7 +102,7 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
     reach[reach == 0.0] = 1.0
     seen = rows[:, [names.index(n) for n in lengths]] @ grown
     growth = np.linalg.lstsq(rows[:, :size] / reach, seen, rcond=1e-10)[0] / reach
-    offsets = {p.name: p.offset for p in result.parameters}
+    offsets: dict[str, float] = {p.name: p.offset for p in result.parameters}
     return _common(
         np.array([offsets[result.names[i]] for i in fitted]),
         growth[fitted],
@@ -143,9 +145,8 @@ def _sister(problem: Problem, result: Identification) -> str:
     """Return in words which shipped robot is much nearer to the arm found than the nominal."""
     if not any(
         p.std is not None
-        and p.name.partition('.')[0] in problem.chain.joint_names
-        and p.name.partition('.')[2] in ('a', 'd', 'alpha', 'theta', 'beta')
-        and abs(p.offset) - 3.0 * p.std > ANOTHER[0 if is_length(p.name) else 1]
+        and p.name.of_dh
+        and abs(p.offset) - 3.0 * p.std > ANOTHER[0 if p.name.is_length else 1]
         for p in result.parameters
     ):
         return ''
@@ -170,7 +171,7 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     exact = found.forward(joints)
     poses = Observations.from_arrays(joints, exact[:, :3, 3], exact[:, :3, :3])
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
-    names = [f'{frame}.{kind}' for frame in ('base', 'tool') for kind in FRAME_KINDS]
+    names: list[str] = [*parameters_of('base'), *parameters_of('tool')]
     system = System((Samples(poses, 1e-4, 1e-4 / 0.3),))
     names = list(excited(triangular_factor(start, names, system), names))
     near = minimise(start, names, system, tolerance=1e-2).chain

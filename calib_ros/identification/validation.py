@@ -20,10 +20,12 @@ from calib_ros.identification.leastsquares import (
 )
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import KNOWN, Region
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weights_of
 from calib_ros.identification.steps import Step
-from calib_ros.kinematics.chain import DH_KINDS, Chain, is_length
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -40,7 +42,7 @@ MOST_OUTLIERS = 0.35
 
 
 @dataclass(frozen=True)
-class Parameter:
+class ParameterRow:
     """One parameter of the model: m for lengths, rad for angles.
 
     `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
@@ -48,7 +50,7 @@ class Parameter:
     degrees of freedom from which `std` was estimated; infinite where the noise is known.
     """
 
-    name: str
+    name: Parameter
     value: float
     offset: float
     std: float | None
@@ -329,7 +331,7 @@ def _leave_one_place_out(
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]
     for place in places:
-        own = [name for name in names if name.partition('.')[0] in place]
+        own = [name for name in names if Parameter(name).owner in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
             elsewhere = [name for name in fitted if name not in own]
             trained = minimise(chain, elsewhere, part(place, inside=False)).chain
@@ -354,14 +356,14 @@ def _leave_one_place_out(
 def refusals(
     problem: Problem,
     converged: bool,
-    parameters: Sequence[Parameter],
+    parameters: Sequence[ParameterRow],
     validation: Comparison | None,
     chance: float | None,
     region: Region | None,
     step: Step | None,
     own: str | None,
     unsure: bool,
-) -> tuple[str, ...]:
+) -> tuple[Reason, ...]:
     """Return the rules of acceptance that fail, in words.
 
     1. The fit has converged.
@@ -382,46 +384,56 @@ def refusals(
     9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
     10. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
     """
-    failed = []
+    failed: list[Reason] = []
+
+    def refuse(rule: Rule, text: str) -> None:
+        failed.append(Reason(rule, text))
+
     if step is not None and step.harmful:
-        failed.append(str(step))
+        failed.append(step.reason)
     if own is not None:
-        failed.append(own)
+        refuse(Rule.OWN_BEHAVIOUR, own)
     if not converged:
-        failed.append('the fit has not converged')
+        refuse(Rule.CONVERGENCE, 'the fit has not converged')
     not_excited = [p.name for p in parameters if p.status == 'not excited']
     if not_excited:
-        failed.append(
+        refuse(
+            Rule.EXCITATION,
             f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            'in more combinations, or fix these parameters'
+            'in more combinations, or fix these parameters',
         )
     for p in parameters:
-        length = is_length(p.name)
+        length = p.name.is_length
         limit = problem.largest_length if length else problem.largest_angle
-        joint, _, kind = p.name.partition('.')
-        if p.std is None or joint not in problem.chain.joint_names or kind not in DH_KINDS:
+        if p.std is None or not p.name.of_dh:
             continue
         if abs(p.offset) - 3.0 * p.std > limit:
-            failed.append(
+            refuse(
+                Rule.COMMON_SENSE,
                 f'{p.name} is off by {1e3 * p.offset:.0f} {"mm" if length else "mrad"}, '
-                'more than a faulty robot of this kind can be: is it the right chain file?'
+                'more than a faulty robot of this kind can be: is it the right chain file?',
             )
     if validation is None:
-        failed.append('there are too few configurations to judge the result on any held out')
+        refuse(
+            Rule.CONFIGURATIONS,
+            'there are too few configurations to judge the result on any held out',
+        )
         return tuple(failed)
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
-        failed += [str(step)] if step is not None and not step.harmful else []
-        failed.append(
+        failed += [step.reason] if step is not None and not step.harmful else []
+        refuse(
+            Rule.OUTLIERS,
             f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
-            'and what is predicted do not belong together'
+            'and what is predicted do not belong together',
         )
         return tuple(failed)
     before, after = validation.figures
     if after.rms_mm > 1e3 * problem.largest_error:
-        failed.append(
+        refuse(
+            Rule.LARGEST_ERROR,
             f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
-            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?'
+            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?',
         )
     judged = validation.deciding
     groups = validation.after.configurations[judged]
@@ -429,45 +441,51 @@ def refusals(
         validation.before.position[judged], validation.after.position[judged], groups
     )
     if not gain > limit:
-        failed.append(
+        refuse(
+            Rule.GAIN,
             f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
-            f'before, {after.rms_mm:.3f} mm after)'
+            f'before, {after.rms_mm:.3f} mm after)',
         )
     elif chance is not None and chance > 1.0 - CONFIDENCE:
-        failed.append(
+        refuse(
+            Rule.DRIFT,
             'the gain may be that of a drift, as of the tracker: moved in time against the joint '
             f'values, residuals are explained as well in {100.0 * chance:.0f} % of the shifts; '
-            'measure the poses in random order, further apart, or more of them'
+            'measure the poses in random order, further apart, or more of them',
         )
     elif region is None:
-        failed.append(
+        refuse(
+            Rule.REGION,
             'too little is known of the arm for the correction to help: what it removes is not '
             'larger than its own uncertainty, even at the poses measured; measure more poses, '
-            'spread further'
+            'spread further',
         )
     if validation.outliers:
         first, second = validation.figures_of_all
         pairs = (validation.before.position, validation.after.position)
         gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
         if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
-            failed.append(
+            refuse(
+                Rule.GAIN_WITH_OUTLIERS,
                 f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
                 f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
-                f'{second.mean_mm:.3f} mm)'
+                f'{second.mean_mm:.3f} mm)',
             )
     if unsure:
-        failed.append(
+        refuse(
+            Rule.ROUNDING,
             'the gain may be that of rounded joint values, which are alike in many poses: record '
-            'them with more digits'
+            'them with more digits',
         )
     if after.rms_mrad is not None:
         gain, limit = log_gain(
             validation.before.orientation[judged], validation.after.orientation[judged], groups
         )
         if gain < -limit:
-            failed.append(
+            refuse(
+                Rule.ORIENTATION,
                 f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
-                f'before, {after.rms_mrad:.3f} mrad after)'
+                f'before, {after.rms_mrad:.3f} mrad after)',
             )
     return tuple(failed)
 

@@ -31,7 +31,15 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.lens import LENS_KINDS, Lens
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import (
+    DELAY,
+    DH_KINDS,
+    FRAME_KINDS,
+    LENS_KINDS,
+    Parameter,
+    parameters_of,
+)
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import Walk
 from calib_ros.shown import Shown
@@ -39,18 +47,8 @@ from calib_ros.shown import Shown
 Convention: TypeAlias = Literal['standard', 'modified']
 JointType: TypeAlias = Literal['revolute', 'prismatic']
 
-DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
-ANGLES = ('alpha', 'theta', 'beta')
-FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
-DELAY = 'delay'
-"""Kind of parameter [s] of a base frame: how late the stamps of its device are."""
 PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
-
-
-def is_length(name: str) -> bool:
-    """Tell whether a parameter is a length [m]; the others are angles [rad]."""
-    return name.partition('.')[2] in ('a', 'd', 'x', 'y', 'z')
 
 
 @dataclass(frozen=True)
@@ -91,6 +89,16 @@ class Joint:
                 f'limits of joint "{self.name}": lower {self.lower} must be less than upper '
                 f'{self.upper}'
             )
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the joint's Denavit-Hartenberg parameters, in the order of DH_KINDS."""
+        return parameters_of(self.name, DH_KINDS)
+
+    @cached_property
+    def driven(self) -> Parameter:
+        """Return the parameter that the joint's value is added to."""
+        return Parameter(self.name, 'theta' if self.type == 'revolute' else 'd')
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,19 +229,20 @@ class Chain(Shown):
         return tuple(joint.name for joint in self.joints)
 
     @cached_property
-    def parameter_names(self) -> tuple[str, ...]:
+    def parameter_names(self) -> tuple[Parameter, ...]:
         """Return the names of all parameters of the error model, frames first.
 
         The model holds beta instead of d at the joints named in `parallel`.
         """
-        names = [f'{frame}.{kind}' for frame in self.frame_names for kind in FRAME_KINDS]
-        names += [f'{k}.{DELAY}' for k in self.frame_names if self.frame(k).delay is not None]
+        names = [name for frame in self.frame_names for name in parameters_of(frame)]
+        late = [key for key in self.frame_names if self.frame(key).delay is not None]
+        names += [Parameter(frame, DELAY) for frame in late]
         cameras = [key for key in self.frame_names if self.frame(key).lens is not None]
-        names += [f'{camera}.{kind}' for camera in cameras for kind in LENS_KINDS]
+        names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
-            names += [f'{joint.name}.{kind}' for kind in DH_KINDS if kind != left_out]
-        return (*names, *(name for name, _ in self.effects))
+            names += [name for name in joint.parameters if name.kind != left_out]
+        return (*names, *(Parameter(name) for name, _ in self.effects))
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -268,7 +277,7 @@ class Chain(Shown):
         owner, kind = self._split(name)
         if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
             return self.value(name) - nominal.value(name)
-        reference = nominal.frame(name.partition('.')[0])
+        reference = nominal.frame(Parameter(name).owner)
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
@@ -277,7 +286,7 @@ class Chain(Shown):
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""
-        return parameter.partition('.')[0] in self.frame_names
+        return Parameter(parameter).owner in self._frames
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with another base or tool frame, which may be a new one."""
@@ -312,10 +321,10 @@ class Chain(Shown):
         for name, offset in offsets.items():
             if name not in known:
                 raise UnknownNameError('parameter', name, self.parameter_names)
-            owner, _, kind = name.partition('.')
+            named = Parameter(name)
             if not math.isfinite(offset):
                 raise ConfigError(f'the offset of {name} must be a finite number')
-            by_owner.setdefault(owner, {})[kind] = float(offset)
+            by_owner.setdefault(named.owner, {})[named.kind] = float(offset)
         joints = []
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
@@ -366,7 +375,7 @@ class Chain(Shown):
         q = q.copy()
         for (name, value), row in zip(self.effects, phi, strict=True):
             if value:
-                q[self.joint_names.index(name.partition('.')[0])] += value * row
+                q[self.joint_names.index(Parameter(name).owner)] += value * row
         return q
 
     def trace(
@@ -410,8 +419,8 @@ class Chain(Shown):
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
         if name not in self._all_parameters:
             raise UnknownNameError('parameter', name, self.parameter_names)
-        owner, _, kind = name.partition('.')
-        return self._joints.get(owner) or self.frame(owner), kind
+        named = Parameter(name)
+        return self._joints.get(named.owner) or self.frame(named.owner), named.kind
 
     @cached_property
     def _all_parameters(self) -> frozenset[str]:

@@ -24,10 +24,10 @@ import numpy as np
 from calib_ros import texts
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import ANGLES, DH_KINDS, Chain, Convention, Frame, Joint
-from calib_ros.kinematics.lens import IN_PIXELS, LENS_KINDS, Lens
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS, Parameter
 from calib_ros.kinematics.urdf import MOST_JOINTS, chain_from_urdf
-from calib_ros.settings import Settings
 from calib_ros.texts import parse_yaml
 from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_name, parse_number, parse_numbers
 
@@ -38,8 +38,6 @@ CHAIN_KEYS = (
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
-SAME = 1e-9
-"""Numbers [m, rad] of two nominal chains that differ by less are the same."""
 
 
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
@@ -123,17 +121,12 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
             convention=content['convention'],
             joints=tuple(_joint(row, f'{where}: joint {k + 1}') for k, row in enumerate(rows)),
             parallel=None if parallel is None else tuple(parallel),
-            base=_frame(content.get('base'), f'{where}: base'),
-            tool=_frame(content.get('tool'), f'{where}: tool'),
-            frames=tuple(
-                (parse_name(name, f'{where}: frames'), _frame(frame, f'{where}: frames.{name}'))
-                for name, frame in _dictionary(content.get('frames'), f'{where}: frames').items()
-            ),
+            **parse_frames(content, where),
             **_gravity(content, where),
         ).with_effect_values(
             {
                 name: parse_number(value, f'{where}: effects: {name}')
-                for name, value in _dictionary(content.get('effects'), f'{where}: effects').items()
+                for name, value in dictionary(content.get('effects'), f'{where}: effects').items()
             }
         )
     except ConfigError as err:
@@ -146,82 +139,23 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
         raise ConfigError(f'{where}: {err}') from err
 
 
+def parse_frames(content: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return the arguments of a chain that hold its frames; `where` names them in errors."""
+    others = dictionary(content.get('frames'), f'{where}: frames')
+    return {
+        'base': _frame(content.get('base'), f'{where}: base'),
+        'tool': _frame(content.get('tool'), f'{where}: tool'),
+        'frames': tuple(
+            (parse_name(name, f'{where}: frames'), _frame(frame, f'{where}: frames.{name}'))
+            for name, frame in others.items()
+        ),
+    }
+
+
 def calibration_record(text: str) -> dict[str, Any]:
     """Return what a chain file says about where its numbers come from."""
     record = parse_yaml(text, 'chain file').get('calibration')
     return record if isinstance(record, dict) else {}
-
-
-def load_calibration(path: str | os.PathLike[str], nominal: Chain) -> tuple[Chain, dict[str, Any]]:
-    """Read the calibration of a nominal chain: its file, or the folder of an identification.
-
-    Return the corrected chain and the record of its origin.
-
-    Raises
-    ------
-    ConfigError
-        When it is none, or that of another nominal chain (`parse_calibration`).
-
-    """
-    file = Path(path)
-    if file.is_dir():
-        file /= 'calibration.yaml'
-    return parse_calibration(read_text(file), str(file), nominal)
-
-
-def parse_calibration(
-    text: str, where: str, nominal: Chain, settings: Settings | None = None
-) -> tuple[Chain, dict[str, Any]]:
-    """Turn the text of a calibration into the corrected chain and the record of its origin.
-
-    A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
-    all that calib_ros writes, and must not speak against this nominal chain; nor may the numbers
-    be further from it than `largest_length` and `largest_angle` of the settings allow. Without
-    settings the identification has judged that, if it records the numbers of this chain.
-
-    Raises
-    ------
-    ConfigError
-        When the text is no chain file, a chain without a record, or a calibration that was not
-        accepted, or that was identified from another nominal chain.
-
-    """
-    chain = parse_chain(text, where)
-    ours, theirs = (
-        [f'{joint.name} ({joint.type})' for joint in each.joints] for each in (nominal, chain)
-    )
-    if ours != theirs:
-        raise ConfigError(
-            f'{where} has the joints {", ".join(theirs)}, the nominal chain has '
-            f'{", ".join(ours)}: is it the right nominal chain?'
-        )
-    record = calibration_record(text)
-    if not record:
-        raise ConfigError(
-            f'{where} is a chain, but no calibration: it does not say where its numbers come '
-            'from (key "calibration"); give the calibration.yaml of calib_ros identify'
-        )
-    if record.get('accepted') is False:
-        raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
-    _check_figures(record, where)
-    known = _check_nominal(record.get('nominal'), nominal, where)
-    limits = settings or Settings()
-    length, angle = limits.largest_length, limits.largest_angle
-    if known and settings is None:
-        length = angle = math.inf
-    differing = _differing(chain, nominal, length, angle)
-    if differing:
-        raise ConfigError(
-            f'{where} is not the calibration of this robot: {", ".join(differing)} differ from '
-            f'chain "{nominal.name}" by more than largest_length and largest_angle allow'
-        )
-    return chain, record
-
-
-def nominal_record(nominal: Chain) -> dict[str, Any]:
-    """Return the numbers of the chain that a calibration belongs to, row by row."""
-    rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
-    return {'convention': nominal.convention, 'joints': rows}
 
 
 def table_hash(chain: Chain) -> str:
@@ -236,52 +170,6 @@ def table_hash(chain: Chain) -> str:
         [[name, float(value)] for name, value in chain.effects],
     ]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
-
-
-def _check_figures(record: dict[str, Any], where: str) -> None:
-    """Refuse what a calibration could not be judged by, or published under."""
-    rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
-    number = isinstance(rms, int | float) and not isinstance(rms, bool)
-    if not number or not 0.0 <= rms < math.inf:
-        raise ConfigError(f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}')
-    if not isinstance(frame, str):
-        raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
-
-
-def _check_nominal(recorded: object, nominal: Chain, where: str) -> bool:
-    """Refuse a nominal chain with other numbers than the one that a calibration comes from.
-
-    Return whether those numbers are recorded and can be compared.
-    """
-    known = _dictionary(recorded, f'{where}: calibration.nominal')
-    if known.get('convention') != nominal.convention:  # nothing recorded, or not comparable
-        return False
-    rows = _dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
-    for joint in nominal.joints:
-        row = parse_numbers(rows.get(joint.name), len(DH_KINDS), f'{where}: nominal {joint.name}')
-        for kind, value in zip(DH_KINDS, row.tolist(), strict=True):
-            if abs(value - getattr(joint, kind)) > SAME:
-                raise ConfigError(
-                    f'{where} was identified from another nominal chain, with {joint.name}.{kind} '
-                    f'{value:.9g} and not {getattr(joint, kind):.9g}: give that one, or identify '
-                    'again'
-                )
-    return True
-
-
-def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
-    """Return what of the joints differs by more than errors of one robot can [m, rad]."""
-    if chain.convention != nominal.convention:
-        return [f'the conventions ({chain.convention}, {nominal.convention})']
-    names = []
-    for joint, other in zip(chain.joints, nominal.joints, strict=True):
-        if joint.sign != other.sign:
-            names.append(f'the sign of {joint.name}')
-        for kind in DH_KINDS:
-            limit = angle if kind in ANGLES else length
-            if abs(getattr(joint, kind) - getattr(other, kind)) > limit:
-                names.append(f'{joint.name}.{kind}')
-    return names
 
 
 def chain_document(chain: Chain) -> dict[str, Any]:
@@ -305,19 +193,20 @@ def chain_document(chain: Chain) -> dict[str, Any]:
         'joints': joints,
         'parallel': list(chain.parallel or ()),
     }
-    document |= {
-        key: _frame_document(frame)
-        for key, frame in (('base', chain.base), ('tool', chain.tool))
-        if frame is not None
-    }
-    others = {name: _frame_document(frame) for name, frame in chain.frames if frame is not None}
-    if others:
-        document['frames'] = others
+    document |= frames_document(chain)
     if chain.effects:
         document['effects'] = {name: float(value) for name, value in chain.effects}
     if chain.gravity != Chain.gravity:
         document['gravity'] = [float(part) for part in chain.gravity]
     return document
+
+
+def frames_document(chain: Chain) -> dict[str, Any]:
+    """Return the frames of a chain file as plain Python values."""
+    ends = (('base', chain.base), ('tool', chain.tool))
+    document: dict[str, Any] = {k: _frame_document(f) for k, f in ends if f is not None}
+    others = {name: _frame_document(frame) for name, frame in chain.frames if frame is not None}
+    return document | ({'frames': others} if others else {})
 
 
 def _frame_document(frame: Frame) -> dict[str, Any]:
@@ -345,7 +234,12 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     """Return plain values as YAML."""
     import yaml
 
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000))
+    class Dumper(yaml.SafeDumper):
+        """Writes parameters by their names."""
+
+    Dumper.add_representer(Parameter, yaml.SafeDumper.represent_str)
+    text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
+    return str(text)
 
 
 def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]:
@@ -357,7 +251,8 @@ def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]
     return value
 
 
-def _dictionary(value: object, where: str) -> dict[str, Any]:
+def dictionary(value: object, where: str) -> dict[str, Any]:
+    """Return a mapping of names, empty for none; `where` names it in the error."""
     if value is None:
         return {}
     if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
@@ -53,44 +54,45 @@ WRIST = 3
 
 def group_of(name: str) -> str:
     """Return the group that an effect belongs to."""
-    kind = name.partition('.')[2]
-    first, _, rest = kind.partition('_')
+    first, rest = Parameter(name).effect
     if first in ('sin', 'cos'):
         return 'eccentricity' if rest in ('1', '2') else 'gear'
     return first
 
 
-def members(chain: Chain, group: str) -> tuple[str, ...]:
+def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
     """Return the names of all effects of a group for a chain."""
     joints = chain.joints
     names = chain.joint_names
     revolute = [joint.name for joint in joints if joint.type == 'revolute']
     if group == 'ratio':
-        return tuple(f'{name}.ratio' for name in names)
+        return tuple(Parameter(name, group) for name in names)
     if group == 'coupling':
         wrist = names[-WRIST:]
         return tuple(
-            f'{wrist[i]}.coupling_{wrist[j]}' for i in range(len(wrist)) for j in range(i)
+            Parameter(wrist[i], f'coupling_{wrist[j]}')
+            for i in range(len(wrist))
+            for j in range(i)
         )
     if group == 'eccentricity':
-        return tuple(f'{name}.{wave}_{k}' for name in revolute for k in (1, 2) for wave in WAVES)
+        return tuple(name for joint in revolute for k in (1, 2) for name in waves(joint, k))
     if group == 'gear':
         return tuple(
-            f'{joint.name}.{wave}_{k * joint.gear_ratio:g}'
+            name
             for joint in joints
             if joint.gear_ratio
             for k in (1, 2)
-            for wave in WAVES
+            for name in waves(joint.name, k * joint.gear_ratio)
         )
     if group == 'gravity':
         return tuple(
-            f'{joint.name}.gravity_{other}'
+            Parameter(joint.name, f'gravity_{other}')
             for i, joint in enumerate(joints)
             if joint.type == 'revolute'
             for other in names[i:]
         )
     if group in ('compliance', 'backlash'):
-        return tuple(f'{name}.{group}' for name in revolute)
+        return tuple(Parameter(name, group) for name in revolute)
     raise UnknownNameError('group of effects', group, GROUPS)
 
 
@@ -99,11 +101,16 @@ ROUNDING = 1e-12
 """Share of gravity below which what turns a joint is a rounding error."""
 
 
+def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:
+    """Return sine and cosine of a harmonic of a joint."""
+    return tuple(Parameter(joint, f'{wave}_{harmonic:g}') for wave in WAVES)
+
+
 def resolve(chain: Chain, name: str) -> tuple[str, ...]:
     """Return the effects that a group or a single name stands for."""
     if name in GROUPS:
         return members(chain, name)
-    joint = name.partition('.')[0]
+    joint = Parameter(name).owner
     if joint not in chain.joint_names:
         known = name if '.' not in name else joint
         raise UnknownNameError('effect or joint', known, (*GROUPS, *chain.joint_names))
@@ -113,7 +120,7 @@ def resolve(chain: Chain, name: str) -> tuple[str, ...]:
 
 def check(name: str, joints: Sequence[str]) -> None:
     """Refuse the name of an effect that does not exist."""
-    first, _, rest = name.partition('.')[2].partition('_')
+    first, rest = Parameter(name).effect
     if first in ('coupling', 'gravity'):
         if rest not in joints:
             raise UnknownNameError(f'joint in effect {name}', rest, joints)
@@ -126,16 +133,6 @@ def check(name: str, joints: Sequence[str]) -> None:
             raise UnknownNameError(f'harmonic in effect {name}', rest, ('1', '2', '...'))
     elif first not in ('ratio', 'compliance', 'backlash') or rest:
         raise UnknownNameError('effect', name, GROUPS)
-
-
-def unit(name: str) -> str:
-    """Return the unit of an effect's value."""
-    return {
-        'ratio': '1',
-        'coupling': '1',
-        'gravity': 'rad/m',
-        'compliance': 'rad/(N m)',
-    }.get(group_of(name), 'rad')
 
 
 def expected(name: str) -> float:
@@ -180,8 +177,8 @@ def _by_kind(
     number = {name: i for i, name in enumerate(joint_names)}
     found: dict[str, list[tuple[int, int, float]]] = {}
     for row, name in enumerate(names):
-        joint, _, kind = name.partition('.')
-        first, _, rest = kind.partition('_')
+        first, rest = Parameter(name).effect
+        joint = Parameter(name).owner
         other = number[rest] if rest in number else float(rest or 0)
         found.setdefault(first, []).append((row, number[joint], other))
     return {

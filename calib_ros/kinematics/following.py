@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import LEVER, Aim, driven, limits, solve_positive
+from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.se3 import FloatArray, transform
 
@@ -81,7 +81,11 @@ class Solution:
 def mobility(chain: Chain) -> int:
     """Return how many freedoms of its flange an arm controls, 6 at most."""
     q = chain.random_joints(10, np.random.default_rng(0))
-    return int(np.linalg.matrix_rank(ErrorModel(chain, driven(chain)).jacobian(q), 1e-6).max())
+    return int(
+        np.linalg.matrix_rank(
+            ErrorModel(chain, [joint.driven for joint in chain.joints]).jacobian(q), 1e-6
+        ).max()
+    )
 
 
 class Follower:

@@ -127,7 +127,7 @@ class Aim:
 
     def __init__(self, chain: Chain, base: str = 'base', tool: str = 'tool') -> None:
         self._chain = chain
-        self._model = ErrorModel(chain, driven(chain), base, tool)
+        self._model = ErrorModel(chain, [joint.driven for joint in chain.joints], base, tool)
         self._signs = np.array([float(joint.sign) for joint in chain.joints])[:, None, None]
         kinds = [joint.type for joint in chain.joints]
         self._turning = np.flatnonzero([kind == 'revolute' for kind in kinds])
@@ -173,12 +173,6 @@ class Aim:
             moved[k] += DIFFERENCE
             slope[:, k] = (self._chain.effective(moved, approach) - here) / DIFFERENCE
         return slope
-
-
-def driven(chain: Chain) -> list[str]:
-    """Return the parameter that each joint drives."""
-    kinds = {'revolute': 'theta', 'prismatic': 'd'}
-    return [f'{joint.name}.{kinds[joint.type]}' for joint in chain.joints]
 
 
 def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:

@@ -24,15 +24,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.chain import ANGLES, DELAY, DH_KINDS, FRAME_KINDS, Chain
-from calib_ros.kinematics.lens import LENS_KINDS
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import (
+    ANGLES,
+    DELAY,
+    DH_KINDS,
+    LENS_KINDS,
+    Parameter,
+    parameters_of,
+)
 from calib_ros.kinematics.se3 import FloatArray
 
 
@@ -57,9 +64,10 @@ class ErrorModel:
         self.chain = chain
         self.names = tuple(names)
         self._ends = (base, tool)
-        joints = tuple((joint.name, joint.type) for joint in chain.joints)
+        turning = tuple(bool(turns) for turns in chain.walk.turning)
         fitted = tuple(name for name, _ in chain.effects if name in self.names)
         standard = chain.convention == 'standard'
+        joints = tuple(zip(chain.joint_names, turning, strict=True))
         self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
         self.rotations = self._layout.rotations
         """Number of rotational parameters; they come first in the arrays of `linearise`."""
@@ -191,32 +199,47 @@ class _Layout(NamedTuple):
     delay: int | None
 
 
+Line: TypeAlias = tuple[int | None, int, bool]
+"""Frame of a walk, None for nowhere; axis along or about which something moves; if it turns."""
+
+
+def _lines(
+    joints: Mapping[str, int],
+    standard: bool,
+    frames: Sequence[str],
+    ends: tuple[str, str],
+) -> dict[str, Line]:
+    """Return along or about which line of a walk each parameter of joints and frames moves."""
+    at = {ends[0]: len(joints) + 1, ends[1]: len(joints) + 2}
+    found: dict[str, Line] = {}
+    for frame in frames:
+        for k, name in enumerate(parameters_of(frame)):
+            found[name] = (at.get(frame), k % 3, k > 2)
+        found[Parameter(frame, DELAY)] = (None, 0, True)
+        found |= dict.fromkeys(parameters_of(frame, LENS_KINDS), (None, 0, False))
+    along = {'a': 0, 'alpha': 0, 'beta': 1}
+    for joint, i in joints.items():
+        for name in parameters_of(joint, DH_KINDS):
+            here = i + 1 if standard and name.kind in along else i
+            found[name] = (here, along.get(name.kind, 2), name.kind in ANGLES)
+    return found
+
+
 @lru_cache(maxsize=64)
 def _layout(
     names: tuple[str, ...],
-    joints: tuple[tuple[str, str], ...],
+    joints: tuple[tuple[str, bool], ...],
     standard: bool,
     frames: tuple[str, ...],
     fitted: tuple[str, ...],
     ends: tuple[str, str],
 ) -> _Layout:
-    """Return the layout of named parameters of joints (name, type), frames and fitted effects."""
+    """Return the layout of named parameters of joints (name, turning), frames and effects."""
     number = {joint: i for i, (joint, _) in enumerate(joints)}
-    at = {ends[0]: len(joints) + 1, ends[1]: len(joints) + 2}
-    lines: dict[str, tuple[int | None, int, bool]] = {}  # frame, axis, and whether it turns
-    for frame in frames:
-        for k, kind in enumerate(FRAME_KINDS):
-            lines[f'{frame}.{kind}'] = (at.get(frame), k % 3, kind.startswith('r'))
-        lines[f'{frame}.{DELAY}'] = (None, 0, True)
-        lines |= {f'{frame}.{kind}': (None, 0, False) for kind in LENS_KINDS}
-    along = {'a': 0, 'alpha': 0, 'beta': 1}
-    for joint, i in number.items():
-        for kind in DH_KINDS:
-            here = i + 1 if standard and kind in along else i
-            lines[f'{joint}.{kind}'] = (here, along.get(kind, 2), kind in ANGLES)
-    owners = [number[name.partition('.')[0]] for name in fitted]
-    for name, i in zip(fitted, owners, strict=True):
-        lines[name] = (i, 2, joints[i][1] == 'revolute')
+    turning = [turns for _, turns in joints]
+    lines = _lines(number, standard, frames, ends)
+    owners = [number[Parameter(name).owner] for name in fitted]
+    lines |= {name: (i, 2, turning[i]) for name, i in zip(fitted, owners, strict=True)}
     for name in names:
         if name not in lines:
             raise UnknownNameError('parameter', name, lines)
@@ -226,12 +249,9 @@ def _layout(
     taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
     moved = [lines[name][0] is not None for name in ordered]
     # turned about itself the target stays where it is
-    lever = [yes and lines[n][0] != at[ends[1]] for yes, n in zip(moved, ordered, strict=True)]
-    axes = sorted({k for k, yes in zip(taken[:rotations], lever, strict=False) if yes})
-    levers = [
-        axes.index(k) if yes else len(axes)
-        for k, yes in zip(taken[:rotations], lever, strict=False)
-    ]
+    away = [lines[name][0] not in (None, len(joints) + 2) for name in ordered[:rotations]]
+    axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
+    levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
     return _Layout(
         row,
         rotations,
@@ -243,11 +263,11 @@ def _layout(
         _indices(taken[:rotations]),
         tuple(k for k, yes in enumerate(moved) if not yes),
         slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
-        any(name.endswith(('.a', '.alpha')) for name in names),
+        any(Parameter(name).kind in ('a', 'alpha') for name in names),
         fitted,
         _indices(row[name] for name in fitted),
         _indices(owners),
-        row.get(f'{ends[0]}.{DELAY}'),
+        row.get(Parameter(ends[0], DELAY)),
     )
 
 

@@ -20,11 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 
-LENS_KINDS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2', 'k3')
-"""Parameters of a lens: the first four in pixels."""
-IN_PIXELS = LENS_KINDS[:4]
 NEAREST = 1e-6
 """Depth [m] up to which a point is taken to be in front of the camera."""
 UNDISTORTIONS = 20
@@ -192,11 +190,6 @@ def at_the_board(seen: View, residual: FloatArray) -> FloatArray:
     square = along @ along.transpose(0, 2, 1)
     weights = np.linalg.solve(square, residual.T[..., np.newaxis])
     return np.asarray((along.transpose(0, 2, 1) @ weights)[..., 0])
-
-
-def of_lens(name: str) -> bool:
-    """Tell whether a parameter of a chain belongs to a lens."""
-    return name.partition('.')[2] in LENS_KINDS
 
 
 def require_lens(lens: Lens | None, camera: str) -> Lens:

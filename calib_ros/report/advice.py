@@ -3,13 +3,15 @@
 """Why a calibration was refused, for readers without a background in calibration.
 
 Each rule of acceptance has a heading, what it means, and what to do in the order in which to try
-it. A rule is known by words of its refusal.
+it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from calib_ros.identification.reasons import Reason, Rule
 
 
 @dataclass(frozen=True)
@@ -29,240 +31,186 @@ RIGHT_CHAIN = (
 )
 SPREAD = 'spread over the whole workspace, with every joint moved through most of its range'
 
-RULES: tuple[tuple[str, Advice], ...] = (
-    (
-        'Did its encoder slip',
-        Advice(
-            'A joint lost its zero while you measured',
-            'From one pose on, one joint reads differently than before. Measurements from before '
-            'describe an arm that no longer exists.',
-            (
-                'Check the mastering (zero position) of the joint named below.',
-                'Keep only what was measured after the slip, or measure again.',
-            ),
+RULES: dict[Rule, Advice] = {
+    Rule.ENCODER: Advice(
+        'A joint lost its zero while you measured',
+        'From one pose on, one joint reads differently than before. Measurements from before '
+        'describe an arm that no longer exists.',
+        (
+            'Check the mastering (zero position) of the joint named below.',
+            'Keep only what was measured after the slip, or measure again.',
         ),
     ),
-    (
-        'something moved',
-        Advice(
-            'Something moved while you measured',
-            'From one pose on, all measurements are shifted alike. The target, the measuring '
-            'device or the foot of the robot was bumped or moved.',
-            (
-                'Fasten the target, the device and the robot, then measure again.',
-                'Or keep the data: name two sessions, before and after, and fit both.',
-            ),
+    Rule.MOVED: Advice(
+        'Something moved while you measured',
+        'From one pose on, all measurements are shifted alike. The target, the measuring '
+        'device or the foot of the robot was bumped or moved.',
+        (
+            'Fasten the target, the device and the robot, then measure again.',
+            'Or keep the data: name two sessions, before and after, and fit both.',
         ),
     ),
-    (
-        'taken for gross errors',
-        Advice(
-            'The poses that were left out are the arm itself',
-            'Some poses did not fit and were set aside as faulty measurements. But they all go '
-            'with one joint, so it is the arm that behaves like this, not the device.',
-            (
-                'Run again with --model auto: it looks for such behaviour of the arm.',
-                'Or run with --loss none, which sets no pose aside.',
-            ),
+    Rule.OWN_BEHAVIOUR: Advice(
+        'The poses that were left out are the arm itself',
+        'Some poses did not fit and were set aside as faulty measurements. But they all go '
+        'with one joint, so it is the arm that behaves like this, not the device.',
+        (
+            'Run again with --model auto: it looks for such behaviour of the arm.',
+            'Or run with --loss none, which sets no pose aside.',
         ),
     ),
-    (
-        'not converged',
-        Advice(
-            'The computation found no stable answer',
-            'The measurements contradict each other or the description of the arm so much that '
-            'no set of corrections fits.',
-            (*RIGHT_CHAIN, f'Measure more poses, {SPREAD}.'),
+    Rule.CONVERGENCE: Advice(
+        'The computation found no stable answer',
+        'The measurements contradict each other or the description of the arm so much that '
+        'no set of corrections fits.',
+        (*RIGHT_CHAIN, f'Measure more poses, {SPREAD}.'),
+    ),
+    Rule.EXCITATION: Advice(
+        'Some joints hardly moved',
+        'An error of a joint shows only when that joint moves. The poses say nothing about '
+        'the parameters named below.',
+        (
+            f'Add poses {SPREAD}. `calib_ros plan` chooses them.',
+            'If a joint cannot move, hold its parameters with --fixed.',
         ),
     ),
-    (
-        'poses do not determine',
-        Advice(
-            'Some joints hardly moved',
-            'An error of a joint shows only when that joint moves. The poses say nothing about '
-            'the parameters named below.',
-            (
-                f'Add poses {SPREAD}. `calib_ros plan` chooses them.',
-                'If a joint cannot move, hold its parameters with --fixed.',
-            ),
+    Rule.COMMON_SENSE: Advice(
+        'This does not look like the right arm',
+        'A correction as large as this cannot come from manufacturing or wear. Most often '
+        'the description is that of another arm, or units or columns are mixed up.',
+        RIGHT_CHAIN,
+    ),
+    Rule.LARGEST_ERROR: Advice(
+        'The arm does not behave like its description',
+        'Even after the correction a large error is left. Most often the description is '
+        'that of another arm, or units or columns are mixed up.',
+        RIGHT_CHAIN,
+    ),
+    Rule.CONFIGURATIONS: Advice(
+        'Too few poses were measured',
+        'A correction must be tested on poses that it was not computed from. There are not '
+        'enough poses for both.',
+        (f'Measure at least 30 different poses, {SPREAD}.',),
+    ),
+    Rule.OUTLIERS: Advice(
+        'Too many measurements do not fit',
+        'More than a third of the poses disagree with all the others. Then nobody can tell '
+        'which ones are right.',
+        (
+            'Check that joint values and measurements belong to the same moment: the arm '
+            'must stand still, and clocks must agree.',
+            'Check that the target is fixed to the flange and the device to the floor.',
+            *RIGHT_CHAIN,
         ),
     ),
-    (
-        'than a faulty robot of this kind',
-        Advice(
-            'This does not look like the right arm',
-            'A correction as large as this cannot come from manufacturing or wear. Most often '
-            'the description is that of another arm, or units or columns are mixed up.',
-            RIGHT_CHAIN,
+    Rule.GAIN: Advice(
+        'The correction does not make the arm better',
+        'On poses that were not used to compute it, the corrected arm is no closer to the '
+        'measurements than the uncorrected one, or not by more than chance explains. The '
+        'arm may be as good as it gets, or the device too coarse to show more.',
+        (
+            'Compare the error before with the accuracy of the measuring device. If they '
+            'are alike, the arm needs no calibration that this device can measure.',
+            f'Else measure more poses, {SPREAD}.',
+            'Try --model auto: the error may come from gears or gravity.',
         ),
     ),
-    (
-        'is left on held-out poses',
-        Advice(
-            'The arm does not behave like its description',
-            'Even after the correction a large error is left. Most often the description is '
-            'that of another arm, or units or columns are mixed up.',
-            RIGHT_CHAIN,
+    Rule.DRIFT: Advice(
+        'The improvement may only be drift of the measuring device',
+        'The errors changed slowly during the session. A measuring device that warms up or '
+        'settles does just that. Then the correction would fit the device, not the robot, '
+        'and be wrong tomorrow.',
+        (
+            'Let the measuring device warm up.',
+            'Measure the same poses again in random order.',
+            'Measure more poses, further apart from one to the next.',
         ),
     ),
-    (
-        'too few configurations',
-        Advice(
-            'Too few poses were measured',
-            'A correction must be tested on poses that it was not computed from. There are not '
-            'enough poses for both.',
-            (f'Measure at least 30 different poses, {SPREAD}.',),
+    Rule.REGION: Advice(
+        'The correction is not certain enough to help',
+        'The correction is smaller than its own uncertainty, even at the poses measured. '
+        'Used on the arm, it could make it worse.',
+        (
+            f'Measure more poses, {SPREAD}. `calib_ros plan --accuracy` says how many.',
+            'Measure with a more accurate device, or orientation as well as position.',
         ),
     ),
-    (
-        'are outliers',
-        Advice(
-            'Too many measurements do not fit',
-            'More than a third of the poses disagree with all the others. Then nobody can tell '
-            'which ones are right.',
-            (
-                'Check that joint values and measurements belong to the same moment: the arm '
-                'must stand still, and clocks must agree.',
-                'Check that the target is fixed to the flange and the device to the floor.',
-                *RIGHT_CHAIN,
-            ),
+    Rule.GAIN_WITH_OUTLIERS: Advice(
+        'The correction helps most poses and harms some',
+        'Some poses were set aside as faulty measurements. Counting them, the corrected arm '
+        'is worse than before. Perhaps they were right.',
+        (
+            'Look at the poses marked as outliers below, and measure these again.',
+            'Run with --model auto or --loss none.',
         ),
     ),
-    (
-        'no gain on held-out poses',
-        Advice(
-            'The correction does not make the arm better',
-            'On poses that were not used to compute it, the corrected arm is no closer to the '
-            'measurements than the uncorrected one, or not by more than chance explains. The '
-            'arm may be as good as it gets, or the device too coarse to show more.',
-            (
-                'Compare the error before with the accuracy of the measuring device. If they '
-                'are alike, the arm needs no calibration that this device can measure.',
-                f'Else measure more poses, {SPREAD}.',
-                'Try --model auto: the error may come from gears or gravity.',
-            ),
+    Rule.ROUNDING: Advice(
+        'The joint values are too coarse',
+        'The recording rounds the joint values. The improvement found is no larger than '
+        'what this rounding alone could cause.',
+        (
+            'Record the joint values with all their digits, as the controller knows them.',
+            'Measure different poses rather than the same ones many times.',
         ),
     ),
-    (
-        'that of a drift',
-        Advice(
-            'The improvement may only be drift of the measuring device',
-            'The errors changed slowly during the session. A measuring device that warms up or '
-            'settles does just that. Then the correction would fit the device, not the robot, '
-            'and be wrong tomorrow.',
-            (
-                'Let the measuring device warm up.',
-                'Measure the same poses again in random order.',
-                'Measure more poses, further apart from one to the next.',
-            ),
+    Rule.ORIENTATION: Advice(
+        'The position gets better, the orientation worse',
+        'On poses that were not used to compute it, the corrected arm points less precisely '
+        'than before. Often the stated accuracy of the device is wrong.',
+        (
+            'Check --sigma-position and --sigma-orientation against the data sheet of the device.',
+            'Check that the target sits rigidly on the flange.',
         ),
     ),
-    (
-        'too little is known',
-        Advice(
-            'The correction is not certain enough to help',
-            'The correction is smaller than its own uncertainty, even at the poses measured. '
-            'Used on the arm, it could make it worse.',
-            (
-                f'Measure more poses, {SPREAD}. `calib_ros plan --accuracy` says how many.',
-                'Measure with a more accurate device, or orientation as well as position.',
-            ),
+    Rule.SCALE: Advice(
+        'The measuring device is out of scale',
+        'All lengths of the arm came out too long or too short by the same factor. No arm '
+        'is built like that; a measuring device with a wrong scale shows just this.',
+        (
+            'Check the scale of the device with a length that you know, such as a scale bar.',
+            'Check the temperature and pressure that are set in the device.',
         ),
     ),
-    (
-        'with the outliers',
-        Advice(
-            'The correction helps most poses and harms some',
-            'Some poses were set aside as faulty measurements. Counting them, the corrected arm '
-            'is worse than before. Perhaps they were right.',
-            (
-                'Look at the poses marked as outliers below, and measure these again.',
-                'Run with --model auto or --loss none.',
-            ),
+    Rule.UNKNOWN_LOSS: Advice(
+        'Nobody can tell how much of the recording is missing',
+        'The recording does not say how many messages it should hold. What is missing could '
+        'be just the poses that matter.',
+        (
+            'Repair the recording: `ros2 bag reindex`.',
+            'If you know that it is complete, run with --largest-loss 1.',
         ),
     ),
-    (
-        'rounded joint values',
-        Advice(
-            'The joint values are too coarse',
-            'The recording rounds the joint values. The improvement found is no larger than '
-            'what this rounding alone could cause.',
-            (
-                'Record the joint values with all their digits, as the controller knows them.',
-                'Measure different poses rather than the same ones many times.',
-            ),
+    Rule.UNREADABLE: Advice(
+        'A part of the recording cannot be read',
+        'The recording is damaged. What is missing could be just the poses that matter.',
+        (
+            'Copy the recording again from the computer that made it.',
+            'If what is left is enough, run with the --largest-loss named below.',
         ),
     ),
-    (
-        'orientation got worse',
-        Advice(
-            'The position gets better, the orientation worse',
-            'On poses that were not used to compute it, the corrected arm points less precisely '
-            'than before. Often the stated accuracy of the device is wrong.',
-            (
-                'Check --sigma-position and --sigma-orientation against the data sheet of the '
-                'device.',
-                'Check that the target sits rigidly on the flange.',
-            ),
+    Rule.DROPPED: Advice(
+        'Much of what was recorded could not be used',
+        'Joint values and measurements are matched by their time stamps. Too many had stamps '
+        'that match nothing.',
+        (
+            'Make the clocks of robot and measuring device agree (NTP or PTP).',
+            'Record both from the same computer.',
+            'If what is left is enough, run with the --largest-loss named below.',
         ),
     ),
-    (
-        'check the scale of the measuring device',
-        Advice(
-            'The measuring device is out of scale',
-            'All lengths of the arm came out too long or too short by the same factor. No arm '
-            'is built like that; a measuring device with a wrong scale shows just this.',
-            (
-                'Check the scale of the device with a length that you know, such as a scale bar.',
-                'Check the temperature and pressure that are set in the device.',
-            ),
-        ),
+    Rule.MISTAKE: Advice(
+        'Something in the input is not what it seems',
+        'As given, the measurements do not fit this arm. With the change named below they do.',
+        ('Check whether it is so. If it is, run again with the option named below.',),
     ),
-    (
-        'the bag is lost is not known',
-        Advice(
-            'Nobody can tell how much of the recording is missing',
-            'The recording does not say how many messages it should hold. What is missing could '
-            'be just the poses that matter.',
-            (
-                'Repair the recording: `ros2 bag reindex`.',
-                'If you know that it is complete, run with --largest-loss 1.',
-            ),
-        ),
+    Rule.POSED: Advice(
+        'The joint values were not measured',
+        'Only the places of camera and board were computed, not the arm.',
+        ('Record the joint values at each image to calibrate the arm.',),
     ),
-    (
-        'could not be read',
-        Advice(
-            'A part of the recording cannot be read',
-            'The recording is damaged. What is missing could be just the poses that matter.',
-            (
-                'Copy the recording again from the computer that made it.',
-                'If what is left is enough, run with the --largest-loss named below.',
-            ),
-        ),
-    ),
-    (
-        'dropped for their stamps',
-        Advice(
-            'Much of what was recorded could not be used',
-            'Joint values and measurements are matched by their time stamps. Too many had stamps '
-            'that match nothing.',
-            (
-                'Make the clocks of robot and measuring device agree (NTP or PTP).',
-                'Record both from the same computer.',
-                'If what is left is enough, run with the --largest-loss named below.',
-            ),
-        ),
-    ),
-)
-OTHER = Advice('The result did not pass a check', '', ('Read the reason given below.',))
+}
 
 
-def advice(refusals: Sequence[str]) -> tuple[Advice, ...]:
+def advice(reasons: Sequence[Reason]) -> tuple[Advice, ...]:
     """Return each refusal in plain words."""
-    return tuple(_advice(each) for each in refusals)
-
-
-def _advice(refusal: str) -> Advice:
-    found = next((each for words, each in RULES if words in refusal), OTHER)
-    return Advice(found.heading, found.meaning, found.steps, refusal)
+    return tuple(replace(RULES[each.rule], refusal=str(each)) for each in reasons)

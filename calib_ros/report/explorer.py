@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.escapes import one_line
-from calib_ros.kinematics.chain import DH_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import numbers, unit_of
 from calib_ros.report.poses import FITTED, JUDGED, REPEATED, Poses

@@ -12,8 +12,8 @@ from scipy import special
 
 from calib_ros.apply.workspace import Survey, rms_map
 from calib_ros.escapes import one_line
-from calib_ros.identification.validation import Parameter
-from calib_ros.kinematics.chain import Chain, Joint, is_length
+from calib_ros.identification.validation import ParameterRow
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.poses import Poses
 
@@ -37,26 +37,45 @@ def label(name: str) -> str:
     return one_line(name).replace('&', '&amp;').replace('<', '&lt;')
 
 
+def axis(title: str, **more: Any) -> Figure:
+    """Return an axis, or a scale of colours, with its title."""
+    return {'title': {'text': title}, **more}
+
+
+def scale_of(title: str, colours: str = 'Viridis', **more: Any) -> Figure:
+    """Return how values are shown as colours, with the scale beside the figure."""
+    bar = axis(title, thickness=12)
+    return {'colorscale': colours, 'reversescale': True, 'colorbar': bar, **more}
+
+
+def _margin(left: int, top: int, bottom: int) -> dict[str, int]:
+    return {'l': left, 'r': 16, 't': top, 'b': bottom}
+
+
+def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> Figure:
+    return {
+        'type': 'scatter',
+        'mode': mode,
+        'name': name,
+        'x': numbers(x),
+        'y': numbers(y),
+        **more,
+    }
+
+
 def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:
     """Return the share of poses with at most a given position error (N,)."""
     share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
     data = [
-        {
-            'type': 'scatter',
-            'mode': 'lines',
-            'name': name,
-            'x': numbers(np.quantile(errors, share)),
-            'y': numbers(100.0 * share),
-            'line': {'color': colour, 'dash': dash},
-        }
-        for name, errors, colour, dash in (
-            ('before', before_mm, BEFORE, 'dash'),
-            ('after', after_mm, AFTER, 'solid'),
+        _curve('lines', name, np.quantile(errors, share), 100.0 * share, line=line)
+        for name, errors, line in (
+            ('before', before_mm, {'color': BEFORE, 'dash': 'dash'}),
+            ('after', after_mm, {'color': AFTER, 'dash': 'solid'}),
         )
     ]
     layout = {
-        'xaxis': {'title': {'text': 'position error [mm]'}, 'rangemode': 'tozero'},
-        'yaxis': {'title': {'text': 'poses with at most this error [%]'}, 'range': [0, 100]},
+        'xaxis': axis('position error [mm]', rangemode='tozero'),
+        'yaxis': axis('poses with at most this error [%]', range=[0, 100]),
     }
     return {'data': data, 'layout': layout}
 
@@ -65,7 +84,6 @@ def against_noise(poses: Poses) -> Figure:
     """Return the quantiles of residuals in stated sigmas against those of a normal law."""
     chosen = poses.select(poses.judged)
     data: list[Figure] = []
-    reach = 3.0
     for name, errors, column, colour, symbol in (
         ('position', chosen.after, 0, AFTER, 'circle'),
         ('orientation', chosen.turned_after, 1, '#7570b3', 'diamond'),
@@ -75,44 +93,37 @@ def against_noise(poses: Poses) -> Figure:
         if not z.size:
             continue
         share = (np.arange(min(QUANTILES, z.size)) + 0.5) / min(QUANTILES, z.size)
-        data.append(
-            {
-                'type': 'scatter',
-                'mode': 'markers',
-                'name': name,
-                'x': numbers(special.ndtri(share)),
-                'y': numbers(np.quantile(z, share)),
-                'marker': {'color': colour, 'symbol': symbol, 'size': 5},
-            }
-        )
-    line: Figure = {'type': 'scatter', 'mode': 'lines', 'name': 'noise as stated'}
-    line |= {'x': [-reach, reach], 'y': [-reach, reach], 'line': {'color': LIMIT, 'dash': 'dot'}}
+        marker = {'color': colour, 'symbol': symbol, 'size': 5}
+        x, y = special.ndtri(share), np.quantile(z, share)
+        data.append(_curve('markers', name, x, y, marker=marker))
+    ends = np.array([-3.0, 3.0])
+    line = {'color': LIMIT, 'dash': 'dot'}
+    data.append(_curve('lines', 'noise as stated', ends, ends, line=line))
     layout = {
-        'xaxis': {'title': {'text': 'expected of pure noise [sigma]'}},
-        'yaxis': {'title': {'text': 'measured [stated sigma]'}},
+        'xaxis': axis('expected of pure noise [sigma]'),
+        'yaxis': axis('measured [stated sigma]'),
     }
-    return {'data': [*data, line], 'layout': layout}
+    return {'data': data, 'layout': layout}
 
 
-def forest(parameters: Sequence[Parameter], lengths: bool, limit: float) -> Figure | None:
+def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> Figure | None:
     """Return offsets with their 95 % intervals, of lengths [mm] or of angles [mrad].
 
     `limit` [m or rad] is that of common sense: drawn where it comes near.
     """
-    found = [p for p in parameters if p.std is not None and is_length(p.name) == lengths]
+    found = [p for p in parameters if p.std is not None and p.name.is_length == lengths]
     if not found:
         return None
     unit = 'mm' if lengths else 'mrad'
     offsets = 1e3 * np.array([p.offset for p in found])
     widths = 1e3 * np.array([p.half_width() or 0.0 for p in found])
     reach = 1.1 * float(np.max(np.abs(offsets) + widths, initial=1e-3))
-    names = [label(p.name) for p in found]
     dots = {
         'type': 'scatter',
         'mode': 'markers',
         'name': 'offset and 95 % interval',
         'x': numbers(offsets),
-        'y': names,
+        'y': [label(p.name) for p in found],
         'error_x': {'type': 'data', 'array': numbers(widths), 'color': AFTER, 'thickness': 2},
         'marker': {'color': AFTER, 'size': 8},
         'hovertemplate': f'%{{y}}: %{{x:.4f}} {unit}<extra></extra>',
@@ -124,10 +135,10 @@ def forest(parameters: Sequence[Parameter], lengths: bool, limit: float) -> Figu
         lines += [{'x0': x, 'x1': x, 'line': edge} for x in (-1e3 * limit, 1e3 * limit)]
     shape = {'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1}
     layout = {
-        'xaxis': {'title': {'text': f'offset from nominal [{unit}]'}, 'range': [-reach, reach]},
+        'xaxis': axis(f'offset from nominal [{unit}]', range=[-reach, reach]),
         'yaxis': {'autorange': 'reversed', 'automargin': True},
         'shapes': [shape | each for each in lines],
-        'margin': {'l': 170, 'r': 16, 't': 30, 'b': 50},
+        'margin': _margin(170, 30, 50),
         'showlegend': True,
     }
     return {'data': [dots], 'layout': layout}
@@ -136,22 +147,20 @@ def forest(parameters: Sequence[Parameter], lengths: bool, limit: float) -> Figu
 def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
     """Return the correlations of fitted parameters (P, P) as a heat map."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    labels = list(map(label, names))
     mesh = {
         'type': 'heatmap',
-        'x': list(map(label, names)),
-        'y': list(map(label, names)),
+        'x': labels,
+        'y': labels,
         'z': numbers(covariance / np.outer(scale, scale), 3),
-        'zmin': -1,
-        'zmax': 1,
-        'colorscale': 'RdBu',
-        'reversescale': True,
-        'colorbar': {'title': {'text': 'correlation'}, 'thickness': 12},
+        **scale_of('correlation', 'RdBu', zmin=-1, zmax=1),
         'hovertemplate': '%{y} and %{x}: %{z:.2f}<extra></extra>',
     }
+    small = {'tickfont': {'size': 10}, 'automargin': True}
     layout = {
-        'xaxis': {'tickfont': {'size': 10}, 'automargin': True},
-        'yaxis': {'autorange': 'reversed', 'tickfont': {'size': 10}, 'automargin': True},
-        'margin': {'l': 130, 'r': 16, 't': 20, 'b': 90},
+        'xaxis': small,
+        'yaxis': {'autorange': 'reversed', **small},
+        'margin': _margin(130, 20, 90),
     }
     return {'data': [mesh], 'layout': layout}
 
@@ -183,21 +192,18 @@ def coverage(chain: Chain, joints: FloatArray) -> tuple[Figure, tuple[tuple[str,
         used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
         share = 100.0 * float(np.mean(counts[k] > 0))
         rows.append((joint.name, ends, used, f'{share:.0f} %'))
-    shown = np.where(counts > 0, counts, np.nan)
     mesh = {
         'type': 'heatmap',
         'x': numbers(100.0 * (np.arange(BINS) + 0.5) / BINS, 4),
         'y': labels,
-        'z': numbers(shown),
-        'colorscale': 'Viridis',
-        'reversescale': True,
-        'colorbar': {'title': {'text': 'poses'}, 'thickness': 12},
+        'z': numbers(np.where(counts > 0, counts, np.nan)),
+        **scale_of('poses'),
         'hovertemplate': '%{y}<br>%{z} poses<extra></extra>',
     }
     layout = {
-        'xaxis': {'title': {'text': 'place in the range of the joint [%]'}, 'range': [0, 100]},
+        'xaxis': axis('place in the range of the joint [%]', range=[0, 100]),
         'yaxis': {'autorange': 'reversed', 'automargin': True},
-        'margin': {'l': 130, 'r': 16, 't': 20, 'b': 50},
+        'margin': _margin(130, 20, 50),
     }
     return {'data': [mesh], 'layout': layout}, tuple(rows)
 
@@ -205,13 +211,11 @@ def coverage(chain: Chain, joints: FloatArray) -> tuple[Figure, tuple[tuple[str,
 def error_map(survey: Survey) -> Figure:
     """Return the RMS of what a calibration removes and of what remains by radius and height."""
     x, y, z = survey.positions.T
-    parts = [('removed by the calibration', survey.removed)]
-    if not np.isnan(survey.remaining).any():
-        parts.append(('expected to remain', survey.remaining))
-    largest = 1e3 * max(float(np.quantile(errors, 0.99)) for _, errors in parts)
+    parts = dict(list(survey.parts.items())[::2])  # without sigma
+    largest = 1e3 * max(float(np.quantile(errors, 0.99)) for errors in parts.values())
     data: list[Figure] = []
     layout: Figure = {'grid': {'rows': 1, 'columns': len(parts), 'pattern': 'independent'}}
-    for k, (label, errors) in enumerate(parts):
+    for k, (label, errors) in enumerate(parts.items()):
         end = str(k + 1) if k else ''
         radius, height, rms = rms_map(np.hypot(x, y), z, 1e3 * errors)
         data.append(
@@ -220,47 +224,50 @@ def error_map(survey: Survey) -> Figure:
                 'x': numbers(0.5 * (radius[1:] + radius[:-1])),
                 'y': numbers(0.5 * (height[1:] + height[:-1])),
                 'z': numbers(rms.T, 3),
-                'zmin': 0,
-                'zmax': largest,
                 'xaxis': f'x{end}',
                 'yaxis': f'y{end}',
-                'colorscale': 'Viridis',
-                'reversescale': True,
-                'showscale': k == 0,
-                'colorbar': {'title': {'text': 'RMS [mm]'}, 'thickness': 12},
+                **scale_of('RMS [mm]', zmin=0, zmax=largest, showscale=k == 0),
                 'hovertemplate': 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm<extra></extra>',
             }
         )
-        layout[f'xaxis{end}'] = {'title': {'text': f'radius [m]<br>{label}'}}
-        layout[f'yaxis{end}'] = {} if k else {'title': {'text': 'height [m]'}}
-    layout['margin'] = {'l': 60, 'r': 16, 't': 20, 'b': 70}
+        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{label}')
+        layout[f'yaxis{end}'] = {} if k else axis('height [m]')
+    layout['margin'] = _margin(60, 20, 70)
     return {'data': data, 'layout': layout}
 
 
 def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | None) -> Figure:
     """Return the error that 1, 2, ... K planned poses promise [m], and so many random ones."""
-    count = np.arange(1, len(accuracy) + 1)
+    count = np.arange(1.0, len(accuracy) + 1)
     data = []
-    for name, errors, colour, dash in (
-        ('planned', accuracy, AFTER, 'solid'),
-        ('at random', at_random, BEFORE, 'dash'),
+    for name, errors, line in (
+        ('planned', accuracy, {'color': AFTER, 'dash': 'solid'}),
+        ('at random', at_random, {'color': BEFORE, 'dash': 'dash'}),
     ):
         known = np.isfinite(errors)
-        data.append(
-            {
-                'type': 'scatter',
-                'mode': 'lines+markers',
-                'name': name,
-                'x': count[known].tolist(),
-                'y': numbers(1e3 * errors[known]),
-                'line': {'color': colour, 'dash': dash},
-            }
-        )
+        data.append(_curve('lines+markers', name, count[known], 1e3 * errors[known], line=line))
     layout: Figure = {
-        'xaxis': {'title': {'text': 'poses measured'}},
-        'yaxis': {'title': {'text': 'predicted RMS error [mm]'}, 'type': 'log'},
+        'xaxis': axis('poses measured'),
+        'yaxis': axis('predicted RMS error [mm]', type='log'),
     }
     if wanted_mm is not None:
-        line = {'type': 'line', 'xref': 'paper', 'x0': 0, 'x1': 1, 'y0': wanted_mm}
-        layout['shapes'] = [line | {'y1': wanted_mm, 'line': {'color': LIMIT, 'dash': 'dot'}}]
+        dotted = {'color': LIMIT, 'dash': 'dot'}
+        at = {'x0': 0, 'x1': 1, 'y0': wanted_mm, 'y1': wanted_mm}
+        layout['shapes'] = [{'type': 'line', 'xref': 'paper', **at, 'line': dotted}]
     return {'data': data, 'layout': layout}
+
+
+def in_space(positions: FloatArray, name: str, **more: Any) -> Figure:
+    """Return points (N, 3) [m] in space."""
+    x, y, z = (numbers(each) for each in positions.T)
+    return {'type': 'scatter3d', 'mode': 'markers', 'x': x, 'y': y, 'z': z, 'name': name, **more}
+
+
+def space(*data: Figure) -> Figure:
+    """Return a figure in space, all axes in one scale."""
+    axes = {f'{name}axis': axis(f'{name} [m]') for name in 'xyz'}
+    margin = {'l': 0, 'r': 0, 't': 30, 'b': 0}
+    return {
+        'data': list(data),
+        'layout': {'scene': {'aspectmode': 'data', **axes}, 'margin': margin},
+    }

@@ -7,21 +7,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from calib_ros.apply.verification import MOST_LINES, Verification
+from calib_ros.apply.verification import Verification
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report.advice import SPREAD
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
-from calib_ros.report.reports import (
+from calib_ros.report.sections import (
     HEAD,
     ISO_9283,
     accuracy_rows,
     coverage,
-    distributions,
+    distribution,
     gain,
     identity_of,
 )
@@ -81,7 +79,7 @@ def verification_report(
         explorer=explorer(chain, poses),
         sections=(
             *_by_configuration(found),
-            *distributions(poses),
+            distribution(poses),
             coverage(chain, poses.joints, 'How far each joint was moved'),
         ),
         inputs=origin.inputs,
@@ -104,18 +102,8 @@ def _assumed(found: Verification) -> tuple[str, ...]:
 
 def _by_configuration(found: Verification) -> list[Section]:
     """Return accuracy and repeatability of a few configurations, one by one."""
-    if found.configurations > MOST_LINES:
+    if not found.each:
         return []
-    rows = []
-    for k in range(found.configurations):
-        before, after = (
-            1e3 * each.position[found.group == k]
-            for each in (found.comparison.before, found.comparison.after)
-        )
-        apart = np.linalg.norm(after - after.mean(axis=0), axis=1)
-        again = f'{apart.mean() + 3.0 * apart.std(ddof=1):.4f}' if len(after) > 1 else ''
-        accuracies = (f'{np.linalg.norm(each.mean(axis=0)):.4f}' for each in (before, after))
-        rows.append((f'P{k + 1}', str(len(after)), *accuracies, again))
     return [
         Section(
             'configurations',
@@ -125,6 +113,15 @@ def _by_configuration(found: Verification) -> list[Section]:
                 'mean + 3 sigma.',
             ),
             head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
-            rows=tuple(rows),
+            rows=tuple(
+                (
+                    f'P{k}',
+                    str(pose.cycles),
+                    f'{pose.before:.4f}',
+                    f'{pose.after:.4f}',
+                    '' if pose.repeatability is None else f'{pose.repeatability:.4f}',
+                )
+                for k, pose in enumerate(found.each, 1)
+            ),
         )
     ]

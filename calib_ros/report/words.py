@@ -1,28 +1,25 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A result in words and tables: a line for the operator, Markdown, JSON, the corrected chain."""
+"""A result in words: a line for the operator, phrases for pages, JSON, the corrected chain."""
 
 from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
 
 import calib_ros
-from calib_ros.escapes import in_markdown
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.region import Region
-from calib_ros.identification.validation import Comparison, ErrorFigures, Parameter
+from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import DELAY, DH_KINDS, FRAME_KINDS, Chain, is_length
-from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, nominal_record, table_hash
-from calib_ros.kinematics.lens import IN_PIXELS, of_lens
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import dump_yaml
 from calib_ros.kinematics.se3 import to_quat
-from calib_ros.sampling.calibration import Calibration
 from calib_ros.settings import Settings
 
 HOLDS = 1.5
@@ -48,32 +45,38 @@ def summary(
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
-    if result.unidentifiable:
-        text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
-    if result.outliers:
-        if numbers is None:
-            text += f'; {len(result.outliers)} outliers named in the report carry no weight'
-        else:
-            named = _outliers_in_words(result.outliers, numbers)
-            text += f'; {len(result.outliers)} outliers carry no weight: {named}'
-    if result.chain.effects:
-        groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
-        text += f'; with {len(result.chain.effects)} effects ({", ".join(groups)})'
-    given = set(result.priors) - set(result.weak)
-    if given:
-        text += f'; priors on {len(given)} parameters'
+    if result.outliers and numbers is None:
+        text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+    elif numbers is not None and result.outliers:
+        named = _outliers_in_words(result.outliers, numbers)
+        text += f'; {len(result.outliers)} outliers carry no weight: {named}'
     if result.region is not None:
         text += f'; {result.region.in_words()}'
-    if result.weak:
-        text += f'; hardly determined, held near nominal by priors: {", ".join(result.weak)}'
-    weak = [name for name in weakly_determined(result) if name not in result.weak]
-    if weak:
-        text += f'; weakly determined: {", ".join(weak)}'
-    if notes := (*warnings, *result.remarks):
-        text += f'; note: {"; ".join(notes)}'
+    text = '; '.join((text, *notes(result)))
+    if more := (*warnings, *result.remarks):
+        text += f'; note: {"; ".join(more)}'
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
+
+
+def notes(result: Identification) -> list[str]:
+    """Return what there is to know of the parameters, one thing each."""
+    found = []
+    if result.unidentifiable:
+        found.append(f'not identifiable, kept nominal: {", ".join(result.unidentifiable)}')
+    if result.chain.effects:
+        groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
+        found.append(f'with {len(result.chain.effects)} effects ({", ".join(groups)})')
+    given = set(result.priors) - set(result.weak)
+    if given:
+        found.append(f'priors on {len(given)} parameters')
+    if result.weak:
+        found.append(f'hardly determined, held near nominal by priors: {", ".join(result.weak)}')
+    weak = [name for name in weakly_determined(result) if name not in result.weak]
+    if weak:
+        found.append(f'weakly determined: {", ".join(weak)}')
+    return found
 
 
 def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
@@ -93,37 +96,8 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     return tuple(
         p.name
         for p in result.parameters
-        if p.std is not None and p.std > WEAK and not of_lens(p.name)
+        if p.std is not None and p.std > WEAK and not p.name.of_lens
     )
-
-
-def provenance(result: Identification) -> dict[str, Any]:
-    """Return where the numbers of a corrected chain come from, as plain values."""
-    before, after = (result.validation or result.fitted).figures
-    return {
-        'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-        'software': f'calib_ros {calib_ros.__version__}',
-        'accepted': result.accepted,
-        'world_frame': result.world_frame,
-        'samples': len(result.fitted.judged),
-        'outliers': len(result.outliers),
-        'validated_by': result.validated_by,
-        'rms_mm_before': round(before.rms_mm, 6),
-        'rms_mm_after': round(after.rms_mm, 6),
-        'not_identifiable': list(result.unidentifiable),
-        'table_sha256': table_hash(result.chain),
-        'nominal': nominal_record(result.before),
-        'region': None if result.region is None else result.region.document(),
-    }
-
-
-def calibration_yaml(result: Identification, origin: Mapping[str, Any] | None = None) -> str:
-    """Return the corrected chain as the text of a chain file, which can be an input again.
-
-    `origin` says where the samples come from.
-    """
-    head = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
-    return head + dump_chain(result.chain, provenance(result) | dict(origin or {}))
 
 
 def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
@@ -138,16 +112,14 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
 
 
 def verdict(
-    calibration: Calibration | None, now: ErrorFigures, nominal: ErrorFigures | None
+    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures
 ) -> tuple[bool, str]:
     """Return whether a calibration still holds on new samples, and why in words."""
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    text += f'{now.count} samples taken since'
-    if nominal is not None:
-        text += f'; the nominal chain has {nominal.rms_mm:.3f} mm'
-    judged = None if calibration is None else calibration.rms_mm
-    if judged is None:
+    text += f'{now.count} samples taken since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    if calibration.residual is None:
         return True, text
+    judged = 1e3 * calibration.residual
     if now.rms_mm > HOLDS * judged:
         return False, (
             f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '
@@ -189,7 +161,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
                 'offset': p.offset,
                 'std': p.std,
                 'half_width_95': p.half_width(0.95),
-                'unit': unit(p.name),
+                'unit': p.name.unit,
                 'status': p.status,
             }
             for p in result.parameters
@@ -228,107 +200,6 @@ def region_figures(region: Region) -> dict[str, Any]:
 
 
 BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
-
-
-def unit(name: str) -> str:
-    """Return the unit of a parameter."""
-    kind = name.partition('.')[2]
-    if kind == DELAY:
-        return 's'
-    if of_lens(name):
-        return 'px' if kind in IN_PIXELS else '1'
-    if kind in DH_KINDS or kind in FRAME_KINDS:
-        return 'm' if is_length(name) else 'rad'
-    return effects.unit(name)
-
-
-def markdown(result: Identification, samples: dict[str, Any], warnings: tuple[str, ...]) -> str:
-    """Return the report that is kept with a calibration."""
-    lines = [
-        f'# Calibration of {in_markdown(result.chain.name)}',
-        '',
-        f'**{in_markdown(summary(result))}**',
-        '',
-    ]
-    lines += [f'- warning: {in_markdown(each)}' for each in (*warnings, *result.remarks)]
-    lines += [
-        f'- {in_markdown(key)}: {in_markdown(value)}'
-        for key, value in samples.items()
-        if value not in (0, {}, None)
-    ]
-    lines += [
-        f'- converged: {"yes" if result.converged else "no"}, {result.iterations} iterations',
-        f'- {result.rank} parameters fitted; {noise_in_words(result)}',
-        *(f'- {in_markdown(each)}' for each in chance_in_words(result)),
-        *(f'- {in_markdown(each)}' for each in priors_in_words(result)),
-        '',
-        '## Accuracy',
-        '',
-        f'"Before" is {BEFORE}. Validated by {result.validated_by}.',
-        '',
-        '| poses | | number | RMS [mm] | mean | max | mean + 3 sigma | RMS [mrad] | RMS [px] |',
-        '|---|---|---|---|---|---|---|---|---|',
-    ]
-    for label, which in (('fitted', result.fitted), ('not fitted', result.validation)):
-        if which is not None:
-            lines += map(_figures_row, (label, label), ('before', 'after'), which.figures)
-            if which.outliers:
-                lines.append(_figures_row(label, 'after, with outliers', which.figures_of_all[1]))
-    if result.outliers:
-        lines += ['', '## Outliers', '', 'They carry no or little weight. Size: in usual errors.']
-        lines += ['', '| set | sample | stamp [ns] | size |', '|---|---|---|---|']
-        lines += [
-            f'| {o.set} | {o.sample} | {o.stamp_ns} | {o.size:.1f} |' for o in result.outliers
-        ]
-    if result.verdicts:
-        lines += [
-            '',
-            '## Non-geometric effects',
-            '',
-            'RMS on configurations left out.',
-        ]
-        lines += ['', '| | before [mm] | with it [mm] | pays for itself |', '|---|---|---|---|']
-        lines += [
-            f'| {in_markdown(v.what)} | {v.rms_mm_before:.4f} | {v.rms_mm_after:.4f} | '
-            f'{"yes" if v.pays else "no"} |'
-            for v in result.verdicts
-        ]
-    lines += ['', '## What the poses determine', '']
-    lines += [f'- {in_markdown(each)}' for each in identifiability_in_words(result)]
-    lines += ['', '## Parameters', '']
-    lines += ['Offsets, standard deviations and 95 % intervals (+-) in mm and mrad.', '']
-    if any(of_lens(p.name) for p in result.parameters):
-        lines[-1:] = ['Those of lenses in px, and of their distortion as it is.', '']
-    lines += [
-        '| parameter | value [m, rad] | offset | std | 95 % | |',
-        '|---|---|---|---|---|---|',
-    ]
-    lines += [_parameter_row(parameter) for parameter in result.parameters]
-    lines += [
-        '',
-        'gauge: redundant by the structure of the chain, kept nominal. not excited: the poses do '
-        'not determine it, kept nominal. fixed: held on request.',
-        '',
-    ]
-    return '\n'.join(lines)
-
-
-def priors_in_words(result: Identification) -> list[str]:
-    """Return the priors, those of effects by group."""
-    known = dict(result.chain.effects)
-    why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
-    lines = [
-        f'prior on {name}: {sigma:.3g} {unit(name)}{why.get(name, "")}'
-        for name, sigma in result.priors.items()
-        if name not in known
-    ]
-    groups: dict[str, list[str]] = {}
-    for name in known:
-        groups.setdefault(effects.group_of(name), []).append(name)
-    for group, names in groups.items():
-        sigma, of = result.priors[names[0]], unit(names[0])
-        lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
-    return lines
 
 
 def sigma_over_range(result: Identification) -> dict[str, float]:
@@ -425,31 +296,12 @@ def observability_in_words(result: Identification) -> str:
     return f'O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
 
 
-def _figures_row(label: str, when: str, figures: ErrorFigures) -> str:
-    turn = '' if figures.rms_mrad is None else f'{figures.rms_mrad:.3f}'
-    seen = '' if figures.rms_px is None else f'{figures.rms_px:.3f}'
-    return (
-        f'| {label} | {when} | {figures.count} | {figures.rms_mm:.3f} | {figures.mean_mm:.3f} | '
-        f'{figures.max_mm:.3f} | {figures.mean_plus_3_sigma_mm:.3f} | {turn} | {seen} |'
-    )
-
-
-def _parameter_row(p: Parameter) -> str:
-    width = p.half_width(0.95)
-    scale = 1.0 if of_lens(p.name) else 1e3
-    std = '' if p.std is None else f'{scale * p.std:.4f}'
-    within = '' if width is None else f'{scale * width:.4f}'
-    offset = '' if p.std is None else f'{scale * p.offset:+.4f}'
-    note = '' if p.status == 'fitted' else p.status
-    return f'| {in_markdown(p.name)} | {p.value:.9f} | {offset} | {std} | {within} | {note} |'
-
-
 def against_truth(result: Identification, truth: Chain) -> str:
     """Return a table of the fitted joint parameters beside those of the true chain."""
     width = max(len(name) for name in result.names)
     rows = [f'  {"parameter":{width}}     true   identified        std   deviation']
     for p in result.parameters:
-        if p.std is None or p.name.partition('.')[0] in ('base', 'tool'):
+        if p.std is None or p.name.owner in ('base', 'tool'):
             continue
         true = truth.value(p.name) - (p.value - p.offset)
         rows.append(

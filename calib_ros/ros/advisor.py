@@ -27,18 +27,18 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
-from calib_ros.apply.compensation import Compensator, compensate_program, in_words
+from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.design import Design
 from calib_ros.apply.planning import next_pose
-from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.apply.program import compensate_program
+from calib_ros.apply.workspace import survey
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.files.trajectories import RATES, trajectory_program
-from calib_ros.identification.identification import Identification
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.observations import STILL
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
-from calib_ros.sampling.calibration import Calibration
 from calib_ros.sampling.cdr import trajectory_size
 from calib_ros.sampling.live import Estimate
 from calib_ros.sampling.sample import Sample
@@ -134,9 +134,9 @@ class Guide:
         problem = self._session.problem_of(samples)
         self._advising = self._start(self._advise, problem, self._session.estimate)
 
-    def show(self, result: Identification) -> None:
-        """Publish the errors over the workspace of an accepted identification."""
-        self._start(self._show, result)
+    def show(self, calibration: Calibration) -> None:
+        """Publish the errors over the workspace of a calibration."""
+        self._start(self._show, calibration)
 
     def _start(self, work: Callable[..., None], *arguments: Any) -> Future[None]:
         with self._lock:  # an identification calls from a thread of its own
@@ -165,14 +165,14 @@ class Guide:
                 to_ros.joints(self._session.joint_names, found.joints, self._now())
             )
 
-    def _show(self, result: Identification) -> None:
-        found = survey(CalibratedArm.of(result), CLOUD, np.random.default_rng(0))
+    def _show(self, calibration: Calibration) -> None:
+        found = survey(calibration, CLOUD, np.random.default_rng(0))
         points = found.cloud
-        base = result.chain.frame('base').matrix
+        base = calibration.chain.frame('base').matrix
         points[:, :3] = points[:, :3] @ base[:3, :3].T + base[:3, 3]
         self._errors.publish(
             to_ros.cloud(
-                ('x', 'y', 'z', 'error', 'sigma'), points, result.world_frame, self._now()
+                ('x', 'y', 'z', 'error', 'sigma'), points, calibration.world_frame, self._now()
             )
         )
 
@@ -220,13 +220,10 @@ class Guide:
             if len(result.refusals) > MOST_REASONS:
                 reasons.append(f'and {len(result.refusals) - MOST_REASONS} more')
             raise InputError('; '.join([words, *reasons]))
-        if calibration.result is not None:
-            arm = CalibratedArm.of(calibration.result)
-            known, warning = arm.knowledge(result.joints, result.orientation_before)
-            words = f'{words}; {known}'
-            if warning:
-                words = f'{words}; {warning}'
-                self._node.get_logger().warning(f'trajectory: {warning}')
+        known, warning = calibration.knowledge(result.joints, result.orientation_before)
+        words = '; '.join(part for part in (words, known, warning) if part)
+        if warning:
+            self._node.get_logger().warning(f'trajectory: {warning}')
         answer = copy.deepcopy(message)
         for key in RATES:
             values = getattr(corrected, key)

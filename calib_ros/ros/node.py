@@ -47,6 +47,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.archive import Archive
 from calib_ros.files.waypoints import read_joints
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
@@ -336,10 +337,11 @@ class CalibrationNode(Node):
             )
         )
         if result.accepted:
-            text = words.calibration_yaml(result, given.origin)
+            found = Calibration.of(result, given.origin, named(given.samples).owners)
             page = partial(self._page, given, result)
-            self._keeper.adopt(result, given.samples, Published(text, given.configuration, page))
-            self._guide.show(result)
+            published = Published(found.dump(), given.configuration, page)
+            self._keeper.adopt(found, published, given.samples)
+            self._guide.show(found)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
         return result.accepted, self._last
@@ -374,7 +376,8 @@ class CalibrationNode(Node):
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
-        return words.verdict(self.session.calibration, *self.session.validate())
+        now, nominal = self.session.validate()
+        return words.verdict(self.session.calibration, now, nominal)
 
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)
@@ -396,6 +399,7 @@ class CalibrationNode(Node):
 
     def _on_load(self, request: Any) -> tuple[bool, str]:
         self._last = f'loaded {self._keeper.load()}'
+        self._guide.show(self.session.calibration)
         return True, self._last
 
     def _to_export(self) -> Exportable:

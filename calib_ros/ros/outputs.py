@@ -19,12 +19,8 @@ from calib_ros.errors import InputError
 from calib_ros.files.archive import Archive
 from calib_ros.files.export import exports, urdf_foot
 from calib_ros.files.vendors import vendor_files
-from calib_ros.identification.identification import Identification
-from calib_ros.identification.region import region_of_record
-from calib_ros.kinematics.chain import Chain
+from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import (
-    calibration_record,
-    parse_calibration,
     parse_chain,
     read_text,
 )
@@ -51,10 +47,9 @@ class Published(NamedTuple):
 
 
 class Exportable(NamedTuple):
-    """The calibrated chain, its text, and the joint values of the samples."""
+    """The calibration, and the joint values of the samples."""
 
-    chain: Chain
-    text: str
+    calibration: Calibration
     joints: Sequence[FloatArray] | None
 
 
@@ -99,12 +94,18 @@ class Keeper:
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(
-        self, result: Identification, samples: Sequence[Sample], published: Published
+        self,
+        calibration: Calibration,
+        published: Published,
+        samples: Sequence[Sample] | None = None,
     ) -> None:
-        """Take an accepted result as the calibration in use."""
+        """Take a calibration as the one in use (`CalibrationSession.adopt`)."""
         with self._lock:
-            self._session.adopt(result, samples)
-            self._publish(result.chain, published)
+            self._session.adopt(calibration, samples)
+            self._published = published
+            self._dh_parameters.publish(to_ros.dh_parameters(calibration.chain))
+            self._calibration.publish(String(data=published.text))
+            self._broadcast.publish(calibration.chain, calibration.world_frame)
 
     @property
     def published(self) -> Published:
@@ -155,16 +156,13 @@ class Keeper:
                 f'{self._archive.folder}: set calibration_filename'
             )
         text = _calibration_text(path)
-        chain, record = parse_calibration(text, str(path), session.chain, session.settings)
-        region = region_of_record(record, chain, str(path))
-        serial, ours = record.get('robot_serial'), self._given.serial
+        calibration = parse_calibration(text, str(path), session.chain, session.settings)
+        serial, ours = calibration.record.get('robot_serial'), self._given.serial
         if serial and ours and serial != ours:
             raise InputError(
                 f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
             )
-        with self._lock:
-            session.load(chain, record.get('rms_mm_after'), record.get('world_frame', ''), region)
-            self._publish(chain, Published(text, ''))
+        self.adopt(calibration, Published(text, ''))
         return path
 
     def exportable(self) -> Exportable:
@@ -174,18 +172,18 @@ class Keeper:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
         joints = [sample.joints for sample in session.samples]
         with self._lock:
-            return Exportable(session.calibration.chain, self._published.text, joints or None)
+            return Exportable(session.calibration, joints or None)
 
     def export(self, found: Exportable) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
-        record = calibration_record(found.text)
+        chain, record = found.calibration.chain, found.calibration.record
         nominal, links = self._session.chain, self._given.links
-        forms = exports(found.chain, nominal, found.joints, record)
-        forms += vendor_files(found.chain, nominal, record, self._urdf, links)
+        forms = exports(chain, nominal, found.joints, record)
+        forms += vendor_files(chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
-            text = corrected_urdf(self._urdf, found.chain, **links)
-            files['corrected.urdf'] = text + urdf_foot(found.chain)
+            text = corrected_urdf(self._urdf, chain, **links)
+            files['corrected.urdf'] = text + urdf_foot(chain)
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:
@@ -211,12 +209,6 @@ class Keeper:
             (self._archive.folder, *self._given.allowed_folders),
             f'choose {parameter} in data_dir, or start the node with allowed_folders',
         )
-
-    def _publish(self, chain: Chain, published: Published) -> None:
-        self._published = published
-        self._dh_parameters.publish(to_ros.dh_parameters(chain))
-        self._calibration.publish(String(data=published.text))
-        self._broadcast.publish(chain, self._session.calibration.world_frame)
 
 
 def _calibration_text(path: Path) -> str:

@@ -22,7 +22,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from calib_ros.identification.identification import Identification, residuals
 from calib_ros.identification.observations import Observations
-from calib_ros.kinematics.chain import DH_KINDS, Chain
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
 
 MOST_ARROWS = 1000

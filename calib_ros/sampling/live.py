@@ -37,8 +37,9 @@ from calib_ros.identification.observations import Observations, configurations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import robust_fit, thorough_fit
 from calib_ros.identification.start import start_frames
-from calib_ros.kinematics.chain import ANGLES, DELAY, Chain
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import ANGLES, DELAY, Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
 
@@ -346,5 +347,5 @@ def _distinct(samples: Sequence[Sample]) -> int:
 
 
 def _wide(name: str) -> float:
-    kind = name.partition('.')[2]
+    kind = Parameter(name).kind
     return 1.0 if kind == DELAY else WIDE[1] if kind in ANGLES else WIDE[0]

@@ -8,12 +8,13 @@ A sample is what the live node takes, what the journal keeps, and what a row of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.records import Owner
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -43,6 +44,8 @@ class Sample(Shown):
         Frame of the measurement, as its message named it.
     socket : bool
         A ball at the target sat in a socket, whose place is not known.
+    plane : bool
+        The target touched a plane, the device; the distance is its height over it.
     eye_in_hand : bool
         The pose is that of a fixed target in a camera on the flange.
     validation : bool
@@ -70,6 +73,7 @@ class Sample(Shown):
     target: str = ''
     frame_id: str = ''
     socket: bool = False
+    plane: bool = False
     eye_in_hand: bool = False
     validation: bool = False
     delay: float = 0.0
@@ -81,13 +85,23 @@ class Frames:
     """Names of the frames between which samples were measured.
 
     The first session, device and target that is met has the frames `base` and `tool`; others add
-    their names.
+    their names. `owners` are those of frames that have names already.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, owners: Mapping[str, Owner] | None = None) -> None:
         self._sessions: list[str] = []
         self._ends: dict[tuple[str, str], list[tuple[bool, str]]] = {}
-        self._owners: dict[str, tuple[str, bool, bool, str]] = {}
+        self._owners = dict(owners or {})
+        for name, (session, eye, socket, label) in self._owners.items():
+            if session not in self._sessions:
+                self._sessions.append(session)
+            if not socket:
+                self._end(name.partition('_')[0], session, (eye, label))
+
+    @property
+    def owners(self) -> Mapping[str, Owner]:
+        """Return which session, device or target each frame is of."""
+        return self._owners
 
     def of(self, sample: Sample) -> tuple[str, str]:
         """Return the names of base and tool of a sample.
@@ -100,9 +114,10 @@ class Frames:
             self._sessions.append(sample.session)
         first = sample.session == self._sessions[0]
         suffix = '' if first else f'_{plain(sample.session)}'
-        if sample.socket:  # none of them is the first
+        if sample.socket or sample.plane:  # none of them is the first
             place = (sample.session, False, True, base)
-            return self._own(f'base{suffix}_{plain(base)}', place), f'tool{suffix}'
+            end = self._end('tool', sample.session, (False, tool)) if sample.plane else ''
+            return self._own(f'base{suffix}_{plain(base)}', place), f'tool{suffix}{end}'
         start = self._end('base', sample.session, (eye, base))
         end = self._end('tool', sample.session, (eye, tool))
         return (
@@ -110,7 +125,7 @@ class Frames:
             self._own(f'tool{suffix}{end}', (sample.session, eye, False, tool)),
         )
 
-    def _own(self, name: str, owner: tuple[str, bool, bool, str]) -> str:
+    def _own(self, name: str, owner: Owner) -> str:
         """Return a name that is no one else's: a device may be called like a session."""
         while self._owners.setdefault(name, owner) != owner:
             name += '_'
@@ -146,15 +161,16 @@ def collect(
     without a covariance of their own. `frames` remembers the names given to earlier samples.
     """
     frames = Frames() if frames is None else frames
-    groups: dict[tuple[str, str, bool, bool, bool, bool], list[Sample]] = {}
+    groups: dict[tuple[str, str, str, bool, bool], list[Sample]] = {}
     for sample in samples:
         base, tool = frames.of(sample)
-        distance = sample.distance is not None
-        key = (base, tool, distance, sample.socket, sample.eye_in_hand, sample.validation)
+        kind = 'socket' if sample.socket else 'plane' if sample.plane else ''
+        kind = kind or ('distance' if sample.distance is not None else 'pose')
+        key = (base, tool, kind, sample.eye_in_hand, sample.validation)
         groups.setdefault(key, []).append(sample)
     fitted: list[Observations] = []
     held_out: list[Observations] = []
-    for (base, tool, _, _, eye_in_hand, validation), members in groups.items():
+    for (base, tool, _, eye_in_hand, validation), members in groups.items():
         observations = replace(_observations(members), base=base, tool=tool)
         if eye_in_hand:
             observations = observations.inverted(sigmas)
@@ -200,4 +216,5 @@ def _observations(samples: Sequence[Sample]) -> Observations:
         optional('acceleration'),
         optional('delay'),
         socket=samples[0].socket,
+        plane=samples[0].plane,
     )

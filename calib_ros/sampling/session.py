@@ -15,23 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import Observations, configurations
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.region import Region
-from calib_ros.identification.validation import ErrorFigures
+from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling import messages
 from calib_ros.sampling.account import Account
-from calib_ros.sampling.calibration import Calibration
 from calib_ros.sampling.collector import Collector, StreamKey
 from calib_ros.sampling.delay import Delay, Watch
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved, restless, sparse
 from calib_ros.sampling.live import Estimate, LiveEstimate, barely_moved
 from calib_ros.sampling.names import FrameNames, JointNames, strange
-from calib_ros.sampling.sample import Sample, collect, named
+from calib_ros.sampling.sample import Frames, Sample, collect, named
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.strays import JOINTS, POSES, STRAY, Gate
 from calib_ros.sampling.track import APART, Stamps
@@ -110,6 +109,7 @@ class CalibrationSession:
         self.recording = True
         self.calibration: Calibration | None = None
         """The last one that was accepted or loaded."""
+        self._known: frozenset[Sample] = frozenset()  # that were there by then
         self.clear()
 
     def clear(self) -> None:
@@ -620,32 +620,15 @@ class CalibrationSession:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
             raise InputError(f'{err} ({self._came})') from err
-        self.adopt(result, self.samples)
+        if result.accepted:
+            owners = named(self.samples).owners
+            self.adopt(Calibration.of(result, owners=owners), self.samples)
         return result
 
-    def adopt(self, result: Identification, samples: Sequence[Sample]) -> None:
-        """Keep a result as the calibration if it is accepted, else the last good one stays.
+    def adopt(self, calibration: Calibration, samples: Sequence[Sample] | None = None) -> None:
+        """Take a calibration as the present one.
 
-        `samples` are those there were when the identification began.
-        """
-        if result.accepted:
-            after = (result.validation or result.fitted).figures[1]
-            self.calibration = Calibration(
-                *(result.chain, result.before, result.world_frame, after.rms_mm),
-                known=frozenset(samples),
-                result=result,
-                frames=named(samples),
-                region=result.region,
-            )
-
-    def load(
-        self,
-        chain: Chain,
-        rms_mm: float | None = None,
-        world_frame: str = '',
-        region: Region | None = None,
-    ) -> None:
-        """Take a calibration from a file as the present one.
+        `samples` are those that it may not be judged on, all of now by default.
 
         Raises
         ------
@@ -653,37 +636,48 @@ class CalibrationSession:
             When it has other joints.
 
         """
-        if chain.joint_names != self.chain.joint_names:
+        theirs = calibration.chain.joint_names
+        if theirs != self.chain.joint_names:
             raise InputError(
-                f'the calibration has the joints {", ".join(chain.joint_names)}, the robot has '
+                f'the calibration has the joints {", ".join(theirs)}, the robot has '
                 f'{", ".join(self.chain.joint_names)}'
             )
-        known = frozenset(self.samples)
-        self.calibration = Calibration(chain, None, world_frame, rms_mm, known, region=region)
+        self._known = frozenset(self.samples if samples is None else samples)
+        self.calibration = calibration
 
-    def validate(self) -> tuple[ErrorFigures, ErrorFigures | None]:
+    def validate(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Judge the calibration on the samples taken since; nothing is fitted.
 
-        Returns
-        -------
-        now : ErrorFigures
-            Of the calibration.
-        nominal : ErrorFigures or None
-            Of the nominal chain with fitted frames, where the calibration was identified here.
+        Return the errors of the calibration, and those of the nominal chain in its frames.
 
         Raises
         ------
         InputError
-            Without a calibration, or without samples since.
+            Without a calibration, without samples since, or when they are between frames that it
+            does not have.
 
         """
-        if self.calibration is None:
+        calibration = self.calibration
+        if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
         self._collector.flush()
         self._take()
         settings = self.settings
         sigmas = (settings.sigma_position, settings.sigma_orientation)
-        return self.calibration.judged(self.usable, sigmas)
+        # the first device and target are those of a file that does not name any
+        frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
+        since = [each for each in self.usable if each not in self._known]
+        sets = [each for part in collect(since, sigmas, frames) for each in part]
+        if not sets:
+            raise InputError('no samples have been taken since: measure some new poses first')
+        known = calibration.chain.frame_names
+        if not all(each.base in known and each.tool in known for each in sets):
+            raise InputError(
+                'the samples since were measured by a device or on a target that the '
+                'calibration does not know'
+            )
+        nominal, now = compare(calibration.before, calibration.chain, sets).figures
+        return now, nominal
 
     # Details
 

@@ -11,26 +11,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from calib_ros.apply.compensation import (
-    Compensator,
-    Program,
-    approaches,
-    compensate,
-    compensate_program,
-    in_words,
-)
+from calib_ros.apply.compensation import Compensator, compensate, in_words
+from calib_ros.apply.program import Program, approaches, compensate_program
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.trajectories import read_program
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics import effects, following, se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint
-from calib_ros.kinematics.chain_file import dump_chain, load_chain, nominal_record, shipped_robots
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, shipped_robots
 from calib_ros.kinematics.following import POSITION_FIRST, mobility
 from calib_ros.kinematics.inverse import solve_positive
-from calib_ros.report.words import as_document, calibration_yaml
+from calib_ros.report.words import as_document
 
 CELL = Cell(length_error=1e-3, angle_error=1e-3)
 ROBOTS = {name: load_chain(name) for name in shipped_robots()}
@@ -713,7 +709,7 @@ def test_the_command_line_says_how_well_the_orientation_is_known(run, tmp_path, 
     found = identify(Problem(UR, seen, sigma_position=1e-4, priors=priors))
     folder = tmp_path / 'result'
     folder.mkdir()
-    (folder / 'calibration.yaml').write_text(calibration_yaml(found))
+    (folder / 'calibration.yaml').write_text(Calibration.of(found).dump())
     (folder / 'result.json').write_text(json.dumps(as_document(found, {})))
     (tmp_path / 'program.csv').write_text(TABLE)
     status, said, err = run(tmp_path / 'program.csv', '--calibration', 'result')
@@ -738,7 +734,7 @@ def test_the_calibration_of_a_cousin_is_refused(run, tmp_path):
     """A tenth of the poses could be corrected from one arm to the other, by centimetres."""
     path = tmp_path / 'program.csv'
     path.write_text(TABLE)
-    record = {'accepted': True, 'nominal': nominal_record(ROBOTS['ur10'])}
+    record = {'accepted': True, 'nominal': nominal_document(ROBOTS['ur10'])}
     (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
     status, _, err = run(path)
     assert status == 1

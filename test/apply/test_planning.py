@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
-from calib_ros.apply import planning, simulation
+from calib_ros.apply import choice, planning, simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates, visit_order
+from calib_ros.apply.choice import choose
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
     Candidates,
@@ -22,7 +23,6 @@ from calib_ros.apply.design import (
     predicted,
 )
 from calib_ros.apply.design import _root_of_inverse as root_of_inverse
-from calib_ros.apply.planning import choose
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.tables import read_table
@@ -237,7 +237,7 @@ def test_worth_by_updates_equals_that_computed_anew(oriented):
     chosen = list(range(12))
     so_far = space.known + information_of(space.rows[chosen])
     by_det, by_task = (
-        planning._score(space, criterion, task)(so_far, space.rows) for criterion in ('d', 'task')
+        choice._score(space, criterion, task)(so_far, space.rows) for criterion in ('d', 'task')
     )
     for k in (3, 20, 29):  # one of them a second time
         more = np.concatenate([q[chosen], q[k : k + 1]])
@@ -253,7 +253,7 @@ def test_indices_are_those_of_the_report(criterion):
     q = some(design.chain, 30)
     space = Candidates(design, q)
     so_far = space.known + information_of(space.rows[:12])
-    worth = planning._score(space, criterion, None)(so_far, space.rows)
+    worth = choice._score(space, criterion, None)(so_far, space.rows)
     rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
     factor = np.linalg.qr(rows, mode='r')
     assert worth[20] == pytest.approx(getattr(observability(factor, 13), criterion), rel=1e-5)
@@ -274,6 +274,7 @@ def test_choosing_by_an_index_raises_it(criterion):
 # The choice
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     """Of 126 choices of 4 from 9; and the bound of how good it is holds."""
@@ -286,13 +287,13 @@ def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     chosen = choose(design, q, 4)
     share = np.exp((log_det(design, q[chosen]) - best) / size)
     assert 0.95 < share < 1.0 + 1e-6
-    assert planning.efficiency(design, q, chosen, None) <= share + 1e-6
+    assert choice.efficiency(design, q, chosen, None) <= share + 1e-6
 
     best = min(predicted_square(design, q[each], task) for each in choices)
     chosen = choose(design, q, 4, 'task', task)
     share = best / predicted_square(design, q[chosen], task)
     assert 0.8 < share < 1.0 + 1e-6
-    assert planning.efficiency(design, q, chosen, task) <= share + 1e-6
+    assert choice.efficiency(design, q, chosen, task) <= share + 1e-6
 
 
 def test_each_criterion_is_best_by_its_own_measure():
@@ -360,8 +361,7 @@ def test_wrong_arguments_are_refused():
 # What planning is for
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('name', ['ur10e', 'puma560'])
+@pytest.mark.parametrize(('name', 'oriented'), [('ur10e', True), ('puma560', False)])
 def test_25_planned_poses_beat_random_ones_on_unseen_poses(name, oriented):
     """After identification, and predicted: the mean of 200 random draws."""
     nominal = arm(name)
@@ -377,16 +377,15 @@ def test_25_planned_poses_beat_random_ones_on_unseen_poses(name, oriented):
         error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
         return np.sqrt((error**2).sum(axis=1).mean())
 
-    planned = np.mean([found(chosen) for _ in range(20)])
-    assert planned < np.mean([found(nominal.random_joints(25, rng)) for _ in range(12)])
+    planned = np.mean([found(chosen) for _ in range(12)])
+    assert planned < np.mean([found(nominal.random_joints(25, rng)) for _ in range(8)])
     random = [accuracy(design, nominal.random_joints(25, rng), unseen)[-1] for _ in range(200)]
     predicted = accuracy(design, chosen, unseen)[-1]
     assert predicted < min(np.mean(random), np.quantile(random, 0.01))
     assert planned == pytest.approx(predicted, rel=0.1)  # what is predicted comes true
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('name', ['ur10e', 'puma560'])
+@pytest.mark.parametrize(('name', 'oriented'), [('ur10e', False), ('puma560', True)])
 def test_in_a_small_range_25_planned_poses_are_worth_50_random_ones(name, oriented):
     nominal = arm(name)
     rng = np.random.default_rng(6)
@@ -404,7 +403,7 @@ def test_over_the_whole_range_no_25_poses_are_worth_50_random_ones():
     design = design_of(arm())
     q, unseen = some(design.chain, 1000), some(design.chain, 300, 2)
     chosen = choose(design, q, 25, 'task', unseen)
-    share = planning.efficiency(design, q, chosen, unseen)
+    share = choice.efficiency(design, q, chosen, unseen)
     least = accuracy(design, q[chosen], unseen)[-1] * np.sqrt(share)
     random = [accuracy(design, some(design.chain, 50, k), unseen)[-1] for k in range(50)]
     assert np.mean(random) < least
@@ -424,14 +423,7 @@ def measured_problem(name, session):
 
 @measured_robots
 @pytest.mark.parametrize(
-    ('name', 'session'),
-    [
-        ('ur10_ipa_leica', 'B'),
-        ('ur5_jacobi_lasertracker', 'grid'),
-        ('wam7_jacobi_lasertracker', 'grid'),
-        ('positioner_2axis_pose', 'all'),
-        ('fr3_camera_eyeinhand', 'all'),
-    ],
+    ('name', 'session'), [('wam7_jacobi_lasertracker', 'grid'), ('fr3_camera_eyeinhand', 'all')]
 )
 def test_half_of_the_measured_poses_predict_as_well_as_all(name, session):
     """Chosen without what was measured there; and the noise found is what is left on others."""
@@ -449,23 +441,17 @@ def test_half_of_the_measured_poses_predict_as_well_as_all(name, session):
 @measured_robots
 @pytest.mark.parametrize(
     ('name', 'session', 'least'),
-    [
-        ('ur10_ipa_leica', 'B', 0.8),
-        ('ur5_jacobi_lasertracker', 'grid', 0.65),
-        ('wam7_jacobi_lasertracker', 'grid', 0.8),
-        ('positioner_2axis_pose', 'all', 0.45),
-        ('fr3_camera_eyeinhand', 'all', 0.8),
-    ],
+    [('wam7_jacobi_lasertracker', 'grid', 0.8), ('positioner_2axis_pose', 'all', 0.45)],
 )
 def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, session, least):
-    """Over the outer fifths of every joint's values, each left out: not by much more than that.
+    """Over the outer fifths of a joint's values, each left out: not by much more than that.
 
-    By less on two robots: errors that neighbours share count against the parameters as a whole
+    By less on the positioner: errors that neighbours share count against the parameters as a whole
     there, and are less than that at the edge of the range (docs/planning.md).
     """
     problem = measured_problem(name, session)
     squares = []
-    for column in problem.observations.joints.T:
+    for column in problem.observations.joints.T[::2]:
         order = np.argsort(column)
         fifth = len(order) // 5
         for out in (order[:fifth], order[-fifth:]):
@@ -476,7 +462,6 @@ def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, sessi
             variance = np.diagonal(result.pose_covariance(part.joints), axis1=1, axis2=2)
             variance = variance[judged, :3] + (problem.sigma_position * result.noise.position) ** 2
             squares.append(np.mean(result.validation.after.position[judged] ** 2 / variance))
-    # the FR3 errs by 1.29: what its geometric model lacks is no effect that is considered
     assert least < np.sqrt(np.mean(squares)) < 1.35
 
 
@@ -572,6 +557,7 @@ def travel(q, order, speeds):
     return (np.abs(np.diff(q[list(order)], axis=0)) / speeds).max(axis=1).sum()
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_the_way_is_close_to_the_shortest(seed):
     rng = np.random.default_rng(seed)
@@ -628,9 +614,10 @@ def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     assert all(float(planned) < float(random) for _, planned, random in rows)
     assert 'the tool is unknown' in out
     before = (tmp_path / 'plan.csv').read_bytes()
-    assert run('--chain', 'ur10e', '--seed', 1, '--out', 'plan.csv')[0] == 1
+    again = ('--chain', 'ur10e', '--seed', 1, '--draw', 100, '--out', 'plan.csv')
+    assert run(*again)[0] == 1
     assert (tmp_path / 'plan.csv').read_bytes() == before
-    assert run('--chain', 'ur10e', '--seed', 1, '--out', 'plan.csv', '--force')[0] == 0
+    assert run(*again, '--force')[0] == 0
     assert (tmp_path / 'plan.csv').read_bytes() != before
 
 
@@ -683,7 +670,7 @@ def test_plan_with_too_few_poses_says_so(run):
         (('--velocity', 1, 2), '--velocity: give one value, or 6'),
         (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
         (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
-        (('--box', 9, 9, 9, 10, 10, 10), 'random poses only'),
+        (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
         (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
         (('--iso9283', '--poses', 20), '--poses is of no use with --iso9283'),
         (('--iso9283', '--candidates', 'q.csv'), '--candidates is of no use'),

@@ -8,7 +8,9 @@ import yaml
 from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.apply import simulation
-from calib_ros.cli.main import NOT_ACCEPTED, RESULT_FILES, main
+from calib_ros.cli.main import main
+from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.results import RESULT_FILES
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
 
@@ -105,12 +107,16 @@ def test_the_identified_parameters_are_the_true_ones(identified, table):
     assert 0.4 < np.sqrt(np.mean(np.square(deviations))) < 1.7
 
 
-def test_without_json_one_line_says_the_result(run, table):
-    status, out, err = run('identify', '--csv', table, '--chain', 'ur5e')
+def test_a_result_is_a_verdict_and_six_rows(run, table):
+    status, out, err = run('identify', table, '--chain', 'ur5e')
     assert (status, err) == (0, '')
-    assert out.startswith('accepted: 30 samples, RMS ')
-    assert out.count('\n') == 1
-    assert f'{TEST} held-out samples' in out
+    lines = out.splitlines()
+    assert lines[0].startswith('accepted: ')
+    assert [line[:20].strip() for line in lines[1:7]] == [
+        *('robot', 'samples', 'position error', 'orientation error', 'judged by', 'valid')
+    ]
+    assert f'{TEST} held-out samples' in lines[5]
+    assert max(map(len, lines)) <= 80
 
 
 def test_out_writes_every_file(run, table, tmp_path):
@@ -387,8 +393,8 @@ def bad_inputs():
     bag_of = ('identify', '--chain', 'ur5e')
     good = (*csv_of, 'good.csv')
     chain_of = ('identify', '--csv', 'good.csv', '--chain')
-    yield 'no input', bag_of, 'either a bag or --csv'
-    yield 'two inputs', (*good, 'bag'), 'either a bag or --csv'
+    yield 'no input', bag_of, 'either a bag, or a table'
+    yield 'two inputs', (*good, 'bag'), 'either a bag, or a table'
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
@@ -399,7 +405,7 @@ def bad_inputs():
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
     yield 'an empty bag folder', (*bag_of, 'folder'), 'folder is not a readable rosbag2'
     yield 'an empty bag file', (*bag_of, 'empty.mcap'), 'empty.mcap is not a readable rosbag2'
-    yield 'a bag file of another kind', (*bag_of, 'good.csv'), 'good.csv is not a readable'
+    yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
     yield 'no such chain', (*chain_of, 'missing.yaml'), 'missing.yaml'
     yield 'no such robot', (*chain_of, 'ur10x'), 'did you mean "ur10'
     yield 'not YAML', (*chain_of, 'broken.yaml'), 'broken.yaml is not valid YAML'

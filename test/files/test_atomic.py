@@ -25,6 +25,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.bags import Recording, replay, write_bag
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import page, plots, reports, words
 from calib_ros.report.page import Origin
@@ -465,7 +466,7 @@ def test_an_identification_that_is_killed_mixes_nothing(
 ):
     if not accepted:
         found = identified['B']
-        refused = replace(found.result, refusals=('no gain',))
+        refused = replace(found.result, refusals=(Reason(Rule.GAIN, 'no gain'),))
         identified['B'] = found._replace(result=refused)
     out = tmp_path / 'out'
 

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the seeds of the corpus: a small valid input or more for each target."""
 
-import json
 import tempfile
 from pathlib import Path
 
@@ -12,7 +11,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros.files.tables import cells, columns
-from calib_ros.kinematics.chain_file import dump_chain, nominal_record
+from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.sampling.messages import DECODERS, JOINT_STATE
 from calib_ros.sampling.sample import Sample
 
@@ -179,19 +179,9 @@ def main():
         'accepted': True,
         'rms_mm_after': 0.1,
         'world_frame': 't',
-        'nominal': nominal_record(ARM),
+        'nominal': nominal_document(ARM),
     }
     put('calibration', 0, dump_chain(ARM.with_offsets({'a.d': 1e-3}), record))
-    put(
-        'result',
-        0,
-        json.dumps(
-            {
-                'covariance': {'names': ['a.d', 'b.a'], 'matrix': [[1e-8, 0], [0, 1e-8]]},
-                'validation': {'after': {'rms_mm': 0.1}},
-            }
-        ),
-    )
     put('urdf', 0, URDF)
     for k, text in enumerate(OPTIONS):
         put('settings', k, text)

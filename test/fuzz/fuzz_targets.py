@@ -204,17 +204,9 @@ def chain(path):
 
 @target('.yaml')
 def calibration(path):
-    from calib_ros.kinematics.chain_file import load_calibration
+    from calib_ros.identification.calibration import load_calibration
 
     load_calibration(path, ARM)
-
-
-@target('result.json')
-def result(path):
-    from calib_ros.apply.workspace import CalibratedArm
-
-    shutil.copy(next(iter((CORPUS / 'calibration').iterdir())), path.parent / 'calibration.yaml')
-    CalibratedArm.read(path.parent, ARM)
 
 
 @target('.urdf')

@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import CalibrationError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import as_document, calibration_yaml, summary
+from calib_ros.report.words import as_document, summary
 
 EXAMPLES = int(os.environ.get('AWKWARD', '30'))
 MOST = 40
@@ -118,7 +119,7 @@ def test_any_design_ends_with_a_result_or_an_error_that_explains(problem):
     assert np.isfinite(result.predicted_sigma(10)).all()
     assert summary(result)
     assert as_document(result, {})
-    assert calibration_yaml(result)
+    assert Calibration.of(result).dump()
 
 
 def test_a_design_that_determines_no_parameter_of_the_arm():

@@ -13,7 +13,8 @@ from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import as_document, markdown
+from calib_ros.report.markdown import markdown
+from calib_ros.report.words import as_document
 
 UR10E = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)

@@ -12,6 +12,7 @@ from calib_ros.identification.leastsquares import Samples, System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.parameter import Parameter
 
 UR = load_chain('ur10e')
 NO_PRIOR = {'*_joint.*': 1e6}
@@ -84,7 +85,7 @@ def test_the_size_of_the_errors_is_found(errors, seed):
         offsets = [
             true.offset(name, UR)
             for name in found.names
-            if not UR.owns_frame(name) and name.endswith(('.a', '.d')) == lengths
+            if not UR.owns_frame(name) and Parameter(name).is_length == lengths
         ]
         ratio = found.posterior.sizes[group] / np.sqrt(np.mean(np.square(offsets)))
         assert 0.5 < ratio < 2.0

@@ -19,6 +19,7 @@ from calib_ros.identification.identifiability import (
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import log_rotation
 from calib_ros.report.words import identifiability_in_words, summary, weakly_determined
 
@@ -300,7 +301,7 @@ def manufacture(scale=1.0):
     cell = Cell()
     names = structurally_independent(UR10E, UR10E.parameter_names)
     return {
-        name: scale * (cell.length_error if name.endswith(('.a', '.d')) else cell.angle_error)
+        name: scale * (cell.length_error if Parameter(name).is_length else cell.angle_error)
         for name in names
         if not name.startswith(('base', 'tool'))
     }

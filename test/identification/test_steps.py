@@ -15,7 +15,8 @@ from calib_ros.identification.robust import Robust
 from calib_ros.identification.steps import find_step
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import as_document, markdown
+from calib_ros.report.markdown import markdown
+from calib_ros.report.words import as_document
 
 UR10E = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)

@@ -1,6 +1,5 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,7 @@ from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import (
     chain_document,
     dump_chain,
-    load_calibration,
     load_chain,
-    nominal_record,
-    parse_calibration,
     parse_chain,
     shipped_robots,
 )
@@ -471,93 +467,3 @@ def test_settings_at_the_edge_are_taken():
 def test_a_key_that_comes_twice_is_refused():
     with pytest.raises(ConfigError, match='key "alpha" comes twice'):
         parse_chain(BASE.replace('alpha:', 'alpha: 0.0, alpha:', 1))
-
-
-def calibrated_text(nominal, record):
-    """Return the text of a calibration of a nominal chain, with a record of its origin."""
-    return dump_chain(nominal.with_offsets({f'{nominal.joint_names[1]}.a': 1e-3}), record)
-
-
-def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
-    nominal = load_chain('ur10e')
-    record = {'accepted': True, 'nominal': nominal_record(nominal)}
-    (tmp_path / 'calibration.yaml').write_text(calibrated_text(nominal, record))
-    for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
-        found, read = load_calibration(path, nominal)
-        assert read == record
-        assert found.joints[1].a == pytest.approx(nominal.joints[1].a + 1e-3, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ('nominal', 'record', 'message'),
-    [
-        ('ur10e', None, 'is a chain, but no calibration'),
-        ('ur10e', {}, 'is a chain, but no calibration'),
-        ('ur10e', {'accepted': False}, 'was not accepted'),
-        ('puma560', {'samples': 3}, 'is it the right nominal chain'),
-        ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),
-        ('ur10', {'nominal': nominal_record(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
-        ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
-        ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
-    ],
-)
-def test_what_is_no_calibration_of_a_nominal_chain_is_refused(nominal, record, message):
-    text = calibrated_text(load_chain('ur10e'), record)
-    with pytest.raises(ConfigError, match=message):
-        parse_calibration(text, 'calibration.yaml', load_chain(nominal))
-
-
-def test_a_record_in_another_convention_is_taken_as_it_is():
-    """Its numbers cannot be compared with those of the nominal chain."""
-    nominal = load_chain('ur10e')
-    record = {'nominal': nominal_record(load_chain('franka_fr3'))}
-    assert record['nominal']['convention'] == 'modified'
-    chain, found = parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
-    assert found == record
-    assert chain.joint_names == nominal.joint_names
-
-
-def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
-    nominal = load_chain('ur5e')
-    far = calibrated_text(nominal.with_offsets({'elbow_joint.theta': 0.2}), {'samples': 3})
-    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
-        parse_calibration(far, 'c.yaml', nominal)
-    parse_calibration(far, 'c.yaml', nominal, Settings(largest_angle=0.3))
-    near = calibrated_text(nominal, {'samples': 3})
-    with pytest.raises(ConfigError, match='conventions'):
-        parse_calibration(near, 'c.yaml', replace(nominal, convention='modified'))
-
-
-def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identified():
-    nominal = load_chain('ur5e')
-    record = {'accepted': True, 'nominal': nominal_record(nominal)}
-    true = nominal.with_offsets({'elbow_joint.theta': 0.2})
-    far = dump_chain(true, record)
-    assert parse_calibration(far, 'c.yaml', nominal)[0].value('elbow_joint.theta') == (
-        pytest.approx(true.value('elbow_joint.theta'))
-    )
-    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
-        parse_calibration(far, 'c.yaml', nominal, Settings())
-    elbow = nominal.joint_names.index('elbow_joint')
-    joints = list(nominal.joints)
-    joints[elbow] = replace(joints[elbow], sign=-1)
-    with pytest.raises(ConfigError, match='the sign of elbow_joint'):
-        parse_calibration(far, 'c.yaml', replace(nominal, joints=tuple(joints)))
-
-
-@pytest.mark.parametrize(
-    ('key', 'value'),
-    [
-        ('rms_mm_after', float('nan')),
-        ('rms_mm_after', 'small'),
-        ('rms_mm_after', -0.1),
-        ('world_frame', 5),
-        ('world_frame', None),
-    ],
-)
-def test_a_record_by_which_nothing_can_be_judged_is_refused(key, value):
-    nominal = load_chain('ur10e')
-    record = {'nominal': nominal_record(nominal), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
-    parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
-    with pytest.raises(ConfigError, match=f'c.yaml: calibration.{key} must be'):
-        parse_calibration(calibrated_text(nominal, record | {key: value}), 'c.yaml', nominal)

@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import DH_KINDS, FRAME_KINDS, Chain, Frame, Joint
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.parameter import DH_KINDS, FRAME_KINDS
 
 NEAR_SINGULAR = (0.0, np.pi / 2, np.pi, 1e-9, np.pi / 2 + 1e-9)
 

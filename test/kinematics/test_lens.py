@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
-from calib_ros.kinematics.lens import LENS_KINDS, Lens
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import LENS_KINDS
 
 small = st.floats(-0.2, 0.2)
 lenses = st.builds(

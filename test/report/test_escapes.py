@@ -20,7 +20,8 @@ from calib_ros.files.tables import read_journal
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
-from calib_ros.report import words
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.report.markdown import markdown
 from calib_ros.report.plots import before_after_png
 from calib_ros.sampling.sample import Sample
 
@@ -85,14 +86,15 @@ def result():
 @pytest.mark.parametrize('name', HOSTILE[:-3])
 def test_a_report_is_of_one_form_whatever_the_names(result, name):
     """Of the robot, a joint, what was dropped, and in a warning."""
-    usual = words.markdown(result, {'samples': 3, 'dropped': {'x': 1}}, ('x',))
+    usual = markdown(result, {'samples': 3, 'dropped': {'x': 1}}, ('x',))
     joint = result.parameters[0].name
+    first = replace(result.parameters[0], name=Parameter(name, 'a'))
     renamed = replace(
         result,
         chain=replace(result.chain, name=name),
-        parameters=(replace(result.parameters[0], name=f'{name}.a'), *result.parameters[1:]),
+        parameters=(first, *result.parameters[1:]),
     )
-    found = words.markdown(renamed, {'samples': 3, name: {name: 1}}, (name,))
+    found = markdown(renamed, {'samples': 3, name: {name: 1}}, (name,))
     assert len(found.splitlines()) == len(usual.splitlines())
     assert '<' not in found
     row = next(line for line in usual.splitlines() if line.startswith(f'| {joint} |'))

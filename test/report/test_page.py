@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages of reports, without a browser."""
 
-import ast
 import base64
 import csv
 import hashlib
-import inspect
 import io
 import json
 import re
@@ -22,17 +20,19 @@ from measured import TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 from plotly import graph_objects
 
 from calib_ros.apply.verification import verify
-from calib_ros.apply.workspace import CalibratedArm, survey
+from calib_ros.apply.workspace import survey
 from calib_ros.cli.main import main
 from calib_ros.files.export import exports
-from calib_ros.identification import steps, validation
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.report import advice, explorer
 from calib_ros.report.maps import workspace_report
-from calib_ros.report.page import Input, Origin, Report, Verdict, render
+from calib_ros.report.page import Input, Origin, Report, Verdict, on_paper, render
+from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
 from calib_ros.report.verified import verification_report
@@ -181,7 +181,7 @@ def test_what_others_named_is_text(solved):
     told = Origin((Input('a', 1, 'b'),), 'c', 'd', 'e', 'f')
     poses = poses_of(*solved)
     plain = identification_report(*solved, poses, told, warnings=('g',))
-    plain = replace(plain, advice=advice.advice(['h', 'i']))
+    plain = replace(plain, advice=advice.advice([Reason(Rule.GAIN, 'h'), Reason(Rule.DRIFT, 'i')]))
     assert {tag for tag, _ in page.tags} <= {tag for tag, _ in page_of(plain).tags}
     shown = json.dumps(figures_of(page))
     assert '<b ' not in shown
@@ -199,7 +199,7 @@ def test_a_page_loads_nothing(solved):
 
 
 def test_every_figure_is_one_that_plotly_knows(solved):
-    arm = CalibratedArm.of(solved[1])
+    arm = Calibration.of(solved[1])
     found = survey(arm, 500, np.random.default_rng(0))
     reports = [report_of(*solved), workspace_report(arm, found, Origin())]
     count = 0
@@ -210,27 +210,13 @@ def test_every_figure_is_one_that_plotly_knows(solved):
     assert count >= 8
 
 
-def sample_refusals():
-    """Return the texts with which `refusals` and steps refuse, without their figures."""
-    tree = ast.parse(inspect.getsource(validation.refusals))
-    for call in ast.walk(tree):
-        if isinstance(call, ast.Call) and getattr(call.func, 'attr', '') == 'append':
-            parts = [each for each in ast.walk(call) if isinstance(each, ast.Constant)]
-            text = ' '.join(str(each.value) for each in parts)
-            if len(text) > 10:
-                yield text
-    for kind in ('joint', 'tool', 'base'):
-        yield str(steps.Step('x', kind, 0, 4, 5 * 10**9, 1e-3, 'm', 0.9, False))
-
-
-def test_every_refusal_is_told_in_plain_words():
-    found = list(sample_refusals())
-    assert len(found) >= 13
-    for each in advice.advice(found):
-        assert each.heading != advice.OTHER.heading, each.refusal
-        assert each.steps
-        assert each.meaning
-    assert advice.advice(['something new'])[0].refusal == 'something new'
+@pytest.mark.parametrize('rule', Rule)
+def test_every_refusal_is_told_in_plain_words(rule):
+    (told,) = advice.advice([Reason(rule, 'something new')])
+    assert told.heading
+    assert told.steps
+    assert told.meaning
+    assert told.refusal == 'something new'
 
 
 def test_a_refused_page_says_why_and_what_to_do():
@@ -250,6 +236,24 @@ def test_a_refused_page_says_why_and_what_to_do():
         assert each.refusal in page.text
     assert 'none: not accepted' in page.text
     assert 'map' not in figures_of(page)
+
+
+def test_paper_begins_with_a_certificate(solved):
+    report = report_of(*solved)
+    content = on_paper(report)
+    assert content.startswith(b'%PDF')
+    assert len(content) < 2e6
+    assert on_paper(replace(report, sections=())).startswith(b'%PDF')
+
+
+def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
+    arm = Calibration.of(solved[1])
+    found = survey(arm, 500, np.random.default_rng(0))
+    for report in (report_of(*solved), workspace_report(arm, found, Origin())):
+        for each in report.sections:
+            drawn = drawing(each.figure, each.height)
+            assert (drawn is not None) == (each.figure is not None)
+    assert drawing({'data': [{'type': 'scatter3d'}], 'layout': {}}, 100) is None
 
 
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
@@ -290,7 +294,7 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
 def test_a_verification_has_its_verdict_first(solved):
     problem, result = solved
     sets = (problem.held_out,)
-    found = verify(CalibratedArm.of(result), sets, 1e-3)
+    found = verify(Calibration.of(result), sets, 1e-3)
     poses = poses_to_verify(result.chain, sets, found.comparison)
     page = page_of(verification_report(result.chain, found, poses, Origin()))
     assert page.text.index('Passed') < page.text.index('Accuracy before')
@@ -317,7 +321,8 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
     out = tmp_path / 'out'
     told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
     arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
-    assert main([*arguments, '--tolerance', '5']) == 0
+    assert main([*arguments, '--tolerance', '5', '--pdf']) == 0
+    assert (out / 'report.pdf').read_bytes().startswith(b'%PDF')
     page = Page((out / 'report.html').read_text())
     digest = hashlib.sha256(table.read_bytes()).hexdigest()
     for text in ('A. Smith', 'tracker 7', '0012', digest, 'tolerance of 5 mm'):
@@ -336,12 +341,14 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
 def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'jinja2', None)
     out = tmp_path / 'out'
-    assert main(['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out)]) == 0
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
+    assert main(arguments) == 0
     said = capsys.readouterr().err
-    assert said.count('\n') == 1
+    assert said.count('\n') == 2
     assert 'calib_ros[report]' in said
+    assert 'calib_ros[pdf]' in said
     names = {path.name for path in out.iterdir()}
-    assert 'report.html' not in names
+    assert not {'report.html', 'report.pdf'} & names
     assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
 
 

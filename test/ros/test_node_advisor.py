@@ -27,6 +27,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import joints_csv
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import advisor as guide_module
@@ -353,7 +354,7 @@ def test_another_calibration_corrects_otherwise(calibrated, corrected):
     send(calibrated, trajectory(q))
     node = calibrated.node
     moved = node.session.calibration.chain.with_offsets({'elbow_joint.a': 1e-3})
-    node.session.load(moved)
+    node.session.adopt(Calibration(moved, UR))
     send(calibrated, trajectory(q))
     calibrated.spin_until(lambda: len(corrected) == 2)
     first, second = (np.array([p.positions for p in each.points]) for each in corrected)
@@ -373,7 +374,7 @@ def test_messages_are_taken_while_it_computes(tmp_path, recording, executor, mon
 
     monkeypatch.setattr(guide_module, 'compensate_program', slow)
     with Cell(executor, chain='ur10e', data_dir=str(tmp_path)) as cell:
-        cell.node.session.load(UR.with_frame('base', Frame()))
+        cell.node.session.adopt(Calibration(UR.with_frame('base', Frame()), UR))
         heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
         cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
         cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory').publish(trajectory(path(5)[0]))
@@ -396,7 +397,7 @@ def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
     monkeypatch.setattr(guide_module, 'compensate_program', stuck)
     with Cell() as cell:
         cell.node = cell.start(chain='ur10e', data_dir=str(tmp_path))
-        cell.node.session.load(UR)
+        cell.node.session.adopt(Calibration(UR, UR))
         publisher = cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory')
         for _ in range(3):
             publisher.publish(trajectory(path(5)[0]))

@@ -8,7 +8,8 @@ import pytest
 from ros_cell import Cell, true_arm
 
 from calib_ros.errors import InputError
-from calib_ros.kinematics.chain_file import dump_chain, load_chain, nominal_record
+from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
 SECRET = 'root:$6$salt$hash:19000:0:99999:7:::'
 
@@ -18,7 +19,7 @@ def data(tmp_path):
     """Return a folder that is the node's, with a calibration; a secret is beside it."""
     data = tmp_path / 'data'
     data.mkdir()
-    record = {'accepted': True, 'nominal': nominal_record(load_chain('ur10e'))}
+    record = {'accepted': True, 'nominal': nominal_document(load_chain('ur10e'))}
     (data / 'good.yaml').write_text(dump_chain(true_arm(), record))
     (tmp_path / 'shadow').write_text(SECRET + '\n')
     (tmp_path / 'secret.yaml').write_text(SECRET + '\n')

@@ -21,6 +21,7 @@ from streams import (
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
@@ -366,14 +367,24 @@ def test_a_bumped_robot_is_noticed():
     assert now.rms_mm > 0.5
 
 
-def test_a_loaded_calibration_is_judged_without_a_nominal_one():
-    chain = session(samples()).identify().chain
-    made = session()
-    made.load(chain, 0.1, 'tracker')
-    drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker()])
-    now, nominal = made.validate()
-    assert now.rms_mm < 0.15
-    assert nominal is None
+@pytest.mark.parametrize('first', [0, 1])
+def test_a_loaded_calibration_is_judged_like_the_one_identified(first):
+    """Whichever target is seen first: the file knows whose its frames are."""
+    rng = np.random.default_rng(5)
+    ball = replace(TRUE, tool=random_frame(rng, 0.2))
+    sources = [tracker(), (Source('ball', target='ball'), *tracker(ball)[1:])]
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    drive(made, UR5E.random_joints(30, rng), sources)
+    made.identify()
+    later = session()
+    later.adopt(parse_calibration(made.calibration.dump(), 'c.yaml', UR5E))
+    made.clear()
+    drive(made, UR5E.random_joints(5, np.random.default_rng(1)), sources[first : first + 1])
+    expected = made.validate()
+    later.restore(made.samples)
+    now, nominal = later.validate()
+    assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
+    assert (now.rms_mm, nominal.rms_mm) == pytest.approx([each.rms_mm for each in expected])
 
 
 def test_what_was_there_before_does_not_judge():
@@ -388,8 +399,9 @@ def test_what_was_there_before_does_not_judge():
 
 def test_the_calibration_of_another_robot_is_refused():
     made = session(samples())
+    panda = load_chain('franka_panda')
     with pytest.raises(InputError, match='the calibration has the joints panda_joint1'):
-        made.load(load_chain('franka_panda'))
+        made.adopt(Calibration(panda, panda))
     assert made.calibration is None
 
 

@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How far the RMS of position errors over poses like those measured may be from the RMS found.
+
+Of K configurations with errors e_k the sum of squares is taken for theta / nu chi2(nu)
+(Satterthwaite 1946) with
+
+    S = mean of e_k e_k^T        nu = K min((tr S)^2 / tr S^2, 2 / c^2)
+
+between K (all errors in one direction) and 3 K (in all directions alike), and fewer where the
+errors are larger at some places than at others, as compliance and eccentricities leave them: c^2
+is the variance of the squared errors over the square of their mean, taken together with that of
+POOLED errors in one direction (2), and larger by its own standard deviation. Few configurations
+make nu too small rather than too large. Measurements of one configuration share its error and
+count for one. Limits are one-sided, each at the confidence wanted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.kinematics.se3 import FloatArray
+
+POOLED = 2
+"""Configurations with errors in one direction that the scatter of the squares is pooled with."""
+
+
+def rms_limits(
+    rms: float, freedom: FloatArray, confidence: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the one-sided limits (N,) of an RMS found with (N,) degrees of freedom."""
+    lower, upper = (
+        rms / np.sqrt(special.chdtri(freedom, 1.0 - level) / freedom)
+        for level in (confidence, 1.0 - confidence)
+    )
+    return lower, upper
+
+
+def rms_interval(
+    errors: FloatArray, group: NDArray[np.intp], confidence: float
+) -> tuple[float, float]:
+    """Return the one-sided limits [m] of the RMS of errors (N, 3) over poses like these.
+
+    `group` (N,) are the configurations, of which each counts for one. With a single one nothing
+    is known: (0, inf).
+    """
+    _, place = np.unique(group, return_inverse=True)
+    moments = moments_of(errors, place)
+    if len(moments) < 2:
+        return 0.0, np.inf
+    rms = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    if rms == 0.0:
+        return 0.0, 0.0
+    freedom = np.array([freedom_of(moments) * len(moments)])
+    lower, upper = rms_limits(rms, freedom, confidence)
+    return float(lower[0]), float(upper[0])
+
+
+def freedom_of(moments: FloatArray) -> float:
+    """Return the degrees of freedom of one of the configurations with moments (K, 3, 3)."""
+    spread, count = moments.mean(axis=0), len(moments)
+    squares = np.trace(moments, axis1=1, axis2=2)
+    scatter = squares.var(ddof=1) / squares.mean() ** 2
+    scatter = ((count - 1) * scatter + 2.0 * POOLED) / (count - 1 + POOLED)
+    scatter *= 1.0 + np.sqrt(scatter / count)
+    return float(min(np.trace(spread) ** 2 / np.trace(spread @ spread), 2.0 / scatter))
+
+
+def moments_of(errors: FloatArray, group: NDArray[np.intp]) -> FloatArray:
+    """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
+    each = errors[:, :, np.newaxis] * errors[:, np.newaxis]
+    sums = np.zeros((int(group.max()) + 1, 3, 3))
+    np.add.at(sums, group, each)
+    return sums / np.bincount(group)[:, np.newaxis, np.newaxis]

@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A robot's program, with velocities and accelerations, corrected sample by sample."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_ros.apply.compensation import (
+    Compensation,
+    Compensator,
+    Refusal,
+    compensate,
+    refused,
+    too_fast,
+)
+from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+NUDGE = 0.01
+"""Step of the differences for velocities, in units of the largest correction."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Program(Shown):
+    """A robot's program as joint values by name.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Columns of the arrays; joints that are not of the arm may be among them.
+    positions : (N, m)
+        Joint values [rad or m], in the order in which they are run through.
+    velocities, accelerations : (N, m), optional
+        Their derivatives.
+    approach : (N, n), optional
+        Signs of the velocities with which the arm's joints come to their values, for backlash.
+        Found from the order of the positions when None.
+
+    """
+
+    names: tuple[str, ...]
+    positions: FloatArray
+    velocities: FloatArray | None = None
+    accelerations: FloatArray | None = None
+    approach: FloatArray | None = None
+
+
+def compensate_program(compensator: Compensator, program: Program) -> tuple[Program, Compensation]:
+    """Return a program with corrected joint values, and what became of each sample.
+
+    Velocities and accelerations follow the corrected path; times stay. Joints that are not of the
+    arm stay as they are. Refused samples are NaN.
+
+    Raises
+    ------
+    InputError, UnknownNameError
+        For a joint of the arm that is missing, and arrays that do not fit the names.
+
+    """
+    columns = _columns(compensator.nominal.joint_names, program)
+    positions = program.positions[:, columns]
+    approach = approaches(positions) if program.approach is None else program.approach
+    result = compensate(compensator, positions, approach)
+    if program.velocities is None:
+        return replace(program, positions=_put(program.positions, columns, result.joints)), result
+    given = program.accelerations
+    curve = np.zeros_like(program.velocities) if given is None else given
+    speeds = program.velocities[:, columns]
+    velocities, accelerations = _derivatives(
+        compensator, result, speeds, curve[:, columns], approach
+    )
+    result = refused(result, _held(result))
+    result = refused(result, _swings(compensator, result, speeds, velocities - speeds))
+    gaps = np.where(np.isnan(result.joints), np.nan, 0.0)
+    return (
+        replace(
+            program,
+            positions=_put(program.positions, columns, result.joints),
+            velocities=_put(program.velocities, columns, velocities + gaps),
+            accelerations=None if given is None else _put(given, columns, accelerations + gaps),
+        ),
+        result,
+    )
+
+
+def approaches(positions: FloatArray) -> FloatArray:
+    """Return the sign (N, n) of the last move of each joint, 0 before it first moves."""
+    moves = np.sign(np.diff(positions, axis=0, prepend=positions[:1]))
+    last = np.where(moves != 0.0, np.arange(len(moves))[:, np.newaxis], 0)
+    return np.asarray(np.take_along_axis(moves, np.maximum.accumulate(last, axis=0), axis=0))
+
+
+def _held(result: Compensation) -> list[Refusal]:
+    """Return the samples with a joint at its limit that are not refused yet."""
+    held = np.flatnonzero(result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1))
+    reason = 'a joint is held at its limit, where its velocity is not defined'
+    return [Refusal(sample, reason) for sample in held.tolist()]
+
+
+def _swings(
+    compensator: Compensator, result: Compensation, speeds: FloatArray, changes: FloatArray
+) -> list[Refusal]:
+    """Return the samples whose correction changes (N, n) too fast for their speeds (N, n).
+
+    The limit is that of jumps, which samples far from each other do not show.
+    """
+    sizes, moves = np.where(np.isnan(result.joints), 0.0, np.abs(changes)), np.abs(speeds)
+    return [
+        Refusal(
+            k,
+            f'the correction of {compensator.nominal.joint_names[i]} moves at {sizes[k, i]:.4g} '
+            f'while the joints move at {moves[k].max():.4g} a second at most',
+        )
+        for k, i in too_fast(compensator, sizes, moves)
+    ]
+
+
+def _derivatives(
+    compensator: Compensator,
+    result: Compensation,
+    velocities: FloatArray,
+    accelerations: FloatArray,
+    approach: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Return velocities and accelerations (N, n) along the corrected path.
+
+    Central differences of the correction along q + v t + a t^2 / 2, with a time step in which the
+    command moves by a small part of the largest correction.
+    """
+    speed, bend = (
+        np.abs(rates / compensator.largest).max(axis=1) for rates in (velocities, accelerations)
+    )
+    moving = speed + np.sqrt(speed**2 + 2.0 * NUDGE * bend)
+    step = np.where(moving > 0.0, 2.0 * NUDGE / np.where(moving > 0.0, moving, 1.0), 1.0)
+    step = step[:, np.newaxis]
+
+    def correction(time: FloatArray) -> FloatArray:
+        joints = result.command + time * velocities + 0.5 * time**2 * accelerations
+        return compensator.follower.solve(joints, approach, bounded=False).change
+
+    ahead, here, behind = correction(step), correction(0.0 * step), correction(-step)
+    return (
+        velocities + (ahead - behind) / (2.0 * step),
+        accelerations + (ahead - 2.0 * here + behind) / step**2,
+    )
+
+
+def _columns(names: Sequence[str], program: Program) -> list[int]:
+    """Return the columns of the arm's joints in a program."""
+    shape = program.positions.shape
+    if len(shape) != 2 or shape[1] != len(program.names):
+        raise InputError(f'{len(program.names)} joint names do not fit positions of shape {shape}')
+    for rates in (program.velocities, program.accelerations):
+        if rates is not None and rates.shape != shape:
+            raise InputError(f'rates of shape {rates.shape} do not fit positions of shape {shape}')
+        if rates is not None and not np.isfinite(rates).all():
+            raise InputError('velocities and accelerations must be finite numbers')
+    if program.accelerations is not None and program.velocities is None:
+        raise InputError('a program with accelerations needs velocities as well')
+    for name in names:
+        if program.names.count(name) > 1:
+            raise InputError(f'joint "{name}" comes twice in the program')
+    missing = [name for name in names if name not in program.names]
+    others = [name for name in program.names if name not in names]
+    if missing and others:
+        (strange,) = difflib.get_close_matches(missing[0], others, n=1, cutoff=0.0)
+        raise UnknownNameError('joint in the program', strange, names)
+    if missing:
+        raise InputError(f'the program has no values of {", ".join(missing)}')
+    return [program.names.index(name) for name in names]
+
+
+def _put(values: FloatArray, columns: Sequence[int], new: FloatArray) -> FloatArray:
+    """Return values (N, m) with some columns replaced."""
+    replaced = values.copy()
+    replaced[:, columns] = new
+    return replaced

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros import | csv2bag | bag2csv`: measurements in other files."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.inputs import replayed
+from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.options import (
+    OF_BAGS,
+    add_chain,
+    add_layout,
+    add_out,
+    add_settings,
+    add_storage,
+    foreign_of,
+    refuse_existing,
+    sessions_of,
+    settings_of,
+)
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+
+
+def _add_import(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to convert')
+    group.add_argument('table', type=Path, metavar='TABLE', help='CSV, text in columns, or .xlsx')
+    add_chain(group, needed=False)
+    add_out(group, 'CSV to write', 'FILE', needed=True)
+    add_layout(parser)
+
+
+def _add_csv2bag(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to convert')
+    group.add_argument('csv', type=Path, metavar='TABLE', help='the table')
+    group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
+    add_chain(group)
+    group.add_argument('--session', metavar='NAME', help='session of the table to use')
+    add_storage(group)
+
+
+def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to convert')
+    group.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file')
+    group.add_argument('csv', type=Path, metavar='TABLE', help='CSV to write')
+    group.add_argument('--force', action='store_true', help='replace what is there already')
+    add_chain(group)
+    add_settings(parser, OF_BAGS)
+
+
+def _import(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.atomic import write_file
+    from calib_ros.files.foreign import Foreign, as_csv
+    from calib_ros.files.layouts import Layout
+    from calib_ros.files.tables import table_of
+    from calib_ros.kinematics.chain_file import load_chain
+
+    refuse_others(options.table, 'import', 'table')
+    refuse_existing(options, options.out)
+    chain = None if options.chain is None else load_chain(options.chain)
+    foreign = foreign_of(options, chain) or Foreign(Layout(), chain)
+    with screen.work(f'converting {options.table.name}'):
+        columns, notes = foreign.convert(options.table)
+        table_of(columns, options.table)  # refuses what no table of ours may hold
+        text = as_csv(columns)
+    for note in notes:
+        screen.warn(note, 'note')
+    write_file(options.out, text, overwrite=options.force)
+    screen.say(f'wrote {options.out}: {len(columns.lines)} rows of {text.partition(chr(10))[0]}')
+    return 0
+
+
+def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
+    import numpy as np
+
+    from calib_ros.files.bags import Recording, write_bag
+    from calib_ros.files.tables import read_table
+    from calib_ros.identification.observations import Observations
+    from calib_ros.kinematics.chain_file import load_chain
+
+    refuse_others(options.csv, 'csv2bag', 'table')
+    chain = load_chain(options.chain)
+    table = read_table(options.csv, len(chain.joints), sessions_of(options))
+    if len(table.fitted) != 1 or table.fitted[0].distances is not None or table.pairs:
+        raise InputError('a bag holds poses or positions of one session and one target')
+    (fitted,) = table.fitted
+    held_out = table.held_out[0] if table.held_out else fitted.select(np.zeros(0, int))
+    oriented = bool(fitted.oriented.any() or held_out.oriented.any())
+    rows = Observations.from_arrays(
+        np.concatenate([fitted.joints, held_out.joints]),
+        np.concatenate([fitted.positions, held_out.positions]),
+        np.concatenate([fitted.rotations, held_out.rotations]) if oriented else None,
+    )
+    judging = np.arange(len(rows)) >= len(fitted)
+    recording = Recording.of_dwells(chain.joint_names, rows, judging)
+    with screen.work(f'writing {options.bag.name}'):
+        write_bag(options.bag, recording, options.storage)
+    screen.say(f'wrote {options.bag}: {len(fitted)} poses to fit, {len(held_out)} held out')
+    return 0
+
+
+def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.atomic import write_file
+    from calib_ros.files.tables import table_text
+    from calib_ros.kinematics.chain_file import load_chain
+
+    refuse_others(options.bag, 'bag2csv', 'bag')
+    refuse_existing(options, options.csv)
+    chain = load_chain(options.chain)
+    session, read = replayed(options.bag, chain, settings_of(options), screen)
+    screen.say(f'{read}; {session.account()}')
+    samples = session.usable
+    if not samples:
+        raise InputError(f'{options.bag} gives no samples ({session.account()})')
+    write_file(options.csv, table_text(samples, len(chain.joints)), overwrite=options.force)
+    for warning in read.warnings:
+        screen.warn(warning)
+    screen.say(f'wrote {options.csv}: {len(samples)} rows')
+    return 0
+
+
+COMMANDS = (
+    Command(
+        'bag2csv',
+        'Convert files',
+        'write the samples of a bag as a table',
+        _add_bag2csv,
+        _bag2csv,
+        ('bag2csv recording/ measured.csv --chain ur10e',),
+    ),
+    Command(
+        'csv2bag',
+        'Convert files',
+        'write a table of measured poses as a bag',
+        _add_csv2bag,
+        _csv2bag,
+        ('csv2bag measured.csv measured_bag --chain ur10e --session monday',),
+    ),
+    Command(
+        'import',
+        'Convert files',
+        'write a table of others as one of ours',
+        _add_import,
+        _import,
+        (
+            'import export.csv --length mm --angle deg --euler ZYX --out measured.csv',
+            'import export.csv --preset optitrack --joints log.csv --joints-preset kuka '
+            '--out measured.csv',
+        ),
+    ),
+)

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a camera saw, as what `identify` fits."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.inputs import SIGMA_TOUCH, Loaded, table
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+    from calib_ros.kinematics.chain import Chain
+    from calib_ros.settings import Settings
+
+SIGMA_PIXEL = 0.3
+"""Standard deviation [px] of a corner, if it is not given."""
+
+
+def detected(
+    options: argparse.Namespace, chain: Chain, settings: Settings, screen: Screen
+) -> Loaded:
+    """Return what is to be fitted of corners of a board, and of a table besides."""
+    from calib_ros.files.boards import (
+        POSED,
+        observed,
+        read_board,
+        read_detections,
+        read_lens,
+        read_places,
+    )
+    from calib_ros.identification.problem import Problem
+    from calib_ros.identification.reasons import Reason, Rule
+    from calib_ros.kinematics.chain import Frame
+
+    for name in ('board', 'places'):
+        if getattr(options, name) is None:
+            raise InputError(f'--detections need --{name} as well')
+    board = read_board(options.board)
+    found = read_detections(options.detections, board)
+    places, posed = read_places(options.places, len(chain.joints))
+    if posed != (chain.name == POSED):
+        raise InputError(
+            f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
+            + (f'give --chain {POSED}' if posed else 'give the chain of the arm')
+        )
+    seen, warnings = observed(found, board, places, options.eye_in_hand)
+    more = []
+    if options.csv is not None:
+        rows = table(options, options.csv, chain, settings, screen)
+        more, warnings = [*rows.fitted], (*warnings, *rows.warnings)
+        names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
+        seen = replace(seen, base=names[0], tool=names[1])
+    if seen.camera not in chain.frame_names:
+        chain = chain.with_frame(seen.camera, Frame())
+    camera = chain.frame(seen.camera)
+    lens = camera.lens if options.intrinsics is None else read_lens(options.intrinsics)
+    if lens is not None:
+        lens = replace(lens, fixed=options.lens != 'fitted')
+    chain = chain.with_frame(seen.camera, replace(camera, lens=lens))
+    given = settings.for_problem()
+    if posed:
+        given['fixed'] = (*given['fixed'], *(f'{name}.*' for name in chain.joint_names))
+    problem = Problem(
+        chain,
+        seen,
+        rows.held_out if options.csv is not None else None,
+        more=more,
+        sigma_pixel=SIGMA_PIXEL if options.sigma_pixel is None else options.sigma_pixel,
+        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
+        **given,
+    )
+    reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'
+    refusals = (Reason(Rule.POSED, reason),) if posed else ()
+    count = sum(map(len, problem.sets))
+    samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
+    return Loaded(problem, samples, warnings, refusals=refusals, instead=posed)

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros identify`: a calibration from a bag, a table, or what a camera saw."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.atomic import write_files
+from calib_ros.cli.command import Command
+from calib_ros.cli.inputs import of_bag, of_table
+from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.options import (
+    NOT_ACCEPTED,
+    add_chain,
+    add_identity,
+    add_layout,
+    add_out,
+    add_settings,
+    origin_of,
+    results,
+    settings_of,
+)
+from calib_ros.cli.results import (
+    RESULT_FILES,
+    Identified,
+    document,
+    identified,
+    result_files,
+    show,
+)
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+
+LAYOUT = (
+    *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
+    *('rotation_vector', 'inverse', 'shift', 'separator', 'decimal', 'sheet', 'joints'),
+)
+"""Options of tables of others."""
+DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens', 'sigma_pixel')
+"""Options for what a camera saw."""
+OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
+OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
+LARGEST_LOSS = 0.1
+"""Share of the messages of a bag that may be lost. As many fewer samples at random make standard
+deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to read')
+    add = group.add_argument
+    add(
+        'measured',
+        nargs='?',
+        type=Path,
+        metavar='MEASURED',
+        help='a table of measured poses, or a bag: folder, .mcap or .db3',
+    )
+    add('--csv', type=Path, metavar='FILE', help='the same for a table of any name')
+    add_chain(group)
+    add('--session', metavar='NAME', help='session of the table; several joined by commas')
+    add(
+        '--eye-in-hand',
+        action='store_true',
+        help='the poses are those of a fixed target in a camera on the flange',
+    )
+    add(
+        '--largest-loss',
+        type=float,
+        default=LARGEST_LOSS,
+        metavar='SHARE',
+        help='of the messages of a bag, beyond which the result is not accepted; 1: any',
+    )
+    add(
+        '--socket-distance',
+        type=float,
+        metavar='M',
+        help='between two sockets of a place, 0.05 if not given',
+    )
+    add(
+        '--sigma-touch',
+        type=float,
+        metavar='M',
+        help='of heights over touched planes, 1e-4 if not given',
+    )
+    group = parser.add_argument_group('what to write')
+    add_out(group, 'calibration, result and report')
+    group.add_argument('--json', action='store_true', help='print the result as JSON')
+    group.add_argument(
+        '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
+    )
+    _add_detections(parser)
+    add_settings(parser)
+    add_layout(parser)
+    add_identity(parser, pdf=True)
+
+
+def _add_detections(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group('what a camera saw (docs/images.md)').add_argument
+    add('--detections', type=Path, metavar='FILE', help='corners of a board, by calib_ros images')
+    add('--board', type=Path, metavar='FILE', help='YAML of that board')
+    add(
+        '--places',
+        type=Path,
+        metavar='FILE',
+        help='table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
+        'qx qy qz qw of the flange',
+    )
+    add('--intrinsics', type=Path, metavar='FILE', help='camera_info, by camera_calibration')
+    add('--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given')
+    add('--sigma-pixel', type=float, metavar='PX', help='of a corner, 0.3 if not given')
+
+
+def _run(options: argparse.Namespace, screen: Screen) -> int:
+    if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
+        raise InputError(f'--tolerance must be positive, not {options.tolerance}')
+    if not 0.0 <= options.largest_loss <= 1.0:
+        raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
+    if options.out is None:
+        found = _identified(options, screen)
+    else:
+        with results(options, (*RESULT_FILES, 'report.pdf')) as folder:
+            found = _identified(options, screen)
+            made = result_files(found, screen, options.out, options.tolerance, options.pdf)
+            write_files(folder, made)
+    for warning in (*found.warnings, *found.result.remarks):
+        screen.warn(warning)
+    if options.json:
+        screen.data(json.dumps(document(found, options.tolerance), indent=2))
+    else:
+        show(found, screen, options.out)
+    return 0 if found.result.accepted else NOT_ACCEPTED
+
+
+def _source(options: argparse.Namespace) -> str:
+    """Return 'bag' or 'table', with the table in `options.csv`, or the bag in `measured`."""
+    if options.measured is not None and options.csv is None:
+        bag = refuse_others(options.measured, 'identify', 'table', 'bag') == 'bag'
+        if not bag:
+            options.csv, options.measured = options.measured, None
+    source = 'table' if options.csv or options.detections else 'bag'
+    if (options.measured is None) == (source == 'bag'):
+        raise InputError('give either a bag, or a table or --detections FILE, or both of these')
+    for name in OF_BAGS if source == 'table' else OF_TABLES:
+        if getattr(options, name):
+            raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
+    return source
+
+
+def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
+    """Return what there is to identify in a table or a bag."""
+    from calib_ros.files.boards import POSED, posed_arm
+    from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report import words
+
+    source = _source(options)
+    chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
+    settings = settings_of(options)
+    if options.detections is not None:
+        from calib_ros.cli.detections import detected
+
+        loaded = detected(options, chain, settings, screen)
+    elif source == 'table':
+        loaded = of_table(options, chain, settings, screen)
+    else:
+        loaded = of_bag(options.measured, chain, settings, screen, options.largest_loss)
+    configuration = words.configuration_yaml(options.chain, settings)
+    read = (options.csv, options.detections, options.measured)
+    return identified(loaded, settings, screen, origin_of(options, read, configuration))
+
+
+COMMANDS = (
+    Command(
+        'identify',
+        'Calibrate',
+        'identify the errors of an arm from a bag or a table of measured poses',
+        _add,
+        _run,
+        (
+            'identify measured.csv --chain ur10e --out result/',
+            'identify recording/ --chain robot.urdf --out result/ --model auto',
+            'identify export.csv --chain ur10e --length mm --angle deg --euler ZYX',
+            'identify measured.csv --chain ur10e --session monday --json',
+        ),
+    ),
+)

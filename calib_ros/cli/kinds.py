@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What kind of file somebody gives, and which command takes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calib_ros.errors import InputError
+
+BEGINNINGS = (
+    (b'\x89MCAP', 'bag'),
+    (b'SQLite format 3', 'bag'),
+    (b'\x28\xb5\x2f\xfd', 'bag'),
+    (b'\x89PNG', 'image'),
+    (b'\xff\xd8\xff', 'image'),
+    (b'%PDF', 'report'),
+    (b'<!doctype html', 'report'),
+    (b'<', 'urdf'),
+)
+SUFFIXES = {
+    **dict.fromkeys(('.mcap', '.db3', '.zstd', '.bag'), 'bag'),
+    **dict.fromkeys(('.urdf', '.xacro', '.xml'), 'urdf'),
+    **dict.fromkeys(('.yaml', '.yml'), 'chain'),
+    **dict.fromkeys(('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp'), 'image'),
+    **dict.fromkeys(('.html', '.pdf', '.md'), 'report'),
+    **dict.fromkeys(('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat'), 'table'),
+}
+IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
+WORDS = {
+    'bag': ('a bag', 'identify and verify take it, bag2csv makes a table of it'),
+    'table': ('a table', 'identify and verify take it, csv2bag makes a bag of it'),
+    'program': ('a program', 'compensate takes it'),
+    'chain': ('a YAML file', 'chain prints one of an arm, which commands take as --chain'),
+    'urdf': ('a URDF', 'commands take it as --chain'),
+    'result': ('the result of identify', 'workspace takes it, others as --calibration'),
+    'image': ('an image', 'images takes the folder of it'),
+    'report': ('a report', 'open it in a browser or a reader'),
+}
+
+
+def kind_of(path: Path) -> str:
+    """Return a key of `WORDS`, or an empty text where nothing tells."""
+    if path.is_dir():
+        names = [each.name for each in path.iterdir()]
+        found = [kind for name, kind in IN_FOLDERS if name in names]
+        found += [kind for kind in map(_by_suffix, names) if kind in ('bag', 'image')]
+        return found[0] if found else ''
+    if path.is_file():
+        with path.open('rb') as file:
+            begin = file.read(16)
+        for mark, kind in BEGINNINGS:
+            if begin.lower().startswith(mark.lower()):
+                return kind
+    kind = _by_suffix(path.name)
+    if kind == 'chain' and path.is_file():
+        with path.open('rb') as file:
+            if b'points:' in file.read(100_000):
+                return 'program'
+    return kind
+
+
+def _by_suffix(name: str) -> str:
+    return SUFFIXES.get(Path(name).suffix.lower(), '')
+
+
+def proposal(path: Path) -> str | None:
+    """Return what to do with a file that stands where a command should; None for no file."""
+    kind = kind_of(path)
+    if not kind:
+        return None
+    what, where = WORDS[kind]
+    return f'{path} is {what}, no command: {where} (calib_ros COMMAND --help)'
+
+
+def refuse_others(path: Path, command: str, *wanted: str) -> str:
+    """Return which of the wanted kinds a file is, the last one where nothing tells.
+
+    Raises
+    ------
+    InputError
+        When it is of another kind.
+
+    """
+    kind = kind_of(path) or wanted[-1]
+    if kind not in wanted:
+        what, where = WORDS[kind]
+        takes = ' or '.join(WORDS[each][0] for each in wanted)
+        raise InputError(f'{path} is {what}, but {command} takes {takes}: {where}')
+    return kind

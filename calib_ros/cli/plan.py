@@ -1,0 +1,225 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros plan`: which poses to measure."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.options import (
+    add_chain,
+    add_identity,
+    add_out,
+    add_settings,
+    origin_of,
+    page_of,
+    refuse_existing,
+    settings_of,
+)
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from calib_ros.apply.candidates import Visibility
+    from calib_ros.apply.design import Design
+    from calib_ros.apply.planning import Plan
+    from calib_ros.cli.screen import Screen
+    from calib_ros.kinematics.se3 import FloatArray
+
+TASK_POSES = 300
+"""Random poses at which a plan is to be accurate when no task is given."""
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    from calib_ros.apply.choice import CRITERIA
+
+    group = parser.add_argument_group('what is wanted')
+    add_chain(group)
+    add = group.add_argument
+    add('--poses', type=int, metavar='N', help='how many; 25, or what --accuracy needs')
+    add('--accuracy', type=float, metavar='MM', help='wanted RMS position error at the task poses')
+    add('--iso9283', action='store_true', help='the five test poses of ISO 9283 instead')
+    add('--task', type=Path, metavar='FILE', help='CSV q1..qn; random poses if not given')
+    add('--taken', type=Path, metavar='FILE', help='CSV q1..qn of poses measured already')
+    add_out(group, 'CSV q1..qn to write, and its report beside it', 'FILE')
+    add = parser.add_argument_group('poses to choose from').add_argument
+    add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
+    add('--draw', type=int, default=2000, metavar='N', help='random candidates without a file')
+    add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
+    add(
+        '--apart',
+        type=float,
+        default=1e-3,
+        metavar='X',
+        help='least move of a joint between poses [rad, m]',
+    )
+    add(
+        '--velocity',
+        type=float,
+        nargs='+',
+        default=[1.0],
+        metavar='V',
+        help='of the joints [rad/s, m/s]',
+    )
+    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
+    add = parser.add_argument_group('what the device sees').add_argument
+    add('--measured', choices=('pose', 'position'), default='pose', help='at each pose')
+    add('--box', type=float, nargs=6, metavar='M', help='measurable region: lower, upper corner')
+    add('--tracker', type=float, nargs=3, metavar='M', help='where the device stands')
+    add(
+        '--axis',
+        type=float,
+        nargs=3,
+        default=[0.0, 0.0, 1.0],
+        metavar='X',
+        help='of the target, to face it',
+    )
+    add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
+    add('--world', action='store_true', help='box and tracker are in the world, not in the base')
+    add_settings(parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed'))
+    add_identity(parser)
+
+
+def _run(options: argparse.Namespace, screen: Screen) -> int:
+    import numpy as np
+
+    from calib_ros.apply.candidates import Visibility
+    from calib_ros.apply.design import ASSUMED_TOOL, Design
+    from calib_ros.apply.simulation import measure
+    from calib_ros.atomic import write_file
+    from calib_ros.files.waypoints import joints_csv
+    from calib_ros.identification.problem import Problem
+    from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report.maps import plan_report
+
+    _check(options)
+    chain = load_chain(options.chain)
+    rng = np.random.default_rng(options.seed)
+    nowhere = np.zeros((1, len(chain.joints)))
+    imagined = measure(chain, nowhere, rng, oriented=options.measured == 'pose')
+    design = Design.of(Problem(chain, imagined, **settings_of(options).for_problem()))
+    visibility = Visibility(
+        None if options.box is None else np.reshape(options.box, (2, 3)),
+        None if options.tracker is None else np.array(options.tracker),
+        tuple(options.axis),
+        np.radians(options.cone),
+        options.world,
+    )
+    planned = _tests if options.iso9283 else _measurement
+    with screen.work('choosing poses'):
+        joints, words, plan = planned(options, design, visibility, rng)
+    screen.say(words)
+    if chain.tool is None:
+        x, y, z = ASSUMED_TOOL
+        screen.say(
+            f'the tool is unknown: its target is taken to be at {x} {y} {z} m from the flange'
+        )
+    if options.out is not None:
+        page = _page_beside(options.out)
+        report = plan_report(
+            design.chain,
+            joints,
+            words,
+            origin_of(options, (options.candidates, options.task, options.taken)),
+            plan,
+            options.accuracy,
+        )
+        pages = page_of(report, screen, page.name)
+        write_file(options.out, joints_csv(joints), overwrite=options.force)
+        for text in pages.values():
+            write_file(page, text, overwrite=options.force)
+        screen.say(f'wrote {options.out}' + (f' and {page}' if pages else ''))
+    return 0
+
+
+def _measurement(
+    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+) -> tuple[FloatArray, str, Plan | None]:
+    """Return the poses to measure in the order of visit, what they promise, and the plan."""
+    import numpy as np
+
+    from calib_ros.apply import planning
+    from calib_ros.apply.candidates import draw_candidates
+    from calib_ros.files.waypoints import read_joints
+
+    size = len(design.chain.joints)
+    if len(options.velocity) not in (1, size):
+        raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
+    if options.taken is not None:
+        design = design.after(read_joints(options.taken, design.chain))
+    task = design.chain.random_joints(TASK_POSES, rng)
+    if options.task is not None:
+        task = read_joints(options.task, design.chain)
+    if options.candidates is None:
+        candidates = draw_candidates(design, options.draw, rng, visibility)
+    else:
+        candidates = read_joints(options.candidates, design.chain)
+        candidates = candidates[visibility.sees(design, candidates)]
+        if not len(candidates):
+            raise InputError(f'the target can be measured at no pose of {options.candidates}')
+    choice = {'criterion': options.criterion, 'apart': options.apart}
+    needed = None
+    if options.accuracy is not None:
+        wanted = 1e-3 * options.accuracy
+        needed = planning.poses_needed(design, candidates, task, wanted, **choice)
+    count = options.poses or needed or 25
+    speeds = np.broadcast_to(options.velocity, size)
+    plan = planning.plan(design, candidates, task, count, **choice, velocities=speeds)
+    words = planning.in_words(plan, len(candidates), options.accuracy, needed)
+    return plan.joints[plan.visit], words, plan
+
+
+def _tests(
+    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+) -> tuple[FloatArray, str, Plan | None]:
+    """Return the test poses of ISO 9283, and what to do with them; there is no plan."""
+    from calib_ros.apply.iso9283 import iso_9283_poses
+
+    found = iso_9283_poses(design, rng, visibility)
+    words = (
+        f'P1 to P5 of ISO 9283 in a cube of {found.edge:.3f} m, one orientation: go to them in '
+        'turn, 30 times, and measure. Collisions are not looked at'
+    )
+    return found.joints, words, None
+
+
+def _check(options: argparse.Namespace) -> None:
+    """Refuse options of `plan` that make no sense."""
+    for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
+        if options.iso9283 and getattr(options, name) is not None:
+            raise InputError(f'--{name} is of no use with --iso9283')
+    for name, lowest in (('poses', 1), ('draw', 1), ('seed', 0)):
+        value = getattr(options, name)
+        if value is not None and value < lowest:
+            raise InputError(f'--{name} must be at least {lowest}, not {value}')
+    if options.accuracy is not None and not options.accuracy > 0.0:
+        raise InputError(f'--accuracy must be positive, not {options.accuracy}')
+    if options.apart < 0.0 or not all(value > 0.0 for value in options.velocity):
+        raise InputError('--apart must not be negative, and each --velocity must be positive')
+    if options.out is not None:
+        refuse_existing(options, options.out, _page_beside(options.out))
+
+
+def _page_beside(path: Path) -> Path:
+    """Return where the report of a plan is."""
+    return path.with_name(f'{path.stem}.report.html')
+
+
+COMMANDS = (
+    Command(
+        'plan',
+        'Before measuring',
+        'choose the poses to measure, and say how accurate they make',
+        _add,
+        _run,
+        (
+            'plan --chain ur10e --accuracy 0.1 --out plan.csv',
+            'plan --chain ur10e --poses 40 --tracker 3 0 1 --cone 45 --out plan.csv',
+            'plan --chain ur10e --iso9283 --out tests.csv',
+        ),
+    ),
+)

@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An identification: made, shown in six rows with its reasons, and written into its files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib_ros.cli.options import page_of
+from calib_ros.errors import InputError, TooFewObservationsError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.inputs import Loaded
+    from calib_ros.cli.screen import Screen
+    from calib_ros.identification.identification import Identification
+    from calib_ros.report.page import Origin
+    from calib_ros.settings import Settings
+
+RESULT_FILES = (
+    'calibration.yaml',
+    'result.json',
+    'report.html',
+    'report.md',
+    'residuals.csv',
+    'before_after.png',
+    'settings.yaml',
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """A result with its input and where that comes from."""
+
+    loaded: Loaded
+    result: Identification
+    origin: Origin
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Return what was strange in the input."""
+        return self.loaded.warnings
+
+
+def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origin) -> Identified:
+    """Identify, and refuse the result where too much of the input is lost."""
+    from calib_ros.identification.model_choice import identify_model
+
+    with screen.work('identifying') as work:
+        try:
+            result = identify_model(loaded.problem, settings.model, work)
+        except TooFewObservationsError as err:
+            if loaded.read:
+                raise InputError(f'{err} ({loaded.read})') from err
+            raise
+    own = () if loaded.instead else result.refusals
+    result = replace(result, refusals=(*own, *loaded.refusals))
+    return Identified(loaded, result, origin)
+
+
+def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
+    """Print a result: the verdict, six rows, and each reason or note once."""
+    from calib_ros.report import words
+    from calib_ros.report.advice import advice
+
+    result = found.result
+    if found.loaded.read:
+        screen.say(found.loaded.read)
+    if result.accepted:
+        screen.title('accepted: the calibration makes the arm better', True)
+    else:
+        screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
+    screen.table(_rows(result))
+    for each in advice(result.refusals):
+        screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
+    for note in words.notes(result):
+        screen.bullet(note)
+    for line in words.cameras_in_words(result):
+        screen.bullet(line)
+    if out is None:
+        screen.bullet('nothing is kept: --out FOLDER writes the calibration and its report')
+    else:
+        screen.say(f'wrote {out}: open {out / "report.html"}')
+
+
+def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
+    before, after = (result.validation or result.fitted).figures
+    samples = f'{len(result.fitted.judged)}'
+    if result.outliers:
+        samples += f', {len(result.outliers)} outliers carry no weight'
+    fitted = f'{result.rank} parameters'
+    if result.chain.effects:
+        fitted += f', {len(result.chain.effects)} of them effects'
+    second = ('largest error', f'{before.max_mm:.3f} -> {after.max_mm:.3f} mm')
+    if before.rms_mrad is not None and after.rms_mrad is not None:
+        turn = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
+        second = ('orientation error', turn)
+    if before.rms_px is not None and after.rms_px is not None:
+        second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
+    return (
+        ('robot', f'{result.chain.name}, {fitted} fitted'),
+        ('samples', samples),
+        ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm'),
+        second,
+        ('judged by', result.validated_by),
+        ('valid', result.region.in_words().removeprefix('valid ') if result.region else 'nowhere'),
+    )
+
+
+def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
+    """Return the content of result.json; `tolerance` is the wanted error [mm]."""
+    from calib_ros.report import words
+
+    content = words.as_document(found.result, found.loaded.samples)
+    content |= {'warnings': list(found.warnings), 'tolerance_mm': tolerance}
+    return content | {'origin': found.origin.document()}
+
+
+def result_files(
+    found: Identified,
+    screen: Screen,
+    out: Path,
+    tolerance: float | None = None,
+    pdf: bool = False,
+) -> dict[str, str | bytes]:
+    """Return the files of a result by name; a chain only if it is accepted.
+
+    A chain that was accepted earlier, in `out`, is kept under another name when this result is
+    not: it does not belong to the files beside it any more. `tolerance` is the wanted error [mm].
+    """
+    from calib_ros.identification.calibration import Calibration
+    from calib_ros.report.markdown import markdown
+    from calib_ros.report.plots import before_after_png
+    from calib_ros.report.poses import poses_of
+    from calib_ros.report.reports import identification_report
+
+    loaded, result = found.loaded, found.result
+    with screen.work('writing the report'):
+        poses = poses_of(loaded.problem, result, loaded.lines)
+        contents: dict[str, str | bytes] = {
+            'result.json': json.dumps(document(found, tolerance), indent=2) + '\n',
+            'report.md': markdown(result, loaded.samples, found.warnings),
+            'residuals.csv': poses.table(),
+            'before_after.png': before_after_png(result),
+            'settings.yaml': found.origin.settings,
+        }
+        wanted = None if tolerance is None else 1e-3 * tolerance
+        report = identification_report(
+            loaded.problem, result, poses, found.origin, found.warnings, wanted
+        )
+        contents |= page_of(report, screen, pdf=pdf)
+    earlier = out / 'calibration.yaml'
+    if result.accepted:
+        contents['calibration.yaml'] = Calibration.of(result, owners=loaded.owners).dump()
+    elif earlier.exists():
+        contents['calibration.previous.yaml'] = earlier.read_bytes()
+    return contents

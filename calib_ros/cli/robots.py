@@ -1,0 +1,102 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros robots | chain`: the arms that are known."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+
+
+def _add_robots(parser: argparse.ArgumentParser) -> None:
+    del parser
+
+
+def _robots(options: argparse.Namespace, screen: Screen) -> int:
+    import numpy as np
+
+    from calib_ros.kinematics.chain_file import load_chain, shipped_robots
+
+    del options
+    lines = [f'{"--chain":21}{"joints":>6}  {"DH table":10}{"length":>8}']
+    for name in shipped_robots():
+        chain = load_chain(name)
+        length = sum(np.hypot(joint.a, joint.d) for joint in chain.joints)
+        lines.append(f'{name:21}{len(chain.joints):6}  {chain.convention:10}{length:6.2f} m')
+    screen.data('\n'.join(lines))
+    screen.say('')
+    screen.say('calib_ros chain NAME prints one, to read or to edit')
+    return 0
+
+
+def _add_chain(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('which arm')
+    add = group.add_argument
+    add('robot', metavar='ROBOT', help='URDF, chain file, or a robot by its name (ur10e, ...)')
+    add('--base-link', metavar='LINK', help='of a URDF: where the arm starts, else its root')
+    add('--tip-link', metavar='LINK', help='of a URDF: where the arm ends, such as tool0')
+    add('--convention', metavar='NAME', help='of the table from a URDF: standard or modified')
+    add('--out', type=Path, metavar='FILE', help='file to write instead')
+
+
+def _chain(options: argparse.Namespace, screen: Screen) -> int:
+    from dataclasses import replace
+
+    from calib_ros.atomic import write_file
+    from calib_ros.kinematics.chain_file import (
+        URDF_SUFFIXES,
+        chain_document,
+        dump_chain,
+        load_chain,
+        read_urdf,
+    )
+
+    names = ('base_link', 'tip_link', 'convention')
+    given = {name: getattr(options, name) for name in names if getattr(options, name)}
+    path = Path(options.robot)
+    if path.suffix in URDF_SUFFIXES:
+        chain = read_urdf(path, **given)
+        frames = chain_document(chain)
+        text = dump_chain(replace(chain, base=None, tool=None))
+        text += '# Known in the URDF: take a line in where the device measures in the base link,\n'
+        text += '# or the tip link itself. Without it that frame is found from the poses.\n'
+        for key in ('base', 'tool'):
+            text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
+    elif given:
+        raise InputError(f'--{next(iter(given)).replace("_", "-")} is of use with a URDF only')
+    else:
+        text = dump_chain(load_chain(options.robot))
+    if options.out is None:
+        screen.data(text.rstrip('\n'))
+    else:
+        write_file(options.out, text)
+        screen.say(f'wrote {options.out}')
+    return 0
+
+
+COMMANDS = (
+    Command(
+        'robots',
+        'First steps',
+        'list the arms that come with calib_ros',
+        _add_robots,
+        _robots,
+        ('robots',),
+    ),
+    Command(
+        'chain',
+        'First steps',
+        'print the chain file of a robot, to read and to edit',
+        _add_chain,
+        _chain,
+        ('chain ur10e', 'chain robot.urdf --tip-link tool0 --out robot.yaml'),
+    ),
+)

@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a command shows: results on standard output; signs of life and warnings on the other.
+
+On a terminal with rich in colour, with a bar; else plain, in lines of 80 columns. Nothing but
+printable characters leaves it: a topic or a joint may have any name.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, TextIO
+
+WIDTH = 80
+FIRST_S = 0.5
+"""Time after which work shows on a terminal that it goes on."""
+EVERY_S = 2.0
+"""Time between two signs of life; where they stay, as in a log, each time doubles it."""
+LONGEST_S = 32.0
+STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
+
+
+class Screen:
+    """Where a command says what it does.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing but data, warnings and errors.
+
+    """
+
+    def __init__(self, quiet: bool = False) -> None:
+        self.quiet = quiet
+
+    def data(self, text: str) -> None:
+        """Print what was asked for, to be read by a program or a person; also when quiet."""
+        print(text)
+
+    def say(self, text: str) -> None:
+        """Print lines as they are; on a terminal, those that are too long are wrapped."""
+        if self.quiet:
+            return
+        for line in text.splitlines() or ['']:
+            indent = ' ' * (len(line) - len(line.lstrip()) + 2)
+            print(_fitted(line, indent, sys.stdout), flush=True)
+
+    def title(self, text: str, good: bool | None = None) -> None:
+        """Print a verdict; the colour of a good or bad one never says more than the words."""
+        console = None if self.quiet else _console(sys.stdout)
+        if console is None:
+            self.say(text)
+        else:
+            console.print(_rich_text(text, STYLES[good]))
+
+    def table(self, rows: Sequence[tuple[str, str]]) -> None:
+        """Print a table of names and values."""
+        if self.quiet:
+            return
+        console = _console(sys.stdout)
+        if console is not None:
+            from rich.box import ROUNDED
+            from rich.table import Table
+
+            shown = Table(box=ROUNDED, show_header=False, border_style='dim')
+            for name, value in rows:
+                shown.add_row(_rich_text(name, 'bold'), _rich_text(value))
+            console.print(shown)
+            return
+        width = max(len(name) for name, _ in rows) + 4
+        for name, value in rows:
+            head = f'  {name}'.ljust(width)
+            print(_wrapped(value, head, ' ' * width, _width(sys.stdout)))
+
+    def bullet(self, text: str, steps: Sequence[str] = ()) -> None:
+        """Print a reason or a note, and what to do, in steps if there are several."""
+        if self.quiet:
+            return
+        print(_wrapped(text, '- ', '  ', _width(sys.stdout)))
+        for k, step in enumerate(steps):
+            head = f'  {k + 1}. ' if len(steps) > 1 else '  -> '
+            print(_wrapped(step, head, ' ' * len(head), _width(sys.stdout)))
+
+    def warn(self, text: str, kind: str = 'warning') -> None:
+        """Print a warning; to a file as one line."""
+        line = _fitted(f'{kind}: {text}', '  ', sys.stderr)
+        console = _console(sys.stderr)
+        if console is not None:
+            console.print(_rich_text(line, 'yellow'))
+        else:
+            print(line, file=sys.stderr)
+
+    @contextmanager
+    def work(self, what: str) -> Iterator[Work]:
+        """Show that work goes on in a `with` block, and how much time is left if that is told."""
+        work = Work(what)
+        if self.quiet:
+            yield work
+            return
+        watch = threading.Thread(target=work.watch, daemon=True)
+        watch.start()
+        try:
+            yield work
+        finally:
+            work.done.set()
+            watch.join()
+
+
+class Work:
+    """A piece of work; called with the stage that begins, or the share that is done, or both."""
+
+    def __init__(self, what: str) -> None:
+        self.what, self.stage, self.share = what, '', 0.0
+        self.done = threading.Event()
+        self._began = time.monotonic()
+
+    def __call__(self, stage: str = '', share: float | None = None) -> None:
+        """Note what the work is at."""
+        self.stage = stage or self.stage
+        self.share = self.share if share is None else min(max(share, 0.0), 1.0)
+
+    def __str__(self) -> str:
+        """Return in words what is done."""
+        spent = time.monotonic() - self._began
+        words = f'{self.words()}, {spent:.0f} s'
+        if self.share > 0.0:
+            left = spent * (1.0 / self.share - 1.0)
+            words += f', {100.0 * self.share:.0f} %, {left:.0f} s left'
+        return words
+
+    def words(self) -> str:
+        """Return what the work is, and its stage."""
+        return _printable(f'{self.what} ({self.stage})' if self.stage else self.what)
+
+    def watch(self) -> None:
+        """Show that the work goes on until it is done."""
+        if not sys.stderr.isatty():
+            pause = EVERY_S
+            while not self.done.wait(pause):
+                print(f'calib_ros: {self}', file=sys.stderr, flush=True)
+                pause = min(2.0 * pause, LONGEST_S)
+        elif not self.done.wait(FIRST_S):
+            console = _console(sys.stderr)
+            if console is None:
+                self._in_one_line()
+            else:
+                self._as_bar(console)
+
+    def _in_one_line(self) -> None:
+        """Write one line of a plain terminal over and over."""
+        width = _width(sys.stderr) - 1
+        while True:
+            sys.stderr.write(f'\r{str(self)[:width]:{width}}')
+            sys.stderr.flush()
+            if self.done.wait(FIRST_S):
+                break
+        sys.stderr.write('\r' + ' ' * width + '\r')
+        sys.stderr.flush()
+
+    def _as_bar(self, console: Any) -> None:
+        from rich import progress
+
+        columns = (
+            progress.SpinnerColumn(),
+            progress.TextColumn('{task.description}', markup=False),
+            progress.BarColumn(bar_width=20),
+            progress.TextColumn('{task.fields[told]}'),
+        )
+        with progress.Progress(*columns, console=console, transient=True) as bar:
+            task = bar.add_task('', total=None, told='')
+            while True:
+                told = str(self)[len(self.words()) + 2 :]
+                total = 1.0 if self.share else None
+                bar.update(
+                    task, description=self.words(), total=total, completed=self.share, told=told
+                )
+                if self.done.wait(FIRST_S / 5):
+                    break
+
+
+def _console(stream: TextIO) -> Any:
+    """Return what writes in colour to a terminal; None where there is none, or no rich."""
+    if not stream.isatty() or os.environ.get('TERM') == 'dumb':
+        return None
+    try:
+        from rich.console import Console
+    except ImportError:
+        return None
+    return Console(file=stream, width=_width(stream), highlight=False)
+
+
+def _rich_text(text: str, style: str = '') -> Any:
+    from rich.text import Text
+
+    return Text(_printable(text), style)
+
+
+def _width(stream: TextIO) -> int:
+    """Return how many columns a line may have."""
+    return min(shutil.get_terminal_size((WIDTH, 24)).columns, 100) if stream.isatty() else WIDTH
+
+
+def _printable(text: str) -> str:
+    return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
+
+
+def _fitted(line: str, indent: str, stream: TextIO) -> str:
+    """Return a line as a terminal takes it; in a file it stays one."""
+    return _wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
+
+
+def _wrapped(text: str, head: str, indent: str, width: int) -> str:
+    text = _printable(text)
+    if len(head) + len(text) <= width and '\n' not in text:
+        return head + text
+    return textwrap.fill(
+        text,
+        width,
+        initial_indent=head,
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        drop_whitespace=True,
+    )

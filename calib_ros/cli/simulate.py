@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros simulate | demo`: a cell with known errors."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.options import (
+    NOT_ACCEPTED,
+    add_chain,
+    add_out,
+    add_storage,
+    origin_of,
+    results,
+)
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+    from calib_ros.kinematics.chain import Chain
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to simulate')
+    group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
+    add_chain(group)
+    _add_simulation(group)
+
+
+def _add_demo(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to simulate')
+    add_chain(group, 'ur10e')
+    add_out(group, 'what it writes', default=Path('demo'))
+    _add_simulation(group)
+
+
+def _add_simulation(parser: argparse._ArgumentGroup) -> None:
+    add = parser.add_argument
+    add('--poses', type=int, default=60, metavar='N', help='configurations to measure')
+    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
+    add_storage(parser)
+
+
+def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.kinematics.chain_file import load_chain
+
+    with screen.work('simulating'):
+        truth = _write_simulation(load_chain(options.chain), options, options.bag)
+    screen.say(f'wrote {options.bag} and the true chain {truth}')
+    return 0
+
+
+def _demo(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.atomic import write_files
+    from calib_ros.cli.inputs import of_bag
+    from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
+    from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report import words
+    from calib_ros.settings import Settings
+
+    chain, settings = load_chain(options.chain), Settings()
+    own = (*RESULT_FILES, 'bag_truth.yaml', 'bag/bag.*', 'bag/metadata.yaml')
+    with results(options, own) as folder:
+        folder.mkdir()
+        bag = folder / 'bag'
+        screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
+        with screen.work('simulating'):
+            truth = _write_simulation(chain, options, bag)
+        screen.say('2. reading that recording as one of a real cell')
+        loaded = of_bag(bag, chain, settings, screen)
+        screen.say('3. identifying the errors from it')
+        configuration = words.configuration_yaml(options.chain, settings)
+        origin = origin_of(options, [bag], configuration)
+        found = identified(loaded, settings, screen, origin)
+        screen.say('4. writing the report')
+        write_files(folder, result_files(found, screen, options.out))
+        against = words.against_truth(found.result, load_chain(truth))
+    screen.say('identified offsets against the true ones [mm, mrad]:')
+    screen.say(against)
+    show(found, screen, options.out)
+    return 0 if found.result.accepted else NOT_ACCEPTED
+
+
+def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
+    """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
+    import numpy as np
+
+    from calib_ros.apply.simulation import Cell, drive, faulty, measure
+    from calib_ros.files.bags import Recording, write_bag
+    from calib_ros.kinematics.chain_file import dump_chain
+
+    if options.poses < 1 or options.seed < 0:
+        raise InputError(
+            f'--poses must be at least 1 and --seed at least 0, not {options.poses} and '
+            f'{options.seed}'
+        )
+    rng, cell = np.random.default_rng(options.seed), Cell()
+    true = faulty(chain, cell, rng)
+    configurations = chain.random_joints(options.poses, rng)
+    joint_stamps, joints, pose_stamps = drive(configurations, cell, 1_700_000_000_000_000_000)
+    standing = np.repeat(configurations, cell.poses_per_dwell, axis=0)
+    poses = measure(true, standing, rng, cell.noise_position, cell.noise_orientation)
+    recording = Recording(
+        chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
+    )
+    truth = bag.with_name(f'{bag.name}_truth.yaml')
+    write_bag(bag, recording, options.storage, {truth: dump_chain(true, {'source': 'simulation'})})
+    return truth
+
+
+COMMANDS = (
+    Command(
+        'demo',
+        'First steps',
+        'simulate an arm, identify it, and compare the result with the truth',
+        _add_demo,
+        _demo,
+        ('demo', 'demo --chain franka_panda --out demo_panda/'),
+    ),
+    Command(
+        'simulate',
+        'First steps',
+        'write the bag of a simulated robot cell, with the true chain',
+        _add,
+        _run,
+        ('simulate cell_bag --chain kuka_iiwa14 --poses 60',),
+    ),
+)

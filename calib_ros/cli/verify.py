@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros verify`: the verdict on a calibrated arm."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.inputs import replayed, table
+from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.options import (
+    NOT_ACCEPTED,
+    OF_BAGS,
+    add_calibration,
+    add_chain,
+    add_identity,
+    add_layout,
+    add_out,
+    add_settings,
+    origin_of,
+    page_of,
+    results,
+    settings_of,
+)
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from calib_ros.apply.verification import Verification
+    from calib_ros.cli.screen import Screen
+    from calib_ros.identification.observations import Observations
+    from calib_ros.kinematics.chain import Chain
+
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
+TITLES = {
+    'PASS': ('PASS: the arm is within the tolerance', True),
+    'FAIL': ('FAIL: the arm is beyond the tolerance', False),
+    'UNDECIDED': ('UNDECIDED: too few measurements to tell', None),
+    'JUDGED': ('judged: without --tolerance there is no verdict', None),
+}
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to judge')
+    add = group.add_argument
+    add(
+        'measured',
+        type=Path,
+        metavar='MEASURED',
+        help='new measurements: a bag, or a table with q1..qn as reported, x y z ...',
+    )
+    add_chain(group)
+    add_calibration(group)
+    add(
+        '--commanded',
+        type=Path,
+        metavar='FILE',
+        help='the program before its correction, q1..qn: judge against the poses that it means',
+    )
+    add('--session', metavar='NAME', help='session of the table')
+    add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
+    add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+    group = parser.add_argument_group('how to judge')
+    group.add_argument(
+        '--tolerance',
+        type=float,
+        metavar='MM',
+        help='wanted RMS position error; if not given, errors only, without a verdict',
+    )
+    group.add_argument(
+        '--confidence', type=float, default=0.95, metavar='SHARE', help='of the verdict'
+    )
+    add_out(group, 'the report and the residuals')
+    add_settings(parser, OF_BAGS)
+    add_layout(parser)
+    add_identity(parser, pdf=True)
+
+
+def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.atomic import write_files
+
+    if options.out is None:
+        return _verified(options, screen)[0]
+    with results(options, VERIFICATION_FILES) as folder:
+        status, contents = _verified(options, screen)
+        write_files(folder, contents)
+    screen.say(f'wrote {options.out}')
+    return status
+
+
+def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[str, str | bytes]]:
+    """Judge, and print what comes out; return the exit status and the files of --out."""
+    from calib_ros.apply.verification import in_words, verify
+    from calib_ros.files.waypoints import read_joints
+    from calib_ros.identification.calibration import calibration_file, load_calibration
+    from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report.poses import poses_to_verify
+    from calib_ros.report.verified import verification_report
+
+    nominal = load_chain(options.chain)
+    arm = load_calibration(options.calibration, nominal)
+    sets, warnings, by_line = _sets(options, nominal, screen)
+    commanded = None
+    if options.commanded is not None:
+        commanded = read_joints(options.commanded, nominal)
+    with screen.work('judging'):
+        found = verify(
+            arm,
+            sets,
+            None if options.tolerance is None else 1e-3 * options.tolerance,
+            options.confidence,
+            options.new_base,
+            commanded,
+            options.new_tool,
+        )
+    for warning in warnings:
+        screen.warn(warning)
+    words = in_words(found)
+    show(found, screen)
+    status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
+    if options.out is None:
+        return status, {}
+    read = (options.measured, options.commanded, calibration_file(options.calibration))
+    with screen.work('writing the report'):
+        poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
+        report = verification_report(arm.chain, found, poses, origin_of(options, read), warnings)
+        contents: dict[str, str | bytes] = {
+            'residuals.csv': poses.table(),
+            'verification.txt': f'{words}\n',
+        }
+        return status, contents | page_of(report, screen, pdf=options.pdf)
+
+
+def show(found: Verification, screen: Screen) -> None:
+    """Print a verdict, six rows, the poses if they are few, and what to do."""
+    from calib_ros.apply.verification import remarks
+
+    before, after = found.comparison.figures
+    orientation = 'not measured'
+    if before.rms_mrad is not None and after.rms_mrad is not None:
+        orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
+    tolerance = 'none given (--tolerance MM)'
+    if found.tolerance is not None:
+        tolerance = f'RMS {1e3 * found.tolerance:g} mm'
+    screen.title(*TITLES[found.verdict])
+    screen.table(
+        (
+            ('measured', f'{after.count} times in {found.configurations} configurations'),
+            ('position error', f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm'),
+            ('largest', f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm'),
+            ('orientation error', orientation),
+            (
+                f'{100.0 * found.confidence:g} % sure',
+                f'RMS over poses like these is above {1e3 * found.lower:.4f} and below '
+                f'{1e3 * found.upper:.4f} mm',
+            ),
+            ('tolerance', tolerance),
+        )
+    )
+    if found.each:
+        screen.say('position error [mm] by configuration')
+        screen.say('  pose   measured   before    after   repeatability (mean + 3 sigma)')
+    for k, pose in enumerate(found.each):
+        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        line = f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
+        screen.say(line.rstrip())
+    for remark in remarks(found):
+        screen.bullet(remark)
+
+
+def _sets(
+    options: argparse.Namespace, nominal: Chain, screen: Screen
+) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
+    """Return all that was measured, warnings, and whether stamps are the lines of a table."""
+    settings = settings_of(options)
+    if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
+        found = table(options, options.measured, nominal, settings, screen)
+        return (*found.fitted, *found.held_out), found.warnings, found.by_line
+    from calib_ros.sampling.sample import collect
+
+    session, read = replayed(options.measured, nominal, settings, screen)
+    screen.say(f'{read}; {session.account()}')
+    sigmas = (settings.sigma_position, settings.sigma_orientation)
+    fitted, held_out = collect(session.usable, sigmas)
+    if not (fitted or held_out):
+        raise InputError(f'{options.measured} gives no samples: {session.account()}')
+    return (*fitted, *held_out), read.warnings, False
+
+
+COMMANDS = (
+    Command(
+        'verify',
+        'Calibrate',
+        'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
+        _add,
+        _run,
+        (
+            'verify new.csv --chain ur10e --calibration result/',
+            'verify recording/ --chain ur10e --calibration result/ --tolerance 0.3',
+            'verify new.csv --chain ur10e --calibration result/ --commanded tests.csv',
+        ),
+    ),
+)

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros workspace`: how good the arm is where."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.options import (
+    add_chain,
+    add_identity,
+    add_out,
+    origin_of,
+    page_of,
+    results,
+)
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from calib_ros.apply.workspace import Survey
+    from calib_ros.cli.screen import Screen
+    from calib_ros.identification.calibration import Calibration
+    from calib_ros.kinematics.se3 import FloatArray
+
+WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
+PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
+BOX_POSES = 30
+"""Random poses that stand for a task given as a box of joint values."""
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    from calib_ros.apply.placement import AIMS
+    from calib_ros.identification.calibration import MODELS
+
+    group = parser.add_argument_group('what to map')
+    add = group.add_argument
+    add(
+        'result',
+        type=Path,
+        metavar='RESULT',
+        help='folder of identify --out, or a calibrated chain file alone',
+    )
+    add_chain(group)
+    add_out(group, 'tables, words and figures', needed=True)
+    add('--poses', type=int, default=20_000, metavar='N', help='random poses of the survey')
+    add('--model', choices=MODELS, default='corrected', help='by which the arm is commanded')
+    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
+    add = parser.add_argument_group('a task to place').add_argument
+    add('--task', type=Path, metavar='FILE', help='CSV x y z qx qy qz qw in the frame of a task')
+    add('--joint-box', type=float, nargs='+', metavar='Q', help='task: lower, then upper values')
+    add('--aim', choices=AIMS, default='mean', help='error over the poses of the task')
+    add('--region', type=float, nargs=6, metavar='M', help='for the task, lower, upper corner')
+    add('--cells', type=int, default=9, metavar='N', help='placements along each axis')
+    add('--turns', type=int, default=1, metavar='N', help='turns about the vertical to try')
+    add_identity(parser)
+
+
+def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.atomic import write_files
+
+    for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
+        if getattr(options, name) < lowest:
+            raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
+    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as folder:
+        write_files(folder, _files(options, screen))
+    screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
+    return 0
+
+
+def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes]:
+    """Map, place, print what comes out, and return the files of it."""
+    import numpy as np
+
+    from calib_ros.apply import placement, workspace
+    from calib_ros.files.waypoints import csv_of, joints_csv
+    from calib_ros.identification.calibration import calibration_file, load_calibration
+    from calib_ros.kinematics.chain_file import load_chain
+    from calib_ros.report import plots
+    from calib_ros.report.maps import workspace_report
+
+    arm = load_calibration(options.result, load_chain(options.chain))
+    rng = np.random.default_rng(options.seed)
+    task = _task(options, arm, rng)
+    with screen.work('mapping errors over the workspace'):
+        survey = workspace.survey(arm, options.poses, rng)
+        contents: dict[str, str | bytes] = {
+            'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
+            'workspace.png': plots.workspace_png(survey),
+        }
+    words = workspace.in_words(survey)
+    _show(survey, screen)
+    if arm.region is not None:
+        sentence = f'The calibration is {arm.region.in_words()}.'
+        words += f'\n{sentence}\n'
+        screen.bullet(sentence)
+    found = None
+    if task is not None:
+        region = None if options.region is None else np.reshape(options.region, (2, 3))
+        with screen.work('placing the task'):
+            found = placement.place(
+                arm, task, options.aim, options.model, region, options.cells, options.turns
+            )
+        placed = placement.in_words(found, options.aim, options.model)
+        words += f'\n{placed}'
+        screen.say(placed)
+        table = np.column_stack([found.positions, found.turns, found.errors])
+        contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
+        contents['placements.png'] = plots.placements_png(found)
+        contents['placed_task.csv'] = joints_csv(found.joints[found.best])
+    origin = origin_of(options, (calibration_file(options.result),))
+    with screen.work('writing the report'):
+        contents |= page_of(workspace_report(arm, survey, origin, found), screen)
+    return contents | {'workspace.md': words}
+
+
+def _show(survey: Survey, screen: Screen) -> None:
+    """Print six rows."""
+    from calib_ros.apply.workspace import Spread, regions
+
+    rows = [('position error', f'at {len(survey.joints)} random poses of the joint range')]
+    for label, errors in survey.parts.items():
+        s = Spread.of(1e3 * errors)
+        figures = f'RMS {s.rms:.4f}, 95 % below {s.percentile_95:.4f}, largest {s.max:.4f} mm'
+        rows.append((label.removesuffix(' by the calibration'), figures))
+    found = regions(survey.positions, survey.removed)
+    for label, sector in (('removes most', found[0]), ('removes least', found[-1])):
+        rows.append((label, f'{sector.words}: RMS {1e3 * sector.rms:.4f} mm'))
+    screen.table(rows)
+
+
+def _task(
+    options: argparse.Namespace, arm: Calibration, rng: np.random.Generator
+) -> FloatArray | None:
+    """Return the poses (K, 4, 4) of the task to place, if there is one."""
+    import numpy as np
+
+    from calib_ros.apply.placement import task_of
+    from calib_ros.apply.workspace import in_base
+    from calib_ros.files.waypoints import read_poses
+
+    if options.task is not None and options.joint_box is not None:
+        raise InputError('give either --task or --joint-box')
+    if options.task is not None:
+        return read_poses(options.task)
+    if options.joint_box is None:
+        return None
+    size = len(arm.chain.joints)
+    if len(options.joint_box) != 2 * size:
+        raise InputError(
+            f'--joint-box: give {size} lower and {size} upper values, not '
+            f'{len(options.joint_box)} in all'
+        )
+    lower, upper = np.reshape(options.joint_box, (2, size))
+    if not (lower <= upper).all():
+        raise InputError('--joint-box: give all lower values first, then all upper ones')
+    joints = rng.uniform(lower, upper, (BOX_POSES, size))
+    return task_of(in_base(arm.commanded_by(options.model), joints))
+
+
+COMMANDS = (
+    Command(
+        'workspace',
+        'Use the calibration',
+        'map errors over the workspace, and place a task where they are least',
+        _add,
+        _run,
+        (
+            'workspace result/ --chain ur10e --out map/',
+            'workspace result/ --chain ur10e --task task.csv --out map/ --aim max',
+        ),
+    ),
+)

@@ -1,0 +1,275 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A calibration, saved and loaded whole: a chain file with a record of where it comes from.
+
+What it removes at q is the distance between the nominal arm, in fitted frames, and the calibrated
+one. What remains is predicted by the expected squares C of the parameters' errors and by the RMS
+error r on poses that were not fitted,
+
+    removed(q) = |p_nominal - p|      sigma(q)^2 = tr J C J^T      remaining(q)^2 = sigma^2 + r^2
+
+with J the rows of position of the error model. An arm that is commanded by its nominal model is
+expected to miss by the root of removed^2 + remaining^2, by its calibrated model by `remaining`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+import calib_ros
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification import records
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.leastsquares import BLOCK
+from calib_ros.identification.noise import Noise
+from calib_ros.identification.region import Region, region_of_record
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import (
+    dump_chain,
+    frames_document,
+    parse_chain,
+    read_text,
+    table_hash,
+)
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Settings
+from calib_ros.shown import Shown
+
+Model: TypeAlias = Literal['corrected', 'nominal']
+MODELS: tuple[Model, ...] = get_args(Model)
+HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Shown):
+    """A corrected chain, what it was before, and how well it is known.
+
+    Attributes
+    ----------
+    chain, before : Chain
+        The corrected chain, and the nominal one in fitted frames.
+    names, covariance : tuple of str, (P, P)
+        Parameters that were fitted, and their covariance; none when it is not known.
+    freedom : float
+        Degrees of freedom from which the covariance was estimated.
+    residual : float or None
+        RMS position error [m] on poses that were not fitted; None when it is not known.
+    noise : Noise or None
+        Of the measurements, where it is known.
+    region : Region or None
+        Where the calibration may be used; None when it is not known.
+    world_frame : str
+        Frame in which the poses were measured.
+    owners : mapping
+        Which session, device or target each frame is of (`sampling.sample.Frames`), if known.
+    record : mapping
+        Where the numbers come from, as the file says it, but for the covariance.
+
+    """
+
+    chain: Chain
+    before: Chain
+    names: tuple[str, ...] = ()
+    covariance: FloatArray | None = None
+    freedom: float = np.inf
+    residual: float | None = None
+    noise: Noise | None = None
+    region: Region | None = None
+    world_frame: str = ''
+    owners: Mapping[str, records.Owner] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        result: Identification,
+        origin: Mapping[str, Any] | None = None,
+        owners: Mapping[str, records.Owner] | None = None,
+    ) -> Calibration:
+        """Return the calibration of an identification; `origin` tells of its samples."""
+        before, after = (result.validation or result.fitted).figures
+        region, noise = result.region, result.noise
+        record = {
+            'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+            'software': f'calib_ros {calib_ros.__version__}',
+            'accepted': result.accepted,
+            'world_frame': result.world_frame,
+            'samples': len(result.fitted.judged),
+            'outliers': len(result.outliers),
+            'validated_by': result.validated_by,
+            'rms_mm_before': round(before.rms_mm, 6),
+            'rms_mm_after': round(after.rms_mm, 6),
+            'noise_in_sigma': asdict(noise) | {'shared': list(noise.shared)},
+            'not_identifiable': list(result.unidentifiable),
+            'table_sha256': table_hash(result.chain),
+            'nominal': records.nominal_document(result.before) | frames_document(result.before),
+            'frames': records.owners_document(owners or {}),
+            'region': None if region is None else region.document(),
+            **(origin or {}),
+        }
+        return cls(
+            result.chain,
+            result.before,
+            result.names,
+            result.covariance,
+            result.uncertainty.overall,
+            1e-3 * after.rms_mm,
+            noise,
+            region,
+            result.world_frame,
+            owners or {},
+            record,
+        )
+
+    def dump(self) -> str:
+        """Return it as the text of a chain file, which can be an input again."""
+        record = dict(self.record)
+        if self.covariance is not None:
+            record['covariance'] = {
+                'names': list(self.names),
+                'freedom': None if np.isinf(self.freedom) else self.freedom,
+                'root': records.packed(self.covariance),
+            }
+        return HEAD + dump_chain(self.chain, record)
+
+    def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return distance (N,) [m] and angle (N,) [rad] between before and after at (N, n)."""
+        before, after = self.before.forward(joints), self.chain.forward(joints)
+        turn = se3.log_rotation(before[:, :3, :3] @ np.swapaxes(after[:, :3, :3], 1, 2))
+        shift = before[:, :3, 3] - after[:, :3, 3]
+        return np.linalg.norm(shift, axis=1), np.linalg.norm(turn, axis=1)
+
+    def sigma(self, joints: FloatArray) -> FloatArray:
+        """Return the standard deviation (N,) [m] of predicted positions; NaN if not known.
+
+        With the region it is the expected error, effects that are not modelled included.
+        """
+        if self.region is not None:
+            return self.region.sigma(joints)
+        return self._sigma(joints, slice(0, 3))
+
+    def sigma_turned(self, joints: FloatArray) -> FloatArray:
+        """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
+        return self._sigma(joints, slice(3, 6))
+
+    def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
+        if self.covariance is None:
+            return np.full(len(joints), np.nan)
+        model = ErrorModel(self.chain, self.names)
+        squares = np.empty(len(joints))
+        for first in range(0, len(joints), BLOCK):
+            part = slice(first, first + BLOCK)
+            rows = model.jacobian(joints[part])[:, components]
+            squares[part] = np.einsum('ncp,pq,ncq->n', rows, self.covariance, rows, optimize=True)
+        return np.sqrt(np.maximum(squares, 0.0))
+
+    def remaining(self, joints: FloatArray) -> FloatArray:
+        """Return the error (N,) [m] expected to remain at (N, n); NaN if not known."""
+        return np.hypot(self.sigma(joints), self.residual or 0.0)
+
+    def expected(self, joints: FloatArray, model: Model) -> FloatArray:
+        """Return the error (N,) [m] expected when a model commands the arm to (N, n)."""
+        if model not in MODELS:
+            raise UnknownNameError('model', model, MODELS)
+        left = self.remaining(joints)
+        if model == 'nominal':
+            return np.hypot(np.nan_to_num(left, nan=self.residual or 0.0), self.removed(joints)[0])
+        if np.isnan(left).any():
+            raise ConfigError(
+                'what remains after the correction cannot be predicted from a chain alone: give '
+                'the calibration.yaml of an identification, or ask for the nominal model'
+            )
+        return left
+
+    def commanded_by(self, model: Model) -> Chain:
+        """Return the chain by which a model turns poses into joint values."""
+        return self.chain if model == 'corrected' else self.before
+
+    def knowledge(self, joints: FloatArray, turned: FloatArray) -> tuple[str, str]:
+        """Return how well a program at (N, n) is known, and a warning where that is not enough.
+
+        `turned` (N,) [rad] are the errors of orientation to correct. Both are empty where the
+        covariance is not known, or nothing is to be warned about.
+        """
+        if self.covariance is None:
+            return '', ''
+        shift, turn = self.sigma(joints), self.sigma_turned(joints)
+        words = (
+            f'sigma of the calibration at these poses: {1e3 * shift.max(initial=0.0):.3f} mm '
+            f'where the target was, {1e3 * turn.max(initial=0.0):.3f} mrad at most'
+        )
+        if np.sum(turn**2) <= np.sum(turned**2):
+            return words, ''
+        return words, (
+            'the calibration does not know the orientation well enough to correct it; positions '
+            'hold near the measured target only. Measure orientations as well, or a target '
+            'further off the last axis'
+        )
+
+
+def calibration_file(path: str | os.PathLike[str]) -> Path:
+    """Return the file of a calibration, which may be in the folder of an identification."""
+    file = Path(path)
+    return file / 'calibration.yaml' if file.is_dir() else file
+
+
+def load_calibration(
+    path: str | os.PathLike[str], nominal: Chain | None = None, settings: Settings | None = None
+) -> Calibration:
+    """Read a calibration: its file, or the folder of an identification (`parse_calibration`)."""
+    file = calibration_file(path)
+    return parse_calibration(read_text(file), str(file), nominal, settings)
+
+
+def parse_calibration(
+    text: str, where: str, nominal: Chain | None = None, settings: Settings | None = None
+) -> Calibration:
+    """Turn the text of a calibration into what it says; `where` names it in errors.
+
+    A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
+    all that calib_ros writes, and must not speak against a nominal chain that is given; nor may
+    the numbers be further from it than `largest_length` and `largest_angle` of the settings allow.
+    Without settings the identification has judged that, if it records the numbers of this chain.
+    Without a nominal chain that of the record is taken. What a file of before does not tell is
+    not known, but for the frames of the nominal chain: these are fitted to the corrected one, over
+    the whole range of the joints.
+
+    Raises
+    ------
+    ConfigError
+        When the text is no chain file, a chain without a record, or a calibration that was not
+        accepted, or that was identified from another nominal chain.
+
+    """
+    chain = parse_chain(text, where)
+    if nominal is not None:
+        records.check_joints(chain, nominal, where)
+    about = records.parse_record(text, where)
+    if nominal is None:
+        nominal = records.nominal_of(about, chain, where)
+    records.check_nominal(chain, about, nominal, where, settings)
+    before = records.before_of(about, nominal, chain, where)
+    names, covariance, freedom = records.covariance_of(about, chain, where)
+    residual = about.get('rms_mm_after')
+    return Calibration(
+        chain,
+        before,
+        names,
+        covariance,
+        freedom,
+        None if residual is None else 1e-3 * residual,
+        records.noise_of(about, where),
+        region_of_record(about, chain, where),
+        about.get('world_frame', ''),
+        records.owners_of(about, where),
+        {key: value for key, value in about.items() if key != 'covariance'},
+    )

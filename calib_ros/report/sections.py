@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What pages of several kinds show alike: accuracy, identity, and figures of poses."""
+
+from __future__ import annotations
+
+import platform
+from datetime import datetime, timezone
+
+import numpy as np
+
+import calib_ros
+from calib_ros.apply.confidence import rms_interval
+from calib_ros.files.rows import EPOCH_NS
+from calib_ros.identification.validation import Comparison, ErrorFigures
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report import figures
+from calib_ros.report.page import Origin, Section
+from calib_ros.report.poses import Poses
+
+INTERVAL = 0.975
+"""One-sided confidence of each limit of an interval of 95 %."""
+ISO_9283 = (
+    'Terms as in ISO 9283: the position accuracy AP is the distance between the pose commanded '
+    'and the mean of the poses attained. Where a pose was measured once, its repeatability is '
+    'part of the figure.'
+)
+HEAD = ('', 'poses', 'RMS [mm]', '95 % interval', 'mean', 'max', 'mean + 3 sigma', 'RMS [mrad]')
+
+
+def gain(which: Comparison) -> str:
+    """Return the errors before and after with their uncertainty."""
+    parts = []
+    for when, found in enumerate(which.figures):
+        between = _between(limits_of(which, when, INTERVAL))
+        parts.append(f'{found.rms_mm:.3f} mm' + (f' ({between})' if between else ''))
+    return ' → '.join(parts)
+
+
+def _between(limits: tuple[float, float]) -> str:
+    """Return limits [m] in mm; nothing where they are not known."""
+    return f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if np.isfinite(limits[1]) else ''
+
+
+def limits_of(which: Comparison, when: int, confidence: float) -> tuple[float, float]:
+    """Return the limits [m] of the RMS before (0) or after (1), without outliers."""
+    residuals = (which.before, which.after)[when]
+    mask = which.judged & ~np.isnan(residuals.position).any(axis=1)
+    return rms_interval(residuals.position[mask], residuals.configurations[mask], confidence)
+
+
+def accuracy_rows(label: str, which: Comparison) -> list[tuple[str, ...]]:
+    """Return the rows of the table of accuracy, before and after."""
+    return [
+        row_of(f'{label}, {name}', found, limits_of(which, when, INTERVAL))
+        for when, (name, found) in enumerate(zip(('before', 'after'), which.figures, strict=True))
+    ]
+
+
+def row_of(label: str, found: ErrorFigures, limits: tuple[float, float] | None) -> tuple[str, ...]:
+    """Return a row of the table of accuracy, with limits [m] of the RMS if they are known."""
+    between = '' if limits is None else _between(limits)
+    turned = '' if found.rms_mrad is None else f'{found.rms_mrad:.3f}'
+    lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
+    shown = (f'{each:.3f}' for each in lengths)
+    return (label, f'{found.count:,}', f'{found.rms_mm:.3f}', between, *shown, turned)
+
+
+def identity_of(
+    chain: Chain,
+    origin: Origin,
+    poses: Poses | None = None,
+    judged: tuple[str, str] = ('', ''),
+    corrected: str = '',
+) -> tuple[tuple[str, str], ...]:
+    """Return what the result is of, by whom and when; what is not told is left out."""
+    rows = [
+        ('Robot', chain.name),
+        ('Serial number', origin.serial),
+        ('Joints', ', '.join(chain.joint_names)),
+        ('Measuring device', origin.device),
+        ('Operator', origin.operator),
+        ('Measured', _measured(poses)),
+        ('Poses', '' if poses is None else f'{len(poses):,}'),
+        judged,
+        ('Report made', datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC')),
+        (
+            'Software',
+            f'calib_ros {calib_ros.__version__}, Python {platform.python_version()}, '
+            f'numpy {np.__version__}',
+        ),
+        ('Corrected table, SHA-256', corrected),
+    ]
+    return tuple((label, value) for label, value in rows if value)
+
+
+def _measured(poses: Poses | None) -> str:
+    """Return when it was measured, where the stamps tell."""
+    if poses is None or not len(poses) or poses.lines or poses.stamps_ns[0] < EPOCH_NS:
+        return ''
+    first, last = (
+        datetime.fromtimestamp(int(stamp) // 10**9, timezone.utc).strftime('%Y-%m-%d %H:%M')
+        for stamp in (poses.stamps_ns[0], poses.stamps_ns[-1])
+    )
+    return f'{first} to {last} UTC'
+
+
+def distribution(poses: Poses) -> Section:
+    """Return how many of the judged poses are how good."""
+    chosen = poses.judged
+    before, after = (
+        1e3 * np.linalg.norm(each[chosen], axis=1) for each in (poses.before, poses.after)
+    )
+    return Section(
+        'cumulated',
+        'How many poses are how good',
+        ('Outliers are left out. The further left a curve, the better.',),
+        figures.cumulated(before, after),
+    )
+
+
+def coverage(chain: Chain, joints: FloatArray, title: str) -> Section:
+    """Return how far joint values (N, n) reach in the range of each joint."""
+    figure, rows = figures.coverage(chain, joints)
+    return Section(
+        'coverage',
+        title,
+        ('Errors show only where a joint was: blank parts of its range hold no poses.',),
+        figure,
+        ('joint', 'range', 'poses from, to', 'parts with poses'),
+        rows,
+        100 + 45 * len(rows),
+    )

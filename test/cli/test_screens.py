@@ -1,0 +1,278 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What every command shows, in 80 columns.
+
+The screens are in `screens/`, with 0 for every digit of a result. After a wanted change:
+
+    SCREENS=write python -m pytest test/cli/test_screens.py
+"""
+
+import errno
+import io
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from measured import TEST, UR, measured, rows_of, write_csv
+
+from calib_ros.cli import screen
+from calib_ros.cli.command import commands
+from calib_ros.cli.main import main
+from calib_ros.cli.options import SETTINGS
+from calib_ros.files import bags
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+SCREENS = Path(__file__).parent / 'screens'
+ESCAPE = '\x1b'
+
+
+class Terminal(io.StringIO):
+    """What stands for a terminal of 80 columns."""
+
+    def isatty(self):
+        return True
+
+
+def assert_shown(name, text):
+    path = SCREENS / f'{name}.txt'
+    if os.environ.get('SCREENS') == 'write':
+        path.write_text(text)
+    assert text == path.read_text(), f'if this is wanted: {__doc__.splitlines()[-2].strip()}'
+    assert max(map(len, text.splitlines()), default=0) <= 80
+
+
+def without_digits(text):
+    """Return a text with 0 for the digits and + for the signs of its numbers."""
+    number = r'(?<![\w.])[+-]?\d[\d.]*(?!\w)'
+    return re.sub(number, lambda found: re.sub(r'\d', '0', found[0].replace('-', '+')), text)
+
+
+@pytest.fixture(scope='module')
+def cell(tmp_path_factory):
+    """A folder with a table, a bag, results that are accepted and not, a task, a program."""
+    folder = tmp_path_factory.mktemp('cell')
+    back = os.getcwd()
+    os.chdir(folder)
+    try:
+        write_csv(folder / 'measured.csv', rows_of(measured()))
+        write_csv(folder / 'good_arm.csv', rows_of(measured(UR, seed=5)))
+        write_csv(folder / 'new.csv', rows_of(measured(seed=11))[:TEST])
+        table = ['measured.csv', '--chain', 'ur5e']
+        assert main(['identify', *table, '--out', 'result', '--quiet']) == 0
+        assert main(['simulate', 'bag', '--chain', 'ur5e', '--poses', '8', '--quiet']) == 0
+        assert main(['plan', *table[1:], '--iso9283', '--out', 'tests.csv', '--quiet']) == 0
+    finally:
+        os.chdir(back)
+    return folder
+
+
+@pytest.fixture
+def shown(cell, monkeypatch, capsys):
+    """Return a function that runs a command in that folder, and returns all that it shows."""
+    monkeypatch.chdir(cell)
+    monkeypatch.setenv('COLUMNS', '80')
+
+    def shown(*arguments):
+        capsys.readouterr()
+        try:
+            status = main(list(arguments))
+        except SystemExit as err:
+            status = err.code
+        out, err = capsys.readouterr()
+        return status, out + err
+
+    return shown
+
+
+def test_the_overview(shown):
+    status, text = shown()
+    assert status == 2
+    assert_shown('overview', text)
+    assert shown('--help') == (0, text)
+
+
+@pytest.mark.parametrize('name', commands())
+def test_the_help_of_a_command(shown, name):
+    status, text = shown(name, '--help')
+    assert status == 0
+    assert_shown(f'{name}_help', text)
+    assert 'default: None' not in text
+
+
+UR5E = ('--chain', 'ur5e')
+BOARD = ['--columns', '5', '--rows', '4', '--square', '0.03', '--marker', '0.02']
+RESULTS = {
+    'bag2csv': (0, 'bag', 'NEW/table.csv', *UR5E),
+    'board': (0, 'charuco', *BOARD, '--out', 'NEW/board.pdf'),
+    'chain': (0, 'ur5e', '--out', 'NEW/ur5e.yaml'),
+    'compensate': (0, 'tests.csv', *UR5E, '--calibration', 'result', '--out', 'NEW/p.csv'),
+    'csv2bag': (0, 'measured.csv', 'NEW/bag', *UR5E),
+    'demo': (0, '--poses', '20', '--out', 'NEW/demo'),
+    'export': (0, 'result/calibration.yaml', *UR5E, '--out', 'NEW/export'),
+    'identify': (0, 'measured.csv', *UR5E, '--out', 'NEW/result'),
+    'import': (0, 'measured.csv', *UR5E, '--out', 'NEW/table.csv'),
+    'plan': (0, *UR5E, '--poses', '20', '--draw', '200', '--out', 'NEW/plan.csv'),
+    'robots': (0,),
+    'simulate': (0, 'NEW/bag', *UR5E, '--poses', '3'),
+    'verify': (0, 'new.csv', *UR5E, '--calibration', 'result', '--tolerance', '0.5'),
+    'workspace': (0, 'result', *UR5E, '--poses', '200', '--out', 'NEW/map'),
+}
+MORE = {
+    'identify_refused': (3, 'identify', 'good_arm.csv', *UR5E),
+    'identify_of_a_program': (1, 'identify', 'result/report.html', *UR5E),
+    'verify_of_a_bag': (3, 'verify', 'bag', *UR5E, '--calibration', 'result', '--tolerance', '1'),
+    'a_table_as_command': (2, 'measured.csv'),
+    'a_bag_as_command': (2, 'bag'),
+    'a_wrong_command': (2, 'identfy'),
+    'nothing_there': (1, 'identify', 'missing.csv', *UR5E),
+}
+
+
+def test_every_command_has_a_screen():
+    apart = {'images'}  # in test_images.py: it needs photographs
+    assert {*RESULTS, *apart} >= {*commands()}
+
+
+@pytest.mark.parametrize('name', [*RESULTS, *MORE])
+def test_the_result_of_a_command(shown, cell, monkeypatch, name):
+    expected, *arguments = MORE.get(name) or (RESULTS[name][0], name, *RESULTS[name][1:])
+    monkeypatch.setenv('TERM', 'dumb')
+    monkeypatch.setattr(screen, 'FIRST_S', 1e6)
+    (cell / 'NEW').mkdir()
+    terminal = Terminal()
+    monkeypatch.setattr(sys, 'stdout', terminal)
+    monkeypatch.setattr(sys, 'stderr', terminal)
+    try:
+        status = main(arguments)
+    except SystemExit as err:
+        status = err.code
+    finally:
+        shutil.rmtree(cell / 'NEW')
+    assert status == expected
+    assert ESCAPE not in terminal.getvalue()
+    assert_shown(name, without_digits(terminal.getvalue()))
+
+
+@pytest.mark.parametrize('name', ['identify', 'identify_refused'])
+def test_a_result_on_a_terminal(shown, monkeypatch, tmp_path, name):
+    pytest.importorskip('rich')
+    monkeypatch.delenv('NO_COLOR', raising=False)
+    monkeypatch.setenv('TERM', 'xterm-256color')
+    _, *arguments = MORE.get(name) or (0, name, 'measured.csv', *UR5E)
+    coloured, plain = Terminal(), Terminal()
+    monkeypatch.setattr(sys, 'stdout', coloured)
+    main(arguments)
+    assert ESCAPE in coloured.getvalue()
+    monkeypatch.setenv('NO_COLOR', '1')
+    monkeypatch.setattr(sys, 'stdout', plain)
+    main(arguments)
+    text = re.sub(r'\x1b\[[0-9;]*m', '', plain.getvalue())
+    assert re.search(r'\x1b\[[0-9;]*3[0-9]', plain.getvalue()) is None
+    assert text == re.sub(r'\x1b\[[0-9;]*m', '', coloured.getvalue())
+    assert_shown(f'{name}_terminal', without_digits(text))
+
+
+def test_quiet_says_nothing_but_what_is_asked_for(shown):
+    assert shown('identify', 'measured.csv', *UR5E, '--quiet') == (0, '')
+    assert shown('identify', 'measured.csv', *UR5E, '--quiet', '--json')[1].startswith('{')
+    assert shown('identify', 'good_arm.csv', *UR5E, '--quiet') == (3, '')
+
+
+def test_names_of_others_bring_no_escape_codes(shown):
+    status, text = shown('identify', f'{ESCAPE}[31mred.csv', *UR5E)
+    assert status == 1
+    assert ESCAPE not in text
+
+
+@pytest.mark.parametrize('name', sorted({*RESULTS} - {'board', 'chain', 'export', 'robots'}))
+def test_what_may_take_over_2_s_shows_a_sign_of_life(shown, monkeypatch, tmp_path, name):
+    monkeypatch.setattr(screen, 'EVERY_S', 1e-4)
+    _, *arguments = RESULTS[name]
+    _, text = shown(name, *(each.replace('NEW', str(tmp_path)) for each in arguments))
+    assert re.search(r'^calib_ros: .*, \d+ s', text, re.MULTILINE)
+    assert ESCAPE not in text
+
+
+@pytest.mark.parametrize('term', ['dumb', 'xterm-256color'])
+def test_on_a_terminal_the_sign_is_one_line_that_vanishes(shown, monkeypatch, term):
+    if term != 'dumb':
+        pytest.importorskip('rich')
+    monkeypatch.setenv('TERM', term)
+    monkeypatch.setattr(screen, 'FIRST_S', 1e-4)
+    monkeypatch.setattr(sys, 'stderr', Terminal())
+    main(['identify', 'measured.csv', *UR5E])
+    said = sys.stderr.getvalue()
+    assert 'identifying' in said
+    assert (ESCAPE in said) == (term != 'dumb')
+    assert said.endswith('\r' if term == 'dumb' else '\x1b[2K')
+
+
+def test_work_tells_the_time_left(monkeypatch):
+    monkeypatch.setattr(time, 'monotonic', lambda: 10.0)
+    work = screen.Work('reading bag')
+    monkeypatch.setattr(time, 'monotonic', lambda: 16.0)
+    assert str(work) == 'reading bag, 6 s'
+    work('third file', 0.75)
+    assert str(work) == 'reading bag (third file), 6 s, 75 %, 2 s left'
+
+
+def test_a_bag_tells_how_much_of_it_is_read(cell, monkeypatch):
+    monkeypatch.setattr(bags, 'BATCH', 100)
+    told = []
+    bags.replay(cell / 'bag', CalibrationSession(UR), told.append)
+    assert told == sorted(told)
+    assert len(told) > 5
+    assert told[-1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ('error', 'status', 'words'),
+    [
+        (OSError(errno.ENOSPC, 'No space left on device', 'x'), 1, 'make room'),
+        (PermissionError(errno.EACCES, 'Permission denied', 'x'), 1, 'choose another place'),
+        (MemoryError(), 1, 'not enough memory'),
+        (KeyboardInterrupt(), 130, 'nothing was written'),
+    ],
+)
+def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error, status, words):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr('calib_ros.kinematics.chain_file.load_chain', fail)
+    found, text = shown('chain', 'ur5e')
+    assert found == status
+    assert words in text
+    assert text.count('\n') == 1
+
+
+def test_who_reads_no_further_is_no_error():
+    command = f'{sys.executable} -m calib_ros.cli.main robots | head -c 1'
+    found = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert found.stderr == ''
+
+
+def test_tab_completes_commands_options_and_robots(tmp_path):
+    pytest.importorskip('argcomplete')
+    for line, wanted in (
+        ('calib_ros ver', 'verify '),
+        ('calib_ros identify --tol', '--tolerance '),
+        ('calib_ros plan --chain kuka_i', 'kuka_iiwa14 '),
+    ):
+        found = tmp_path / 'found'
+        environment = {**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line, 'COMP_TYPE': '9'}
+        environment |= {'COMP_POINT': str(len(line)), '_ARGCOMPLETE_STDOUT_FILENAME': str(found)}
+        command = [sys.executable, '-m', 'calib_ros.cli.main']
+        subprocess.run(command, env=environment, check=False, capture_output=True)
+        assert found.read_text() == wanted
+
+
+def test_every_setting_is_in_a_group():
+    grouped = [name for names in SETTINGS.values() for name in names]
+    assert sorted(grouped) == sorted(item.name for item in fields(Settings))

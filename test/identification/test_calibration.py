@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A calibration in its file: all that was known is known again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.errors import ConfigError
+from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
+from calib_ros.settings import Settings
+
+UR = load_chain('ur10e')
+
+
+@pytest.fixture(scope='module')
+def found():
+    rng = np.random.default_rng(0)
+    true = faulty(UR, Cell(), rng)
+    seen = measure(true, UR.random_joints(40, rng), rng, 1e-4, 3e-4)
+    owners = {'base': ('', False, False, 'tracker'), 'tool': ('', False, False, 'ball')}
+    result = identify(Problem(UR, seen, effects=('gravity',), world_frame='tracker'))
+    return Calibration.of(result, {'robot_serial': '7'}, owners)
+
+
+@pytest.mark.parametrize('nominal', [UR, None])
+def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nominal):
+    text = found.dump()
+    read = parse_calibration(text, 'c.yaml', nominal)
+    again, before = (yaml.safe_load(each)['calibration'] for each in (read.dump(), text))
+    assert again.pop('covariance').keys() == before.pop('covariance').keys()
+    assert again == before
+    q = UR.random_joints(200, np.random.default_rng(1))
+    for ours, theirs in ((found, read), (replace(found, region=None), replace(read, region=None))):
+        for ask in ('removed', 'sigma', 'sigma_turned', 'remaining'):
+            np.testing.assert_allclose(
+                getattr(theirs, ask)(q), getattr(ours, ask)(q), rtol=1e-6, atol=1e-12
+            )
+    np.testing.assert_array_equal(read.region.covers(q), found.region.covers(q))
+    scale = np.sqrt(np.diag(found.covariance))
+    difference = (read.covariance - found.covariance) / np.outer(scale, scale)
+    np.testing.assert_allclose(difference, 0.0, atol=1e-8)
+    assert read.residual == pytest.approx(found.residual, rel=1e-5)
+    for name in ('names', 'freedom', 'noise', 'owners', 'world_frame'):
+        assert getattr(read, name) == getattr(found, name)
+    np.testing.assert_allclose(read.before.table, found.before.table, atol=1e-15)
+    assert read.record['robot_serial'] == '7'
+
+
+@pytest.mark.parametrize(
+    ('key', 'change'),
+    [
+        ('covariance', {'root': ['1.0']}),
+        ('covariance', {'root': 3}),
+        ('covariance', {'names': ['no_joint.a']}),
+        ('covariance', {'freedom': 'many'}),
+        ('covariance', 5),
+        ('noise_in_sigma', {'position': 'small'}),
+        ('noise_in_sigma', {'shared': None}),
+        ('frames', {'base': {'session': ''}}),
+        ('frames', {'base': 3}),
+        ('nominal', {'base': {'xyz': [0.0]}}),
+        ('nominal', {'effects': {'elbow_joint.sin_1': 'a'}}),
+    ],
+)
+def test_a_damaged_record_is_refused(found, key, change):
+    document = yaml.safe_load(found.dump())
+    old = document['calibration'][key]
+    document['calibration'][key] = old | change if isinstance(change, dict) else change
+    with pytest.raises(ConfigError, match=rf'c\.yaml: (calibration\.{key}|{key})'):
+        parse_calibration(yaml.safe_dump(document), 'c.yaml')
+
+
+def test_of_a_file_of_before_what_it_tells_is_known(found):
+    """Its nominal frames are fitted to the corrected arm, over the whole joint range."""
+    document = yaml.safe_load(found.dump())
+    record = document['calibration']
+    for key in ('covariance', 'noise_in_sigma', 'frames'):
+        del record[key]
+    record['nominal'] = {key: record['nominal'][key] for key in ('convention', 'joints')}
+    read = parse_calibration(yaml.safe_dump(document), 'c.yaml')
+    q = UR.random_joints(300, np.random.default_rng(1))
+    assert (read.names, read.covariance, read.noise, read.owners) == ((), None, None, {})
+    assert np.isnan(read.sigma_turned(q)).all()
+    np.testing.assert_allclose(read.remaining(q), found.remaining(q), rtol=1e-6)
+    first, second = (np.sqrt(np.mean(each.removed(q)[0] ** 2)) for each in (read, found))
+    assert first == pytest.approx(second, rel=0.05)
+
+
+def calibrated_text(nominal, record):
+    """Return the text of a calibration of a nominal chain, with a record of its origin."""
+    return dump_chain(nominal.with_offsets({f'{nominal.joint_names[1]}.a': 1e-3}), record)
+
+
+def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
+    nominal = load_chain('ur10e')
+    record = {'accepted': True, 'nominal': nominal_document(nominal)}
+    (tmp_path / 'calibration.yaml').write_text(calibrated_text(nominal, record))
+    for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
+        found = load_calibration(path, nominal)
+        assert found.record == record
+        assert found.chain.joints[1].a == pytest.approx(nominal.joints[1].a + 1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('nominal', 'record', 'message'),
+    [
+        ('ur10e', None, 'is a chain, but no calibration'),
+        ('ur10e', {}, 'is a chain, but no calibration'),
+        ('ur10e', {'accepted': False}, 'was not accepted'),
+        ('puma560', {'samples': 3}, 'is it the right nominal chain'),
+        ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),
+        ('ur10', {'nominal': nominal_document(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
+        ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),
+        ('ur10e', {'nominal': 'ur10e'}, 'must be a mapping'),
+    ],
+)
+def test_what_is_no_calibration_of_a_nominal_chain_is_refused(nominal, record, message):
+    text = calibrated_text(load_chain('ur10e'), record)
+    with pytest.raises(ConfigError, match=message):
+        parse_calibration(text, 'calibration.yaml', load_chain(nominal))
+
+
+def test_a_record_in_another_convention_is_taken_as_it_is():
+    """Its numbers cannot be compared with those of the nominal chain."""
+    nominal = load_chain('ur10e')
+    record = {'nominal': nominal_document(load_chain('franka_fr3'))}
+    assert record['nominal']['convention'] == 'modified'
+    found = parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    assert found.record == record
+    assert found.chain.joint_names == nominal.joint_names
+    with pytest.raises(ConfigError, match='give that with --chain'):
+        parse_calibration(calibrated_text(nominal, record), 'c.yaml')
+
+
+def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
+    nominal = load_chain('ur5e')
+    far = calibrated_text(nominal.with_offsets({'elbow_joint.theta': 0.2}), {'samples': 3})
+    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+        parse_calibration(far, 'c.yaml', nominal)
+    parse_calibration(far, 'c.yaml', nominal, Settings(largest_angle=0.3))
+    near = calibrated_text(nominal, {'samples': 3})
+    with pytest.raises(ConfigError, match='conventions'):
+        parse_calibration(near, 'c.yaml', replace(nominal, convention='modified'))
+
+
+def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identified():
+    nominal = load_chain('ur5e')
+    record = {'accepted': True, 'nominal': nominal_document(nominal)}
+    true = nominal.with_offsets({'elbow_joint.theta': 0.2})
+    far = dump_chain(true, record)
+    assert parse_calibration(far, 'c.yaml', nominal).chain.value('elbow_joint.theta') == (
+        pytest.approx(true.value('elbow_joint.theta'))
+    )
+    with pytest.raises(ConfigError, match=r'of this robot: elbow_joint\.theta'):
+        parse_calibration(far, 'c.yaml', nominal, Settings())
+    elbow = nominal.joint_names.index('elbow_joint')
+    joints = list(nominal.joints)
+    joints[elbow] = replace(joints[elbow], sign=-1)
+    with pytest.raises(ConfigError, match='the sign of elbow_joint'):
+        parse_calibration(far, 'c.yaml', replace(nominal, joints=tuple(joints)))
+
+
+@pytest.mark.parametrize(
+    ('key', 'value'),
+    [
+        ('rms_mm_after', float('nan')),
+        ('rms_mm_after', 'small'),
+        ('rms_mm_after', -0.1),
+        ('world_frame', 5),
+        ('world_frame', None),
+    ],
+)
+def test_a_record_by_which_nothing_can_be_judged_is_refused(key, value):
+    nominal = load_chain('ur10e')
+    record = {'nominal': nominal_document(nominal), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
+    parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    with pytest.raises(ConfigError, match=f'c.yaml: calibration.{key} must be'):
+        parse_calibration(calibrated_text(nominal, record | {key: value}), 'c.yaml', nominal)
