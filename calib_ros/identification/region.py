@@ -28,9 +28,9 @@ from scipy import special
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.leastsquares import BLOCK
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.records import packed, unpacked
+from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of

@@ -32,8 +32,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from calib_ros.identification.leastsquares import Fit, Samples, System
+from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.observations import stops
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
