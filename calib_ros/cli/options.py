@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -17,6 +18,9 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     from calib_ros.cli.screen import Screen
     from calib_ros.files.foreign import Foreign
+    from calib_ros.files.history import History
+    from calib_ros.files.rows import Filing
+    from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain import Chain
     from calib_ros.report.page import Origin, Report
     from calib_ros.settings import Settings
@@ -214,8 +218,8 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContex
     return whole_folder(options.out, names, overwrite=options.force)
 
 
-def add_identity(parser: argparse.ArgumentParser) -> None:
-    """Add the options by which a report says what it is of."""
+def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
+    """Add the options by which a report says what it is of; `pdf` adds that for paper."""
     add = parser.add_argument_group('for the report').add_argument
     for name, text in (
         ('operator', 'who measured'),
@@ -223,6 +227,40 @@ def add_identity(parser: argparse.ArgumentParser) -> None:
         ('device', 'measuring device and its serial number'),
     ):
         add(f'--{name}', default='', metavar='NAME', help=text)
+    if pdf:
+        add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
+
+
+def add_history(parser: Group) -> None:
+    """Add the option that says where a result is filed besides."""
+    parser.add_argument(
+        '--history',
+        metavar='DIR',
+        help='file the result there as well, by --serial',
+    )
+
+
+def history_of(options: argparse.Namespace) -> History | None:
+    """Return where a result is filed, if it is to be; refuse one without a serial number."""
+    if options.history is None:
+        return None
+    from calib_ros.files.history import History
+
+    if not options.serial:
+        raise InputError('--history files by serial number: give --serial as well')
+    return History(options.history)
+
+
+def filing_of(
+    options: argparse.Namespace, sets: Sequence[Observations], measured: Path, settings: str
+) -> Filing:
+    """Return what is filed of a result besides the result; `settings` is a hash."""
+    from calib_ros.files.rows import Filing, content_hash, measured_at
+    from calib_ros.report.page import input_of
+
+    changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
+    content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
+    return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
 
 
 def origin_of(
@@ -238,15 +276,20 @@ def origin_of(
     return Origin(inputs_of(known), settings=settings, **told)
 
 
-def page_of(report: Report, screen: Screen, name: str = 'report.html') -> dict[str, str]:
-    """Return a report as the content of a file, by its name; nothing where its extra is missing.
+def page_of(
+    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
+) -> dict[str, str | bytes]:
+    """Return a report as the content of files by name; nothing where an extra is missing.
 
-    That is said once.
+    That is said once. `pdf` asks for report.pdf as well.
     """
-    from calib_ros.report.page import MISSING, render
+    from calib_ros.report.page import MISSING, MISSING_PDF, on_paper, render
 
-    text = render(report)
-    if text is None:
+    found: dict[str, str | bytes | None] = {name: render(report)}
+    if found[name] is None:
         screen.warn(MISSING, 'note')
-        return {}
-    return {name: text}
+    if pdf:
+        found['report.pdf'] = on_paper(report)
+        if found['report.pdf'] is None:
+            screen.warn(MISSING_PDF, 'note')
+    return {each: content for each, content in found.items() if content is not None}

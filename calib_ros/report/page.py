@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A report as one HTML file that needs nothing else: no network, no files beside it.
 
-jinja2 and plotly's JavaScript are imported here only; `render` returns None where they are not
-installed. All text of others is escaped by the template.
+jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
+None where they are not installed. All text of others is escaped by the template.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
@@ -25,7 +26,10 @@ MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
 )
-BLOCK = 1 << 20
+MISSING_PDF = (
+    'report.pdf is not written: it needs weasyprint and jinja2 (pip install "calib_ros[pdf]", or '
+    'apt install weasyprint)'
+)
 
 
 @dataclass(frozen=True)
@@ -106,39 +110,85 @@ class Report:
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
 
 
-def render(report: Report) -> str | None:
-    """Return a report as HTML; None where jinja2 or plotly is not installed."""
+def plotly_script() -> str | None:
+    """Return plotly's JavaScript; None where plotly is not installed."""
     try:
-        import jinja2
         from plotly.offline import get_plotlyjs
 
-        plotly = get_plotlyjs()
+        return str(get_plotlyjs())
     except (ImportError, FileNotFoundError):
         return None
-    folder = resources.files('calib_ros.report') / 'templates'
 
-    def source(name: str) -> str:
-        return (folder / name).read_text(encoding='utf-8')
 
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(source),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_shown,
-        trim_blocks=True,
-    )
-    page: str = environment.get_template('report.html.jinja').render(
+def render(report: Report, script: str = '') -> str | None:
+    """Return a report as HTML; None where jinja2 or plotly is not installed.
+
+    With the path of plotly's `script`, which many pages share, the page needs that file besides.
+    """
+    plotly = '' if script else plotly_script()
+    if plotly is None:
+        return None
+    return filled(
+        'report.html.jinja',
         report=report,
         marks=MARKS,
-        css=source('report.css'),
-        js=source('report.js'),
+        drawings=None,
+        script=script,
         plotly=plotly,
         data={
             'figures': {each.name: each.figure for each in report.sections if each.figure},
             'explorer': report.explorer,
         },
     )
+
+
+def on_paper(report: Report) -> bytes | None:
+    """Return a report as PDF: a certificate first; None where jinja2 or weasyprint is missing.
+
+    Figures are drawn by matplotlib, those in space are left out: paper cannot be turned.
+    """
+    try:
+        import weasyprint
+    except (ImportError, OSError):  # OSError: its libraries of the system
+        return None
+    from calib_ros.report.plots import drawing
+
+    heights = {each.name: each.height for each in report.sections} | {'cumulated': 260}
+    drawn = ((each.name, drawing(each.figure, heights[each.name])) for each in report.sections)
+    logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
+    page = filled(
+        'report.html.jinja',
+        report=report,
+        marks=MARKS,
+        drawings={name: each for name, each in drawn if each},
+    )
+    if page is None:
+        return None
+    found: bytes = weasyprint.HTML(string=page).write_pdf()
+    return found
+
+
+def filled(template: str, **values: Any) -> str | None:
+    """Return a page with the style and the scripts of all; None where jinja2 is not installed."""
+    try:
+        import jinja2
+    except ImportError:
+        return None
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_template),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+    )
+    page: str = environment.get_template(template).render(
+        css=_template('report.css'), js=_template('report.js'), **values
+    )
     return page
+
+
+def _template(name: str) -> str:
+    return (resources.files('calib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
 def _shown(value: object) -> object:
@@ -160,7 +210,7 @@ def input_of(path: Path) -> tuple[Input, ...]:
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with path.open('rb') as file:
-        while block := file.read(BLOCK):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
 

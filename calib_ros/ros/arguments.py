@@ -45,6 +45,11 @@ BESIDE_SETTINGS = (
     ),
     Parameter('serial', '', 'serial number of the robot, for the record'),
     Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
+    Parameter(
+        'history',
+        '',
+        'folder in which results of ~/identify and ~/validate are filed by serial; default: none',
+    ),
     Parameter('resume', False, 'go on with the newest journal of this robot'),
     Parameter(
         'allowed_folders',

@@ -53,6 +53,7 @@ from calib_ros.ros.advisor import Guide
 from calib_ros.ros.arguments import NODE, typed, usage
 from calib_ros.ros.deferred import DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
+from calib_ros.ros.filer import Filer
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import Exportable, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
@@ -113,6 +114,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             chain, given.settings, self._on_sample, self._archive.remove
         )
         self.session.socket_distance = given.socket_distance
+        self._filer = Filer(given.history, given.serial, chain)
         self._last = 'nothing identified yet'
         self._progress = Progress('identifying')
         self._observability = ''
@@ -336,6 +338,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self._guide.show(found)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
+        self._last += self._filer.identified(given.problem, result, self.session.settings)
         return result.accepted, self._last
 
     def _page(self, given: Snapshot, result: Identification) -> str | None:
@@ -371,9 +374,11 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
-        now, nominal = self.session.validate()
-        assert self.session.calibration is not None  # else that raises
-        return words.verdict(self.session.calibration, now, nominal)
+        figures = self.session.validate()
+        calibration = self.session.calibration
+        assert calibration is not None  # else there was nothing to judge
+        holds, text = words.verdict(calibration, *figures)
+        return holds, text + self._filer.validated(self.session, figures, holds)
 
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)

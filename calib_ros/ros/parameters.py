@@ -53,6 +53,7 @@ class Given:
     chain: str
     links: Links
     serial: str
+    history: str
     data_dir: Path | None
     allowed_folders: tuple[Path, ...]
     resume: bool
@@ -87,6 +88,7 @@ def declare_all(node: Node) -> Given:
         chain=own['chain'],
         links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
         serial=own['serial'],
+        history=own['history'],
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
         resume=own['resume'],

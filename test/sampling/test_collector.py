@@ -140,6 +140,24 @@ def test_a_stop_is_one_sample_of_each_stream():
     assert set(made.unused) == {MOVING, CALM}
 
 
+def test_the_covariance_of_a_stop_is_the_mean_of_its_measurements():
+    motion = stops(STOPS[:2], MOVE, STAND)
+    spread = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) * 1e-8
+    spread[0, 1] = spread[1, 0] = 5e-9
+    times = np.arange(0.003, 3.5, 0.02)
+    sizes = np.where(np.arange(len(times))[:, np.newaxis] % 2, 3.0, 1.0) * spread.ravel()
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    rows = np.concatenate([place(motion(times)), turns, sizes], axis=1)
+    events = [
+        (time, POSE, stamp, row)
+        for time, stamp, row in zip(times.tolist(), stamps(times), rows, strict=True)
+    ]
+    sample = play(collector(), joint_events(motion, 3.5), events)[0]
+    share = 1.0 / sample.count  # an odd count has one more of either
+    np.testing.assert_allclose(sample.covariance, 2.0 * spread, rtol=share)
+    np.testing.assert_array_equal(sample.covariance == 0.0, spread == 0.0)
+
+
 @pytest.mark.parametrize(('settle', 'count'), [(0.0, 50), (0.3, 35), (0.7, 15)])
 def test_measuring_begins_after_the_arm_has_settled(settle, count):
     motion = tour()

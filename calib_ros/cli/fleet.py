@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros fleet` and `calib_ros history`: many robots, and results over time."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+    from calib_ros.files.rows import Row
+
+INCOMPLETE = 4
+"""Exit status when measurements of some robots could not be used, and no robot needs a look."""
+
+
+def _add_fleet(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('plant', type=Path, metavar='PLANT', help='plant.yaml: the robots (docs/fleet.md)')
+    add('--history', required=True, metavar='DIR', help='where results are filed; also a URL')
+    add('--out', type=Path, metavar='FOLDER', help='the report: index.html, a page of each robot')
+    add('--metrics', type=Path, metavar='FILE', help="for Prometheus' text collector")
+    group = parser.add_argument_group('who does the work')
+    add = group.add_argument
+    add('--scheduler', default='', metavar='ADDRESS', help='of a dask cluster: tcp://host:8786')
+    add('--workers', type=int, default=0, metavar='N', help='processes here; default: one a core')
+    add('--memory', default='2GiB', metavar='SIZE', help='of each of these, at most')
+    group = parser.add_argument_group('alarms')
+    group.add_argument(
+        '--years',
+        type=float,
+        default=100.0,
+        metavar='N',
+        help='between two false alarms of a robot that is measured every night',
+    )
+
+
+def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.atomic import write_file
+    from calib_ros.files.history import History
+    from calib_ros.fleet.page import write_report
+    from calib_ros.fleet.plant import read_plant
+    from calib_ros.fleet.run import Cluster, run
+    from calib_ros.fleet.standing import counts, metrics, standings
+
+    if not 0.0 < options.years < 1e9:
+        raise InputError(f'--years must be positive, not {options.years:g}')
+    if options.workers < 0:
+        raise InputError(f'--workers must be at least 1, not {options.workers}')
+    robots = read_plant(options.plant)
+    history = History(options.history)
+    cluster = Cluster(options.scheduler, options.workers, options.memory)
+    with screen.work(f'{len(robots)} robots') as work:
+        done = run(robots, history, cluster, options.out, work)
+        work('comparing nights')
+        found = standings(robots, history, done, options.years)
+        if options.out is not None:
+            missing = write_report(options.out, found, done)
+            if missing:
+                screen.warn(missing, 'note')
+        if options.metrics is not None:
+            write_file(options.metrics, metrics(found, done, time.time()), overwrite=True)
+    number = counts(found)
+    screen.title(
+        ', '.join(f'{count} {state}' for state, count in number.items() if count),
+        number['fine'] == len(found),
+    )
+    for each in found:
+        for change in each.watched.changes:
+            screen.bullet(f'{each.robot.serial}, {change.time:%Y-%m-%d}: {change}')
+        for error in each.errors.values():
+            screen.warn(f'{each.robot.serial}: {error}')
+        if each.state == 'refused' and each.last is not None:
+            screen.bullet(f'{each.robot.serial}: not accepted: {"; ".join(each.last.reasons)}')
+    screen.say(f'{done.filed} new results in {options.history}')
+    if options.out is not None:
+        screen.say(f'wrote {options.out}: open {options.out / "index.html"}')
+    if number['changed'] or number['refused'] or number['beyond tolerance']:
+        return NOT_ACCEPTED
+    return INCOMPLETE if number['unreadable'] else 0
+
+
+def _add_history(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add('history', metavar='DIR', help='folder or URL of a history')
+    add('--robot', metavar='SERIAL', help='this robot only')
+
+
+def _run_history(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.errors import UnknownNameError
+    from calib_ros.files.history import History
+
+    history = History(options.history)
+    serials = history.serials()
+    if not serials:
+        raise InputError(f'{options.history} holds no results: is it a history?')
+    if options.robot is not None:
+        if options.robot not in serials:
+            raise UnknownNameError('robot', options.robot, serials)
+        serials = (options.robot,)
+    width = max(map(len, serials))
+    screen.data(f'{"robot":{width}}  time (UTC)        what      verdict    poses  RMS [mm]  from')
+    for serial in serials:
+        for row in history.rows(serial):
+            screen.data(f'{serial:{width}}  {_line(row)}'.rstrip())
+    return 0
+
+
+def _line(row: Row) -> str:
+    rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
+    when = f'{row.time:%Y-%m-%d %H:%M}'
+    return f'{when}  {row.kind:8}  {row.verdict:9}  {row.poses:5}  {rms:>8}  {row.source}'
+
+
+COMMANDS = (
+    Command(
+        'fleet',
+        'Calibrate',
+        'identify what is new of all robots of a plant, and tell which ones changed',
+        _add_fleet,
+        _run_fleet,
+        (
+            'fleet plant.yaml --history history/ --out report/',
+            'fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786',
+        ),
+    ),
+    Command(
+        'history',
+        'Calibrate',
+        'list results over time',
+        _add_history,
+        _run_history,
+        ('history history/ --robot 0042',),
+    ),
+)

@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""plant.yaml: which robots there are, what was measured of each, and how it is identified."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from datetime import date, datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.files.rows import settings_hash
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.settings import LONGEST_ENTRY, Settings
+from calib_ros.texts import parse_yaml, read_text
+from calib_ros.values import parse_name, parse_number
+
+COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
+"""What a group says for its robots, and a robot for itself."""
+KEYS = {
+    'the plant': ('groups', 'robots'),
+    'a group': COMMON,
+    'a robot': ('serial', 'group', 'measured', 'since', *COMMON),
+    'measured': ('files', 'session'),
+}
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Files by a glob pattern, local or at a URL; of tables one session, or what stands alone."""
+
+    files: str
+    session: str = ''
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A robot of the plant.
+
+    `tolerance` is the wanted RMS position error [mm], `largest_loss` the share of the messages of
+    a bag that may be lost. What was measured before `since` is not compared with what came later.
+    """
+
+    serial: str
+    chain: Chain
+    measured: tuple[Measured, ...]
+    settings: Settings = field(default_factory=Settings)
+    tolerance: float | None = None
+    largest_loss: float = 0.1
+    since: datetime | None = None
+
+    @property
+    def settings_hash(self) -> str:
+        """Return the hash of what a result depends on besides the measurements."""
+        return settings_hash(self.chain, self.settings, self.largest_loss)
+
+
+def read_plant(path: Path) -> tuple[Robot, ...]:
+    """Read a plant file.
+
+    Relative names in it are meant from its folder.
+
+    Raises
+    ------
+    ConfigError
+        When it cannot be used; the message names the robot and the key.
+
+    """
+    return parse_plant(read_text(path, what='plant file '), path.parent, str(path))
+
+
+def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Robot, ...]:
+    """Return the robots of the text of a plant file."""
+    content = _mapping(parse_yaml(text, where), 'the plant', where)
+    groups = content.get('groups') or {}
+    if not isinstance(groups, dict):
+        raise ConfigError(f'{where}: groups must be a mapping of names, not {groups!r}')
+    for name, values in groups.items():
+        _mapping(values, 'a group', f'{where}: group {name}')
+    rows = content.get('robots')
+    if not isinstance(rows, list) or not rows:
+        raise ConfigError(f'{where}: robots must be a list, each with serial, chain and measured')
+    chains: dict[str, Chain] = {}
+    robots = [
+        _robot(row, groups, folder, f'{where}: robot {number}', chains)
+        for number, row in enumerate(rows, 1)
+    ]
+    seen: set[str] = set()
+    for robot in robots:
+        if robot.serial in seen:
+            raise ConfigError(f'{where}: there are two robots with the serial {robot.serial}')
+        seen.add(robot.serial)
+    return tuple(robots)
+
+
+def _robot(
+    row: object,
+    groups: Mapping[str, Any],
+    folder: Path,
+    where: str,
+    chains: dict[str, Chain],
+) -> Robot:
+    own = _mapping(row, 'a robot', where)
+    serial = own.get('serial')
+    if not isinstance(serial, str) or not parse_name(serial, f'{where}: serial'):
+        raise ConfigError(f'{where}: serial must be text ("0042" in quotes), not {serial!r}')
+    where = f'{where} ({serial})'
+    group = own.get('group')
+    if group is not None and group not in groups:
+        raise UnknownNameError(f'group in {where}', str(group), map(str, groups))
+    shared = {} if group is None else groups[group]
+    given = {**shared, **own}
+    chosen = {**_names(shared, 'settings', where), **_names(own, 'settings', where)}
+    tolerance = given.get('tolerance')
+    if tolerance is not None:
+        tolerance = _positive(tolerance, f'{where}: tolerance')
+    loss = parse_number(given.get('largest_loss', Robot.largest_loss), f'{where}: largest_loss')
+    if not 0.0 <= loss <= 1.0:
+        raise ConfigError(f'{where}: largest_loss must be from 0 to 1, not {loss:g}')
+    return Robot(
+        serial,
+        _chain(given.get('chain'), folder, where, chains),
+        _measured(own.get('measured'), folder, where),
+        _settings(chosen, where),
+        tolerance,
+        loss,
+        _moment(own.get('since'), f'{where}: since'),
+    )
+
+
+def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> Chain:
+    """Return the chain of a robot; that of many is read once."""
+    if not isinstance(name, str) or not name:
+        raise ConfigError(f'{where}: give chain, a file or a robot by its name, or a group')
+    if name not in chains:
+        path = folder / name
+        try:
+            chains[name] = load_chain(path if path.suffix or path.is_file() else name)
+        except ConfigError as err:
+            raise ConfigError(f'{where}: {err}') from err
+    return chains[name]
+
+
+def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
+    entries = value if isinstance(value, list) and value else [value]
+    found = []
+    for entry in entries:
+        if not isinstance(entry, dict):
+            entry = {'files': entry}
+        entry = _mapping(entry, 'measured', f'{where}: measured')
+        files, session = entry.get('files'), entry.get('session', '')
+        if not isinstance(files, str) or not files or len(files) > LONGEST_ENTRY:
+            raise ConfigError(
+                f'{where}: measured must be a pattern of bags or tables, a file or URL with *, '
+                f'or a list of them, not {files!r:.100}'
+            )
+        if not isinstance(session, str):
+            raise ConfigError(f'{where}: session must be text, not {session!r}')
+        found.append(Measured(files if '://' in files else str(folder / files), session))
+    return tuple(found)
+
+
+def _settings(given: Mapping[str, Any], where: str) -> Settings:
+    """Return settings by their names, the others by default."""
+    known = {each.name: each for each in fields(Settings)}
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        if name not in known:
+            raise UnknownNameError(f'setting in {where}', name, known)
+        default = known[name].default
+        place = f'{where}: {name}'
+        if isinstance(default, tuple):
+            entries = value if isinstance(value, list) else [value]
+            if not all(isinstance(entry, str) for entry in entries):
+                raise ConfigError(f'{place} must be a list of texts, not {value!r:.100}')
+            values[name] = tuple(entries)
+        elif isinstance(default, str):
+            if not isinstance(value, str):
+                raise ConfigError(f'{place} must be text, not {value!r:.100}')
+            values[name] = value
+        else:
+            number = parse_number(value, place)
+            if isinstance(default, int) and number != int(number):
+                raise ConfigError(f'{place} must be a whole number, not {number:g}')
+            values[name] = int(number) if isinstance(default, int) else number
+    try:
+        return Settings(**values)
+    except ConfigError as err:
+        raise ConfigError(f'{where}: {err}') from err
+
+
+def _names(given: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
+    value = given.get(key) or {}
+    if not isinstance(value, dict):
+        raise ConfigError(f'{where}: {key} must be a mapping of names, not {value!r:.100}')
+    return value
+
+
+def _mapping(value: object, kind: str, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f'{where} must be a mapping with the keys {", ".join(KEYS[kind])}')
+    for key in value:
+        if key not in KEYS[kind]:
+            raise UnknownNameError(f'key in {where}', str(key), KEYS[kind])
+    return value
+
+
+def _positive(value: object, where: str) -> float:
+    number = parse_number(value, where)
+    if number <= 0.0:
+        raise ConfigError(f'{where} must be positive, not {number:g}')
+    return number
+
+
+def _moment(value: object, where: str) -> datetime | None:
+    """Return a date of YAML as a time; without a zone it is in UTC."""
+    if value is None:
+        return None
+    if isinstance(value, str):
+        try:
+            value = datetime.fromisoformat(value)
+        except ValueError:
+            value = repr(value)
+    if isinstance(value, date) and not isinstance(value, datetime):
+        value = datetime(value.year, value.month, value.day)
+    if not isinstance(value, datetime):
+        raise ConfigError(f'{where} must be a date, such as 2026-11-20, not {value!r}')
+    return value if value.tzinfo else value.replace(tzinfo=timezone.utc)

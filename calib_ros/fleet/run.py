@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A run over the fleet: what is new is identified by the workers and filed as each completes.
+
+Workers are processes of this machine, or those of any cluster of dask. Each result is filed when
+it arrives, so whatever is lost, a worker, the scheduler or this process, costs the tasks that were
+running; the next run does the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from itertools import islice
+from pathlib import Path
+from typing import Any, TypeAlias
+from urllib.parse import quote
+
+import calib_ros
+from calib_ros.atomic import write_file
+from calib_ros.errors import CalibrationError, ConfigError, shortened
+from calib_ros.files.history import History
+from calib_ros.files.rows import Row
+from calib_ros.fleet.plant import Robot
+from calib_ros.fleet.work import Outcome, Task, sources, work
+
+MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
+AHEAD = 20
+"""Tasks for each worker that the scheduler knows of: enough to keep it busy, few to lose."""
+PATIENCE = 60.0
+"""Time [s] for a scheduler and its first worker to answer."""
+NEVER = datetime.fromtimestamp(0, timezone.utc)
+Told: TypeAlias = Callable[[str, float], None]
+
+
+class LostError(CalibrationError):
+    """The scheduler, or all of its workers, are gone; what is filed stays."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where the work is done: at the `address` of a scheduler, or by `workers` processes here.
+
+    `memory` bounds each of these, as dask has it: "2GiB".
+    """
+
+    address: str = ''
+    workers: int = 0
+    memory: str = '2GiB'
+
+
+@dataclass
+class Run:
+    """What a run did: results filed, time spent on them [s], and errors by robot and source."""
+
+    filed: int = 0
+    seconds: float = 0.0
+    errors: dict[str, dict[str, str]] = field(default_factory=dict)
+
+    def note(self, serial: str, source: str, error: str) -> None:
+        """Keep what is wrong with a source."""
+        self.errors.setdefault(serial, {})[source] = error
+
+
+def run(
+    robots: Sequence[Robot],
+    history: History,
+    cluster: Cluster,
+    out: Path | None = None,
+    told: Told = lambda words, share: None,
+) -> Run:
+    """Identify all that is new, file it, and write the page of each robot's newest result.
+
+    Parameters
+    ----------
+    robots : sequence of Robot
+        Those of the plant.
+    history : History
+        Where results are looked up and filed.
+    cluster : Cluster
+        It is not asked for where nothing is to be done.
+    out : Path, optional
+        Folder of the report; without it there are no pages.
+    told : callable
+        Called with words, and the share that is done.
+
+    Raises
+    ------
+    LostError
+        When the cluster cannot be reached any more.
+
+    """
+    found = Run()
+    with ExitStack() as stack:
+        client = None
+        for plan in (_new, _without_page):
+            tasks = [task for robot in robots for task in plan(robot, history, out, found)]
+            if tasks and client is None:
+                client = stack.enter_context(_client(cluster))
+                told(f'dashboard: {client.dashboard_link}', 0.0)
+            for number, (task, outcome) in enumerate(_done(client, tasks), 1):
+                _keep(task, outcome, history, out, found)
+                told(f'{number} of {len(tasks)}: {task.robot.serial}', number / len(tasks))
+    return found
+
+
+def page_path(out: Path, row: Row) -> Path:
+    """Return where the page of a row is."""
+    return out / 'robots' / quote(row.serial, safe='') / f'{row.key}.html'
+
+
+def results(robot: Robot, history: History) -> tuple[Row, ...]:
+    """Return the identifications of a robot by its settings of today, in order of time."""
+    return tuple(
+        row
+        for row in history.rows(robot.serial)
+        if row.kind == 'identify' and row.settings == robot.settings_hash
+    )
+
+
+def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
+    """Return the sources of a robot whose results are not filed; the last one has a page."""
+    try:
+        there = sources(robot)
+    except CalibrationError as err:
+        found.note(robot.serial, '', str(err))
+        return []
+    rows = [row for row in results(robot, history) if row.software == calib_ros.__version__]
+    done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
+    last = max(there, key=lambda each: (each.modified or NEVER, each.name))
+    return [
+        Task(
+            robot,
+            source,
+            frozenset(row.inputs for row in rows if row.source == source.name),
+            page=out is not None and source == last,
+        )
+        for source in there
+        if (source.name, source.fingerprint) not in done
+    ]
+
+
+def _without_page(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
+    """Return the source of a robot's newest result if that has no page yet."""
+    rows = results(robot, history)
+    if out is None or not rows or page_path(out, rows[-1]).exists():
+        return []
+    with suppress(CalibrationError):  # it was told of before
+        names = found.errors.get(robot.serial, {})
+        there = [each for each in sources(robot) if each.name not in names]
+        return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
+    return []
+
+
+def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
+    """File a result, and write its page in place of the earlier ones."""
+    found.seconds += outcome.seconds
+    if outcome.error:
+        found.note(task.robot.serial, task.source.name, outcome.error)
+    if outcome.row is None:
+        return
+    found.filed += history.file(outcome.row)
+    if outcome.page and out is not None:
+        path = page_path(out, outcome.row)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, outcome.page, overwrite=True)
+        for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
+            if earlier != path:
+                earlier.unlink(missing_ok=True)
+
+
+@contextmanager
+def _client(cluster: Cluster) -> Iterator[Any]:
+    """Yield a client of the workers; those of this machine end with it."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise ConfigError(MISSING) from None
+    with ExitStack() as stack:
+        if cluster.address:
+            where: Any = cluster.address
+        else:
+            where = stack.enter_context(
+                LocalCluster(
+                    n_workers=cluster.workers or None,
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=cluster.memory,
+                    dashboard_address='127.0.0.1:0',
+                    silence_logs=logging.ERROR,
+                )
+            )
+        try:
+            client = stack.enter_context(Client(where, set_as_default=False, timeout=PATIENCE))
+            client.wait_for_workers(1, timeout=PATIENCE)
+        except (OSError, TimeoutError, ValueError) as err:
+            raise LostError(f'no workers at {cluster.address or "this machine"}: {err}') from err
+        others = {each for each in client.run(_version).values() if each != calib_ros.__version__}
+        if others:
+            raise ConfigError(
+                f'workers have calib_ros {", ".join(sorted(others))}, this is '
+                f'{calib_ros.__version__}: install the same'
+            )
+        yield client
+
+
+def _version() -> str:
+    return calib_ros.__version__
+
+
+def _done(
+    client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
+) -> Iterator[tuple[Task, Outcome]]:
+    """Yield tasks with what became of them, as they are done."""
+    if not tasks:
+        return
+    from distributed import as_completed
+
+    waiting = iter(tasks)
+    running: dict[str, Task] = {}
+
+    def submitted(count: int) -> list[Any]:
+        futures = []
+        for task in islice(waiting, count):
+            future = client.submit(work, task, pure=False)
+            running[future.key] = task
+            futures.append(future)
+        return futures
+
+    ahead = AHEAD * max(1, len(client.nthreads()))
+    completed = as_completed(submitted(ahead), client.loop, with_results=True, raise_errors=False)
+    for future, result in completed:
+        if future.status in ('cancelled', 'lost'):
+            raise LostError(
+                'the scheduler is lost: what was done is filed, start again for the rest'
+            )
+        for more in submitted(1):
+            completed.add(more)
+        task = running.pop(future.key)
+        if future.status == 'error':
+            result = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
+        yield task, result

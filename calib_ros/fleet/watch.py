@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Did the arm change between nights, when, and which joint?
+
+Night k brings the arm's parameters x_k with covariance C_k; base and tool frames are left out, the
+device may stand elsewhere every night. For each of the last m nights (LAGS) the mean of these m is
+compared with the mean of the nights before, both weighted by information:
+
+    d = x_after - x_before,   S = s^2 (C_after + C_before),   u = S^-1 d,   W = S^-1
+
+An arm is bumped at one joint, not at all of them. That joint j alone changed, by
+
+    d_j = W_jj^-1 u_j,   covariance W_jj^-1,
+
+explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution where nothing
+changed: as many degrees of freedom as j has parameters, over those of the noise. s^2 is by how
+much the nights so far scatter more than their covariances tell, where they clearly do: what warms
+up, what the model lacks. After a change all begins anew.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from calib_ros.files.rows import Row
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import FloatArray
+
+LAGS = (1, 2, 4, 8)
+"""Nights that a change is looked for in: a large one shows at once, a small one after some."""
+YEARS = 100.0
+"""Time between false alarms of a robot, of one night each day."""
+DAYS = 365.25
+TWIN = 20.0
+"""Odds from which on one joint is told from another."""
+SHOWN = 3.0
+"""A parameter of the joint that changed by so many of its standard deviations is named."""
+KNOWN = 1e9
+
+
+@dataclass(frozen=True)
+class Change:
+    """An arm that is another one than before.
+
+    Attributes
+    ----------
+    time : datetime
+        Of the first night after it.
+    joint : str
+    others : tuple of str
+        Joints that explain it about as well.
+    parts : tuple of (str, float, float)
+        Parameters of the joint that changed, by how much and its standard deviation [m or rad].
+    seen : datetime
+        The night in which it was found.
+
+    """
+
+    time: datetime
+    joint: str
+    others: tuple[str, ...]
+    parts: tuple[tuple[str, float, float], ...]
+    seen: datetime
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        parts = ', '.join(
+            f'{name} by {1e3 * size:+.3f} ± {1e3 * sigma:.3f} '
+            f'{"mm" if Parameter(name).is_length else "mrad"}'
+            for name, size, sigma in self.parts
+        )
+        others = (
+            f' (or {", ".join(self.others)}: they cannot be told apart)' if self.others else ''
+        )
+        return f'{self.joint}{others} changed, {parts}: was it bumped?'
+
+
+class Night(NamedTuple):
+    """A night, and how strongly each joint seems changed: as that of a normal variable."""
+
+    row: Row
+    strength: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What the nights of a robot tell; `left_out` cannot be compared with the others."""
+
+    nights: tuple[Night, ...] = ()
+    changes: tuple[Change, ...] = ()
+    left_out: tuple[Row, ...] = ()
+
+
+def watch(rows: Sequence[Row], since: datetime | None = None, years: float = YEARS) -> Watched:
+    """Look for changes in identifications in the order of their times.
+
+    Those that are not accepted, and what was before `since`, are left out.
+    """
+    known = [row for row in rows if row.accepted and (since is None or row.time >= since)]
+    wanted = known[0].names if known else ()
+    alike = [row for row in known if row.names == wanted]
+    left_out = tuple(row for row in known if row.names != wanted)
+    if not alike:
+        return Watched((), (), left_out)
+    joints = {joint['name'] for joint in json.loads(alike[0].chain)['joints']}
+    own = [k for k, name in enumerate(wanted) if Parameter(name).owner in joints]
+    names = tuple(wanted[k] for k in own)
+    data = _Data(
+        names,
+        np.array([row.offsets[own] for row in alike]),
+        np.linalg.inv(np.array([row.covariance[np.ix_(own, own)] for row in alike])),
+        np.array([row.freedom or KNOWN for row in alike]),
+    )
+    level = 1.0 / (DAYS * years * len(LAGS) * len(data.joints))
+    changes: list[Change] = []
+    strengths = np.zeros((len(alike), len(data.joints)))
+    first = known_up_to = 0
+    while True:
+        tests = data.tests(first)
+        least = tests.chances.min(axis=0)
+        fresh = np.arange(len(alike)) >= known_up_to
+        strengths[fresh] = -special.ndtri(np.maximum(0.5 * least[fresh], 1e-300))
+        alarms = np.flatnonzero((least.min(axis=1) < level) & fresh)
+        if not alarms.size:
+            break
+        k = int(alarms[0])
+        lag = int(tests.chances[:, k].min(axis=1).argmin())
+        first, known_up_to = k + 1 - LAGS[lag], k + 1
+        changes.append(data.change(tests, lag, k, alike[first].time, alike[k].time))
+    nights = tuple(
+        Night(row, dict(zip(data.joints, values, strict=True)))
+        for row, values in zip(alike, strengths.tolist(), strict=True)
+    )
+    return Watched(nights, tuple(changes), left_out)
+
+
+class _Tests(NamedTuple):
+    """Tests of L lags at K nights for J joints.
+
+    `chances` (L, K, J) are 1 where there is no night before; `pull` (L, K, P) and `weight`
+    (L, K, P, P) are u and W.
+    """
+
+    chances: FloatArray
+    pull: FloatArray
+    weight: FloatArray
+
+
+class _Data:
+    """The parameters (K, P) of K nights with their information (K, P, P)."""
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        values: FloatArray,
+        information: FloatArray,
+        freedom: FloatArray,
+    ) -> None:
+        self._names, self._values, self._information = names, values, information
+        self._freedom = freedom
+        owners = [Parameter(name).owner for name in names]
+        self.joints = tuple(dict.fromkeys(owners))
+        self._groups = [
+            np.array([k for k, owner in enumerate(owners) if owner == joint])
+            for joint in self.joints
+        ]
+
+    def tests(self, first: int) -> _Tests:
+        """Return the tests of all nights against those before, from the `first` on."""
+        count, size = self._values.shape
+        whole = np.cumsum(self._information[first:], axis=0)
+        pulled = np.cumsum(
+            np.einsum('kpr,kr->kp', self._information[first:], self._values[first:]), axis=0
+        )
+        chances = np.ones((len(LAGS), count, len(self.joints)))
+        pull = np.zeros((len(LAGS), count, size))
+        weight = np.zeros((len(LAGS), count, size, size))
+        scatter = np.ones(count)
+        for number, lag in enumerate(LAGS):
+            ends = np.arange(lag, len(whole))
+            if not ends.size:
+                continue
+            before = np.linalg.inv(whole[ends - lag])
+            after = np.linalg.inv(whole[ends] - whole[ends - lag])
+            moved = np.einsum('kpr,kr->kp', after, pulled[ends] - pulled[ends - lag])
+            moved -= np.einsum('kpr,kr->kp', before, pulled[ends - lag])
+            inverse = np.linalg.inv(after + before)
+            force = np.einsum('kpr,kr->kp', inverse, moved)
+            if lag == 1:
+                scatter[first + ends] = np.einsum('kp,kp->k', moved, force) / size
+            nights = first + ends
+            usual = np.array([self._usual(scatter[first + 1 : k + 1 - lag]) for k in nights])
+            weight[number, nights] = inverse / usual[:, np.newaxis, np.newaxis]
+            pull[number, nights] = force / usual[:, np.newaxis]
+            for j, group in enumerate(self._groups):
+                part = inverse[:, group[:, np.newaxis], group]
+                found = np.linalg.solve(part, force[:, group, np.newaxis])[..., 0]
+                gain = np.einsum('kp,kp->k', found, force[:, group]) / usual / len(group)
+                chances[number, nights, j] = special.fdtrc(len(group), self._freedom[nights], gain)
+        return _Tests(chances, pull, weight)
+
+    def _usual(self, scatter: FloatArray) -> float:
+        """Return how much nights scatter, by their covariances; 1 where these may be right."""
+        if not scatter.size:
+            return 1.0
+        middle = float(np.median(scatter))
+        error = np.sqrt(np.pi / (len(self._names) * scatter.size))  # of a median, in normal terms
+        return middle if middle > 1.0 + 2.0 * error else 1.0
+
+    def change(self, tests: _Tests, lag: int, k: int, time: datetime, seen: datetime) -> Change:
+        """Return the change that was found by a lag at a night."""
+        chances = tests.chances[lag, k]
+        best = int(chances.argmin())
+        gains = -2.0 * np.log(np.maximum(chances, 1e-300))
+        others = [
+            joint
+            for j, joint in enumerate(self.joints)
+            if j != best and gains[best] - gains[j] < 2.0 * np.log(TWIN)
+        ]
+        group = self._groups[best]
+        covariance = np.linalg.inv(tests.weight[lag, k][np.ix_(group, group)])
+        sizes, sigmas = covariance @ tests.pull[lag, k, group], np.sqrt(np.diag(covariance))
+        clear = np.abs(sizes) > SHOWN * sigmas
+        clear[np.argmax(np.abs(sizes) / sigmas)] = True
+        parts = tuple(
+            (self._names[p], float(size), float(sigma))
+            for p, size, sigma, yes in zip(group, sizes, sigmas, clear, strict=True)
+            if yes
+        )
+        return Change(time, self.joints[best], tuple(others), parts, seen)

@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""One piece of a fleet's work, as a worker does it: a bag or a table is fetched and identified."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
+from calib_ros.files.bags import replay
+from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
+from calib_ros.files.tables import read_table
+from calib_ros.fleet.plant import Robot
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.problem import Problem
+from calib_ros.report.page import Origin, input_of, render
+from calib_ros.report.poses import poses_of
+from calib_ros.report.reports import identification_report
+from calib_ros.report.words import configuration_yaml
+from calib_ros.sampling.session import CalibrationSession
+
+TABLES = ('.csv', '.txt', '.xlsx')
+"""Endings of tables; anything else is a bag, or a folder that is one."""
+DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified', 'ETag', 'etag')
+"""What file systems call that by which a change of content shows."""
+PLOTLY = 'plotly.min.js'
+"""The script that all pages of a report share."""
+
+
+class Source(NamedTuple):
+    """A bag or table: its place, the session of a table, and what changes with its content.
+
+    The `fingerprint` is empty where the file system tells nothing by which a change would show.
+    """
+
+    url: str
+    session: str = ''
+    fingerprint: str = ''
+    modified: datetime | None = None
+
+    @property
+    def name(self) -> str:
+        """Return what it is known by."""
+        return f'{self.url}#{self.session}' if self.session else self.url
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A source to identify; not if its content is `known`, by hash, unless a `page` is wanted."""
+
+    robot: Robot
+    source: Source
+    known: frozenset[str] = frozenset()
+    page: bool = False
+
+
+class Outcome(NamedTuple):
+    """What became of a task: a row, or what is wrong with the source; neither if it was known."""
+
+    row: Row | None = None
+    error: str = ''
+    page: str = ''
+    seconds: float = 0.0
+
+
+def sources(robot: Robot) -> tuple[Source, ...]:
+    """Return what there is of a robot, by name.
+
+    Raises
+    ------
+    InputError
+        When a pattern matches nothing, or its file system cannot be listed.
+
+    """
+    found = []
+    for each in robot.measured:
+        try:
+            files, pattern = _file_system(each.files)
+            matched = files.glob(pattern, detail=True)
+        except CalibrationError:
+            raise
+        except Exception as err:  # file systems fail in ways of their own
+            raise InputError(f'{each.files} cannot be listed: {err}') from err
+        if not matched:
+            raise InputError(f'nothing matches {each.files}')
+        for path, info in sorted(matched.items()):
+            fingerprint, modified = _state(files, path, info)
+            url = path if _is_local(files) else files.unstrip_protocol(path)
+            url += each.files[each.files.find('::') :] if '::' in each.files else ''
+            found.append(Source(url, each.session, fingerprint, modified))
+    return tuple(found)
+
+
+def work(task: Task) -> Outcome:
+    """Do a task; what goes wrong is told of its source and harms nothing else."""
+    begin = time.monotonic()
+    try:
+        with fetched(task.source.url) as path:
+            inputs = input_of(path)
+            content = content_hash([each.sha256 for each in inputs], task.source.session)
+            if content in task.known and not task.page:
+                return Outcome()
+            problem, result, warnings, lines = _identify(path, task)
+            robot, source = task.robot, task.source
+            about = Filing(
+                robot.serial,
+                measured_at((*problem.sets, *problem.judging), source.modified),
+                content,
+                robot.settings_hash,
+                source.name,
+                source.fingerprint,
+            )
+            row = identified(result, about, warnings)
+            page = ''
+            if task.page:
+                origin = Origin(
+                    inputs,
+                    serial=robot.serial,
+                    settings=configuration_yaml(robot.chain.name, robot.settings),
+                )
+                wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
+                poses = poses_of(problem, result, lines)
+                report = identification_report(problem, result, poses, origin, warnings, wanted)
+                page = render(report, f'../../{PLOTLY}') or ''
+    except (CalibrationError, OSError) as err:
+        return Outcome(error=shortened(str(err)))
+    except Exception as err:  # a fault of ours, or of a file system: it costs this source only
+        return Outcome(error=shortened(f'{type(err).__name__}: {err}'))
+    return Outcome(row, page=page, seconds=time.monotonic() - begin)
+
+
+@contextmanager
+def fetched(url: str) -> Iterator[Path]:
+    """Yield the path of a local file or folder, or of a copy of what is elsewhere."""
+    files, path = _file_system(url)
+    if _is_local(files):
+        yield Path(path)
+        return
+    with TemporaryDirectory(prefix='calib_ros_') as folder:
+        target = Path(folder) / PurePosixPath(path).name
+        files.get(path, str(target), recursive=_is_folder(files, path))
+        yield target
+
+
+def _identify(path: Path, task: Task) -> tuple[Problem, Identification, tuple[str, ...], bool]:
+    """Return problem, result, warnings, and whether the stamps are the lines of a table."""
+    robot, settings = task.robot, task.robot.settings
+    if path.suffix in TABLES:
+        table = read_table(
+            path,
+            len(robot.chain.joints),
+            (task.source.session,) if task.source.session else (),
+            (settings.sigma_position, settings.sigma_orientation),
+        )
+        problem = Problem(
+            robot.chain,
+            table.fitted[0],
+            table.held_out,
+            more=table.fitted[1:],
+            separations=tuple((*pair, 0.05) for pair in table.pairs),
+            world_frame=table.world_frame,
+            **settings.for_problem(),
+        )
+        result = identify_model(problem, settings.model)
+        return problem, result, table.warnings, table.by_line
+    session = CalibrationSession(robot.chain, settings)
+    replayed = replay(path, session)
+    problem = session.problem()
+    result = identify_model(problem, settings.model)
+    lost = replayed.refusals(session.account(), robot.largest_loss)
+    result = replace(result, refusals=(*result.refusals, *lost))
+    return problem, result, replayed.warnings, False
+
+
+def _file_system(url: str) -> tuple[Any, str]:
+    from fsspec.core import url_to_fs
+
+    try:
+        files, path = url_to_fs(url)
+    except (ImportError, ValueError) as err:
+        raise ConfigError(f'{url} cannot be read: {err}') from err
+    return files, path
+
+
+def _is_local(files: Any) -> bool:
+    return 'file' in (files.protocol if isinstance(files.protocol, tuple) else (files.protocol,))
+
+
+def _is_folder(files: Any, path: str) -> bool:
+    """Tell whether a path is a folder; a name with an ending of a file is not asked for."""
+    name = PurePosixPath(path).name
+    return not name.endswith((*TABLES, '.mcap', '.db3', '.zstd')) and bool(files.isdir(path))
+
+
+def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime | None]:
+    """Return the fingerprint of a file or folder, and when it was changed last."""
+    parts = files.find(path, detail=True) if _is_folder(files, path) else {path: info}
+    marks, times = [], []
+    for name, part in sorted(parts.items()):
+        if not any(part.get(key) for key in DATES):
+            part = files.info(name)
+        dates = [part[key] for key in DATES if part.get(key)]
+        if part.get('size') is None or not dates:
+            return '', None
+        marks.append([name, part['size'], *map(str, dates)])
+        times += [each for each in map(_moment, dates) if each is not None]
+    return digest(marks), max(times, default=None)
+
+
+def _moment(value: object) -> datetime | None:
+    if isinstance(value, int | float):
+        return datetime.fromtimestamp(value, timezone.utc)
+    return value if isinstance(value, datetime) and value.tzinfo else None

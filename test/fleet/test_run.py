@@ -1,0 +1,99 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import plants
+import pytest
+from distributed import LocalCluster
+
+from calib_ros.errors import ConfigError
+from calib_ros.files.history import History
+from calib_ros.fleet import run as running
+from calib_ros.fleet.plant import read_plant
+from calib_ros.fleet.run import Cluster, LostError, run
+
+
+@pytest.fixture(scope='module')
+def cluster():
+    with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as local:
+        yield Cluster(local.scheduler_address)
+
+
+@pytest.fixture
+def plant(tmp_path):
+    path = plants.write_plant(tmp_path, ('A', 'B'), 2)
+    return read_plant(path)
+
+
+def keys(history):
+    return {(each, key) for each in history.serials() for key in history.keys(each)}
+
+
+def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
+    history, out = History(tmp_path / 'history'), tmp_path / 'report'
+    said = []
+    first = run(plant, history, cluster, out, lambda words, share: said.append(share))
+    assert (first.filed, first.errors, said[-1]) == (4, {}, 1.0)
+    rows = history.rows('A')
+    assert [row.time for row in rows] == [plants.when(0), plants.when(1)]
+    assert all(row.accepted and row.rms_mm < 0.15 for row in rows)
+    pages = {path.stem for path in out.glob('robots/*/*.html')}
+    assert pages == {history.rows(each)[-1].key for each in 'AB'}
+
+    there = keys(history)
+    nowhere = Cluster('tcp://127.0.0.1:1')  # which is not asked for
+    assert run(plant, history, nowhere, out) == running.Run()
+
+    third = tmp_path / 'nights/A/002.csv'
+    third.write_text(plants.night(*plants.robot(0), 2))
+    touched = tmp_path / 'nights/B/001.csv'
+    touched.write_bytes(touched.read_bytes())
+    assert run(plant, history, cluster, out).filed == 1
+    assert len(keys(history) - there) == 1
+    (page,) = (out / 'robots/A').iterdir()
+    assert page.stem == history.rows('A')[-1].key
+
+    page.unlink()  # or another folder of the report
+    assert run(plant, history, cluster, out).filed == 0
+    assert page.exists()
+
+
+def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
+    history = History(tmp_path / 'history')
+    bad = tmp_path / 'nights/A/001.csv'
+    bad.write_bytes(bad.read_bytes()[:-200] + b'\xff\xfe\n')
+    for path in (tmp_path / 'nights/B').iterdir():
+        path.unlink()
+    found = run(plant, history, cluster)
+    assert found.filed == 1
+    assert str(bad) in found.errors['A'][str(bad)]
+    assert 'nothing matches' in found.errors['B']['']
+
+
+def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeypatch):
+    history = History(tmp_path / 'history')
+    original = running.work.__globals__['read_table']
+
+    def faulty(path, *rest):
+        if path.name == '000.csv':
+            raise ZeroDivisionError('by zero')
+        return original(path, *rest)
+
+    monkeypatch.setitem(running.work.__globals__, 'read_table', faulty)
+    found = run(plant, history, cluster)
+    assert found.filed == 2
+    assert [next(iter(each.values())) for each in found.errors.values()] == [
+        'ZeroDivisionError: by zero'
+    ] * 2
+
+
+def test_without_a_scheduler_nothing_is_lost(plant, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, 'PATIENCE', 0.5)
+    history = History(tmp_path / 'history')
+    with pytest.raises(LostError, match=r'tcp://127\.0\.0\.1:1'):
+        run(plant, history, Cluster('tcp://127.0.0.1:1'))
+    assert keys(history) == set()
+
+
+def test_workers_of_another_version_are_refused(plant, cluster, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, '_version', lambda: '0.0.1')
+    with pytest.raises(ConfigError, match=r'workers have calib_ros 0\.0\.1'):
+        run(plant, History(tmp_path / 'history'), cluster)
