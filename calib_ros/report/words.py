@@ -15,7 +15,7 @@ import calib_ros
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.region import Region
-from calib_ros.identification.validation import Comparison, ErrorFigures
+from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_yaml
@@ -155,17 +155,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'not_excited': list(result.not_excited),
         'weakly_determined': list(weakly_determined(result)),
         'held_near_nominal': list(result.weak),
-        'parameters': {
-            p.name: {
-                'value': p.value,
-                'offset': p.offset,
-                'std': p.std,
-                'half_width_95': p.half_width(0.95),
-                'unit': p.name.unit,
-                'status': p.status,
-            }
-            for p in result.parameters
-        },
+        'parameters': {p.name: _parameter(p) for p in result.parameters},
         'fitted': comparison(result.fitted),
         'validation': None if validation is None else {'by': result.validated_by, **validation},
         'before_is': BEFORE,
@@ -190,6 +180,17 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'python': platform.python_version(),
             'numpy': np.__version__,
         },
+    }
+
+
+def _parameter(p: ParameterRow) -> dict[str, Any]:
+    return {
+        'value': p.value,
+        'offset': p.offset,
+        'std': p.std,
+        'half_width_95': p.half_width(0.95),
+        'unit': p.name.unit,
+        'status': p.status,
     }
 
 
