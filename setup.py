@@ -17,6 +17,9 @@ AMENT = (
 SHARE = f'share/{NAME}'
 BAGS = 'rosbags>=0.11.0'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
+# Ubuntu 24.04 has it with the libraries that it needs.
+PDF = 'weasyprint>=61.1'
+DOCS = ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.24']
 XLSX = 'openpyxl>=3.1.2'
 CAMERA = 'opencv-python-headless>=4.7'
 TERMINAL = ['argcomplete>=3.1.4', 'rich>=13.7.1']
@@ -45,6 +48,10 @@ setup(
         'bags': [BAGS],
         # report.html; without it the other files are written.
         'report': REPORT,
+        # report.pdf, a certificate on paper.
+        'pdf': [*REPORT, PDF],
+        # The site: `make docs`.
+        'docs': DOCS,
         # Workbooks as tables.
         'xlsx': [XLSX],
         # For photographs; Ubuntu has it as python3-opencv.
@@ -60,6 +67,7 @@ setup(
         'test': [
             BAGS,
             *REPORT,
+            PDF,
             XLSX,
             CAMERA,
             *FLEET,
@@ -89,7 +97,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (SHARE, ['package.xml']),
-        (f'{SHARE}/config', glob('config/*.yaml') + glob('config/*.rviz')),
+        (f'{SHARE}/config', glob('config/*.*')),
         (f'{SHARE}/config/robots', glob('config/robots/*.yaml')),
         (f'{SHARE}/config/tables', glob('config/tables/*.yaml')),
         (f'{SHARE}/security', glob('security/*.xml')),

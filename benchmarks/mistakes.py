@@ -29,7 +29,7 @@ import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.files.tables import read_table
-from calib_ros.identification import mistakes
+from calib_ros.identification import mistakes, suspects
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
@@ -116,7 +116,7 @@ def spoilt(problem):
     def both(each, size, angle=1.0):
         return replace(each, positions=size * each.positions, joints=angle * each.joints)
 
-    for unit, size in mistakes.SCALES.items():
+    for unit, size in suspects.SCALES.items():
         yield (
             unit,
             f'positions are in {unit},',
@@ -155,7 +155,7 @@ def spoilt(problem):
         'not on the flange',
         with_(lambda e: e.inverted(), measured and oriented),
     )
-    yield 'left-handed', 'left-handed', with_(mistakes._mirrored, measured)
+    yield 'left-handed', 'left-handed', with_(suspects._mirrored, measured)
     for k in range(count):
         signs = np.ones(count)
         signs[k] = -1.0

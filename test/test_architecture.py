@@ -24,6 +24,7 @@ ONLY = {
     'rosbags': ('files.bags',),
     'matplotlib': ('report.plots',),
     **dict.fromkeys(('jinja2', 'plotly'), ('report.page', 'fleet.page')),
+    'weasyprint': ('report.page',),
     'cv2': ('files.images',),
     'pyarrow': ('files.history',),
     'fsspec': ('files.history', 'fleet.'),
@@ -90,7 +91,7 @@ def test_no_two_modules_import_each_other():
 
 
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
-    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'cv2']
+    blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'weasyprint', 'cv2']
     blocked += ['pyarrow', 'fsspec', 'distributed', 'rich']
     apart = ('ros.', 'files.bags', 'report.plots')
     core = [name for name in MODULES if not name.startswith(apart)]

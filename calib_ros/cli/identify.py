@@ -28,6 +28,7 @@ from calib_ros.cli.options import (
     results,
     settings_of,
 )
+from calib_ros.cli.recalibrate import add_previous, recalibrated
 from calib_ros.cli.results import (
     RESULT_FILES,
     Identified,
@@ -39,8 +40,10 @@ from calib_ros.cli.results import (
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
+    from calib_ros.cli.inputs import Loaded
     from calib_ros.cli.screen import Screen
     from calib_ros.files.history import History
+    from calib_ros.settings import Settings
 
 LAYOUT = (
     *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
@@ -103,7 +106,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
     _add_detections(parser)
     add_settings(parser)
     add_layout(parser)
-    add_identity(parser)
+    add_identity(parser, pdf=True)
+    add_previous(parser)
 
 
 def _add_detections(parser: argparse.ArgumentParser) -> None:
@@ -127,13 +131,16 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
+    if options.previous is not None:
+        return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
     history = history_of(options)
     if options.out is None:
         found = _identified(options, screen)
     else:
-        with results(options, RESULT_FILES) as folder:
+        with results(options, (*RESULT_FILES, 'report.pdf')) as folder:
             found = _identified(options, screen)
-            write_files(folder, result_files(found, screen, options.out, options.tolerance))
+            made = result_files(found, screen, options.out, options.tolerance, options.pdf)
+            write_files(folder, made)
     if history is not None:
         _file(history, found, options)
     for warning in (*found.warnings, *found.result.remarks):
@@ -170,11 +177,10 @@ def _source(options: argparse.Namespace) -> str:
     return source
 
 
-def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
-    """Return what there is to identify in a table or a bag."""
+def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
+    """Return what there is to identify in a table or a bag, and the settings."""
     from calib_ros.files.boards import POSED, posed_arm
     from calib_ros.kinematics.chain_file import load_chain
-    from calib_ros.report import words
 
     source = _source(options)
     chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
@@ -187,6 +193,14 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
         loaded = of_table(options, chain, settings, screen)
     else:
         loaded = of_bag(options.measured, chain, settings, screen, options.largest_loss)
+    return loaded, settings
+
+
+def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
+    """Return what is identified."""
+    from calib_ros.report import words
+
+    loaded, settings = _loaded(options, screen)
     configuration = words.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
     return identified(loaded, settings, screen, origin_of(options, read, configuration))

@@ -218,8 +218,8 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContex
     return whole_folder(options.out, names, overwrite=options.force)
 
 
-def add_identity(parser: argparse.ArgumentParser) -> None:
-    """Add the options by which a report says what it is of."""
+def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
+    """Add the options by which a report says what it is of; `pdf` adds that for paper."""
     add = parser.add_argument_group('for the report').add_argument
     for name, text in (
         ('operator', 'who measured'),
@@ -227,6 +227,8 @@ def add_identity(parser: argparse.ArgumentParser) -> None:
         ('device', 'measuring device and its serial number'),
     ):
         add(f'--{name}', default='', metavar='NAME', help=text)
+    if pdf:
+        add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
 
 
 def add_history(parser: Group) -> None:
@@ -274,15 +276,20 @@ def origin_of(
     return Origin(inputs_of(known), settings=settings, **told)
 
 
-def page_of(report: Report, screen: Screen, name: str = 'report.html') -> dict[str, str]:
-    """Return a report as the content of a file, by its name; nothing where its extra is missing.
+def page_of(
+    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
+) -> dict[str, str | bytes]:
+    """Return a report as the content of files by name; nothing where an extra is missing.
 
-    That is said once.
+    That is said once. `pdf` asks for report.pdf as well.
     """
-    from calib_ros.report.page import MISSING, render
+    from calib_ros.report.page import MISSING, MISSING_PDF, on_paper, render
 
-    text = render(report)
-    if text is None:
+    found: dict[str, str | bytes | None] = {name: render(report)}
+    if found[name] is None:
         screen.warn(MISSING, 'note')
-        return {}
-    return {name: text}
+    if pdf:
+        found['report.pdf'] = on_paper(report)
+        if found['report.pdf'] is None:
+            screen.warn(MISSING_PDF, 'note')
+    return {each: content for each, content in found.items() if content is not None}

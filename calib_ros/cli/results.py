@@ -119,7 +119,11 @@ def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
 
 
 def result_files(
-    found: Identified, screen: Screen, out: Path, tolerance: float | None = None
+    found: Identified,
+    screen: Screen,
+    out: Path,
+    tolerance: float | None = None,
+    pdf: bool = False,
 ) -> dict[str, str | bytes]:
     """Return the files of a result by name; a chain only if it is accepted.
 
@@ -146,7 +150,7 @@ def result_files(
         report = identification_report(
             loaded.problem, result, poses, found.origin, found.warnings, wanted
         )
-        contents |= page_of(report, screen)
+        contents |= page_of(report, screen, pdf=pdf)
     earlier = out / 'calibration.yaml'
     if result.accepted:
         contents['calibration.yaml'] = Calibration.of(result, owners=loaded.owners).dump()

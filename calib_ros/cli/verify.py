@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain import Chain
 
-VERIFICATION_FILES = ('report.html', 'residuals.csv', 'verification.txt')
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
 TITLES = {
     'PASS': ('PASS: the arm is within the tolerance', True),
     'FAIL': ('FAIL: the arm is beyond the tolerance', False),
@@ -83,7 +83,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_history(group)
     add_settings(parser, OF_BAGS)
     add_layout(parser)
-    add_identity(parser)
+    add_identity(parser, pdf=True)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -141,7 +141,7 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
             'residuals.csv': poses.table(),
             'verification.txt': f'{words}\n',
         }
-        return status, contents | page_of(report, screen)
+        return status, contents | page_of(report, screen, pdf=options.pdf)
 
 
 def show(found: Verification, screen: Screen) -> None:

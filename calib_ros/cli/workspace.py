@@ -22,6 +22,7 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
+    from calib_ros.apply.workspace import Survey
     from calib_ros.cli.screen import Screen
     from calib_ros.identification.calibration import Calibration
     from calib_ros.kinematics.se3 import FloatArray
@@ -66,14 +67,13 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         if getattr(options, name) < lowest:
             raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
     with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as folder:
-        contents = _files(options, screen)
-        write_files(folder, contents)
+        write_files(folder, _files(options, screen))
     screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
     return 0
 
 
 def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes]:
-    """Return the files of a map, and of placements where there is a task."""
+    """Map, place, print what comes out, and return the files of it."""
     import numpy as np
 
     from calib_ros.apply import placement, workspace
@@ -86,28 +86,51 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
     arm = load_calibration(options.result, load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
-    survey = workspace.survey(arm, options.poses, rng)
+    with screen.work('mapping errors over the workspace'):
+        survey = workspace.survey(arm, options.poses, rng)
+        contents: dict[str, str | bytes] = {
+            'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
+            'workspace.png': plots.workspace_png(survey),
+        }
     words = workspace.in_words(survey)
+    _show(survey, screen)
     if arm.region is not None:
-        words += f'\nThe calibration is {arm.region.in_words()}.\n'
+        sentence = f'The calibration is {arm.region.in_words()}.'
+        words += f'\n{sentence}\n'
+        screen.bullet(sentence)
     found = None
-    contents: dict[str, str | bytes] = {
-        'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
-        'workspace.png': plots.workspace_png(survey),
-    }
     if task is not None:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
-        found = placement.place(
-            arm, task, options.aim, options.model, region, options.cells, options.turns
-        )
-        words += '\n' + placement.in_words(found, options.aim, options.model)
+        with screen.work('placing the task'):
+            found = placement.place(
+                arm, task, options.aim, options.model, region, options.cells, options.turns
+            )
+        placed = placement.in_words(found, options.aim, options.model)
+        words += f'\n{placed}'
+        screen.say(placed)
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
     origin = origin_of(options, (calibration_file(options.result),))
-    contents |= page_of(workspace_report(arm, survey, origin, found), screen)
+    with screen.work('writing the report'):
+        contents |= page_of(workspace_report(arm, survey, origin, found), screen)
     return contents | {'workspace.md': words}
+
+
+def _show(survey: Survey, screen: Screen) -> None:
+    """Print six rows."""
+    from calib_ros.apply.workspace import Spread, regions
+
+    rows = [('position error', f'at {len(survey.joints)} random poses of the joint range')]
+    for label, errors in survey.parts.items():
+        s = Spread.of(1e3 * errors)
+        figures = f'RMS {s.rms:.4f}, 95 % below {s.percentile_95:.4f}, largest {s.max:.4f} mm'
+        rows.append((label.removesuffix(' by the calibration'), figures))
+    found = regions(survey.positions, survey.removed)
+    for label, sector in (('removes most', found[0]), ('removes least', found[-1])):
+        rows.append((label, f'{sector.words}: RMS {1e3 * sector.rms:.4f} mm'))
+    screen.table(rows)
 
 
 def _task(

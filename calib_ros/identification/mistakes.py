@@ -5,8 +5,8 @@
 Where the nominal arm misses the measurements by more than faulty arms do, each suspect changes
 some samples, or the chain, and base and tool are found anew in closed form (`start.py`). Of the
 best few they are polished by least squares. A suspect is named when the typical error so is
-NEARER times that as given and within what faulty arms show; those that explain the same are named
-together.
+NEARER times that as given and within what faulty arms show; those that explain nearly as much are
+named with it.
 
 The typical error is the median over the samples of the distance and the angle times LEVER, in
 units of the spread of the positions.
@@ -16,79 +16,43 @@ a last one's the tool's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.identification.acceptance import MOST_OUTLIERS
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms
-from calib_ros.identification.validation import MOST_OUTLIERS
+from calib_ros.identification.suspects import Sets, Suspect, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.chain_file import shipped_chains
+from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
 
-Sets: TypeAlias = tuple[Observations, ...]
-Change: TypeAlias = Callable[[Observations], Observations]
-Made: TypeAlias = Callable[[], Sets]
-DEGREE = np.pi / 180.0
 SAMPLES = 48
 """Samples of a set, spread evenly, by which suspects are tried."""
-FEWEST = 6
-LEVER = 0.3
-"""Distance [m] at which an angle counts as much as a position."""
 NEARER = 0.3
-"""Ratio of the typical errors from which a suspect is named."""
+"""Ratio of the typical errors from which a suspect is named, or another is not named with it."""
 ALIKE = 1.5
-"""Ratio of the typical errors of suspects that explain the same."""
+"""Ratio of the typical errors of suspects that explain the same: the most usual are named."""
 POLISHED = 6
 """Suspects that are polished."""
-ITERATIONS = 12
-CONVINCING = 0.25
+MEANINGLESS = 0.25
 """Share of the spread of the positions from which an error explains nothing."""
 ROWS = (1, -1, 2, -2)
 """Rows by which joint values may stand beside another measurement."""
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
-
-
-@dataclass(frozen=True, eq=False)
-class Suspect:
-    """A mistake that may have been made.
-
-    Attributes
-    ----------
-    what : str
-        What was done, in words.
-    remedy : str
-        The option to give.
-    chain : Chain
-        The nominal chain, as it had to be.
-    sets : callable
-        Makes the samples that should have been given.
-    rank : int
-        Of those that explain the same, the lowest are named.
-
-    """
-
-    what: str
-    remedy: str
-    chain: Chain
-    sets: Made
-    rank: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,21 +113,22 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
 
 def explained(problem: Problem) -> Explained | None:
     """Return what explains the measurements much better than what was given, if anything does."""
-    sets = tuple(each for each in problem.sets if each.distances is None)
-    if not sets or max(map(len, sets)) < FEWEST:
-        return None
+    sets = tuple(e for e in problem.sets if e.distances is None and e.pixels is None)
+    if not sets or max(map(len, sets)) < 6:
+        return None  # base and tool alone explain nearly all of them
     if not any(each.socket for each in sets):
         sets = (max(sets, key=len),)
     chain = replace(
         problem.chain, base=_known(problem.chain.base), tool=_known(problem.chain.tool)
     )
-    few = tuple(_few(each) for each in sets)
+    few = tuple(map(_few, sets))
     given = _tried(chain, few)
     if given is None:
         return None
     rough = []
-    for k, each in enumerate(_suspects(problem, chain, sets)):
-        found = _tried(each.chain, each.sets())
+    for k, each in enumerate(suspects(chain, few)):
+        whole = [_moved(problem, one, each.rows) for one in sets] if each.rows else few
+        found = _tried(each.chain or chain, tuple(map(each.change, map(_few, whole))))
         if found is not None and found.share < given.share:
             rough.append((found.share, k, each, found))
     tried = []
@@ -174,18 +139,17 @@ def explained(problem: Problem) -> Explained | None:
         return None
     tried.sort(key=lambda one: one[:2])
     best = tried[0][3]
+    given = min(given, _polished(problem, given), key=lambda one: one.share)
     largest = problem.largest_error + LEVER * problem.largest_angle / 3.0
     if best.error > min(largest, NEARER * given.error):
         return None
-    if best.share > min(NEARER * given.share, CONVINCING):
+    if best.share > min(NEARER * given.share, MEANINGLESS):
         return None
-    given = min(given, _polished(problem, given), key=lambda one: one.share)
-    if best.share > NEARER * given.share or best.error > NEARER * given.error:
-        return None
-    same = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
-    lowest = min(each.rank for each in same)
-    named = tuple(each for each in same if each.rank == lowest)[:3]
-    return Explained(named, given.error, best.error)
+    named = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
+    lowest = min(each.rank for each in named)
+    named = [each for each in named if each.rank == lowest]
+    named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
+    return Explained(tuple(named[:3]), given.error, best.error)
 
 
 def _known(frame: Frame | None) -> Frame | None:
@@ -252,7 +216,7 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
         if name.is_length or frame not in sockets
     ]
     known = excited(triangular_factor(chain, names, system), names)
-    fitted = minimise(chain, known, system, tolerance=1e-2, iterations=ITERATIONS).chain
+    fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
     spread = trial.error / trial.share if trial.share > 0.0 else np.inf
     return min(trial, _trial(fitted, sets, spread), key=lambda one: one.error)
 
@@ -269,258 +233,6 @@ def _error(chain: Chain, sets: Sets) -> float:
             away = away + LEVER * np.where(each.oriented, turns, 0.0)
         sizes.append(away)
     return float(np.median(np.concatenate(sizes)))
-
-
-def _suspects(problem: Problem, chain: Chain, sets: Sets) -> Iterator[Suspect]:
-    """Yield what may have gone wrong, the most usual first."""
-    few = tuple(_few(each) for each in sets)
-    measured = not any(each.socket for each in sets)
-
-    def each_set(change: Change) -> Made:
-        return lambda: tuple(change(each) for each in few)
-
-    def joints(change: Callable[[FloatArray], FloatArray]) -> Made:
-        return each_set(lambda each: replace(each, joints=change(each.joints)))
-
-    def turned(rows: FloatArray, factor: float) -> FloatArray:
-        return np.where(revolute, factor, 1.0) * rows
-
-    revolute = np.array([joint.type == 'revolute' for joint in chain.joints])
-    if measured:
-        yield from _units(chain, few, each_set, turned)
-        if all(each.oriented.any() for each in few):
-            yield from _conventions(chain, few, each_set, turned)
-        yield Suspect(
-            'the axes of the measuring device are left-handed',
-            'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
-            chain,
-            each_set(_mirrored),
-            3,
-        )
-    yield Suspect(
-        'the joint values are in degrees, not radians',
-        '--joint-angle deg',
-        chain,
-        joints(lambda q: turned(q, DEGREE)),
-    )
-    yield Suspect(
-        'the joint values are in radians, not degrees',
-        '--joint-angle rad',
-        chain,
-        joints(lambda q: turned(q, 1.0 / DEGREE)),
-    )
-    yield from _of_joints(chain, joints, revolute)
-    other = 'modified' if chain.convention == 'standard' else 'standard'
-    yield Suspect(
-        f'the DH table is in the {other} convention, not the {chain.convention} one',
-        f'convention: {other} in the chain file',
-        replace(
-            chain, convention='modified' if other == 'modified' else 'standard', parallel=None
-        ),
-        lambda: few,
-        3,
-    )
-    types = [joint.type for joint in chain.joints]
-    for ours in shipped_chains():
-        if [joint.type for joint in ours.joints] == types and not _same(ours, chain):
-            yield Suspect(
-                f'the arm is a {ours.name}, not a {chain.name}',
-                f'--chain {ours.name}',
-                replace(ours, base=chain.base, tool=chain.tool),
-                lambda: few,
-                2,
-            )
-    for rows in ROWS:
-        where = 'below' if rows > 0 else 'above'
-        count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
-        yield Suspect(
-            f'the joint values stand {count} {where} the measurement that they belong to',
-            f'--shift {rows}',
-            chain,
-            partial(_all_moved, problem, sets, rows),
-            2,
-        )
-
-
-def _units(
-    chain: Chain,
-    few: Sets,
-    each_set: Callable[[Change], Made],
-    turned: Callable[[FloatArray, float], FloatArray],
-) -> Iterator[Suspect]:
-    """Yield units of lengths, and of angles at the same time."""
-    for unit, size in SCALES.items():
-        for way, factor in (
-            (f'in {unit}, not metres', size),
-            (f'in metres, not {unit}', 1 / size),
-        ):
-            option = f'--length {unit}' if factor == size else '--length m'
-            for more, degrees in (('', 1.0), (' and the joint values in degrees', DEGREE)):
-
-                def scaled(
-                    each: Observations, factor: float = factor, degrees: float = degrees
-                ) -> Observations:
-                    return replace(
-                        each,
-                        positions=factor * each.positions,
-                        joints=turned(each.joints, degrees),
-                    )
-
-                yield Suspect(
-                    f'the positions are {way}{more}',
-                    f'{option}{" --joint-angle deg" if more else ""}',
-                    chain,
-                    each_set(scaled),
-                    1 if not more else 2,
-                )
-
-
-def _conventions(
-    chain: Chain,
-    few: Sets,
-    each_set: Callable[[Change], Made],
-    turned: Callable[[FloatArray, float], FloatArray],
-) -> Iterator[Suspect]:
-    """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too."""
-    inverse = any(each.inverse for each in few)
-    flange = (
-        'the poses are those of the world in the target, as by a camera on the flange',
-        '--eye-in-hand (or --inverse, where the device stands)',
-    )
-    if inverse:
-        flange = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
-    ways: tuple[tuple[str, str, Change, bool], ...] = (
-        ('the quaternions are w x y z, not x y z w', '--quaternion wxyz', _first_is_w, inverse),
-        ('the quaternions are x y z w, not w x y z', '--quaternion xyzw', _last_is_w, inverse),
-        (
-            'the rotations are transposed, those of the device in the target',
-            '--columns qx=-qx,qy=-qy,qz=-qz',
-            _transposed,
-            inverse,
-        ),
-        (*flange, _as_it_is, not inverse),
-    )
-    for what, remedy, change, again in ways:
-        for more, option, size, angle in (
-            ('', '', 1.0, 1.0),
-            (', and the positions in mm', ' --length mm', 1e-3, 1.0),
-            (', and the joint values in degrees', ' --joint-angle deg', 1.0, DEGREE),
-            (
-                ', the positions in mm and the joint values in degrees',
-                ' --length mm --joint-angle deg',
-                1e-3,
-                DEGREE,
-            ),
-        ):
-
-            def changed(
-                each: Observations,
-                change: Change = change,
-                again: bool = again,
-                size: float = size,
-                angle: float = angle,
-            ) -> Observations:
-                each = each.inverted() if each.inverse else each  # as it was measured
-                each = change(replace(each, positions=size * each.positions))
-                each = replace(each, joints=turned(each.joints, angle))
-                return each.inverted() if again else each
-
-            rank = 2 if more else 1
-            yield Suspect(f'{what}{more}', f'{remedy}{option}', chain, each_set(changed), rank)
-
-
-def _of_joints(
-    chain: Chain,
-    joints: Callable[[Callable[[FloatArray], FloatArray]], Made],
-    revolute: FloatArray,
-) -> Iterator[Suspect]:
-    """Yield signs, zeros, order and couplings of joints."""
-    names = chain.joint_names
-    count = len(names)
-    for k, name in enumerate(names):
-        signs = np.ones(count)
-        signs[k] = -1.0
-        yield Suspect(
-            f'{name} counts the other way round',
-            f'sign: {-chain.joints[k].sign} in the chain file, or --columns q{k + 1}=-q{k + 1}',
-            chain,
-            joints(partial(np.multiply, signs)),
-        )
-        if not revolute[k]:
-            continue
-        for degrees, angle in QUARTERS.items():
-            zero = np.zeros(count)
-            zero[k] = angle
-            yield Suspect(
-                f'{name} has its zero {degrees[1:]} degrees away',
-                f'theta {degrees} degrees in the chain file, or --columns '
-                f'q{k + 1}=q{k + 1}{degrees[0]}{abs(angle):.16g}',
-                chain,
-                joints(partial(np.add, zero)),
-            )
-    for i in range(count):
-        for j in range(i + 1, count):
-            order = np.arange(count)
-            order[[i, j]] = j, i
-            yield Suspect(
-                f'{names[i]} and {names[j]} are swapped',
-                f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}',
-                chain,
-                joints(partial(_ordered, order)),
-                2,
-            )
-    for k in range(1, count):
-        for sign in (1.0, -1.0):
-            if not (revolute[k] and revolute[k - 1]):
-                continue
-            coupled = np.eye(count)
-            coupled[k, k - 1] = sign
-            what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
-            remedy = f'--columns q{k + 1}=q{k + 1}{"+" if sign > 0.0 else "-"}q{k}'
-            change = joints(partial(_mixed, coupled))
-            yield Suspect(what, remedy, chain, change, 2)
-
-
-def _same(one: Chain, other: Chain) -> bool:
-    return one.table.shape == other.table.shape and np.allclose(one.table, other.table, atol=1e-6)
-
-
-def _first_is_w(each: Observations) -> Observations:
-    quat = se3.to_quat(each.rotations)
-    return replace(each, rotations=se3.from_quat(quat[:, [1, 2, 3, 0]]))
-
-
-def _last_is_w(each: Observations) -> Observations:
-    quat = se3.to_quat(each.rotations)
-    return replace(each, rotations=se3.from_quat(quat[:, [3, 0, 1, 2]]))
-
-
-def _transposed(each: Observations) -> Observations:
-    return replace(each, rotations=np.swapaxes(each.rotations, 1, 2))
-
-
-def _as_it_is(each: Observations) -> Observations:
-    return each
-
-
-def _mirrored(each: Observations) -> Observations:
-    """Return what a device with its y axis the other way round should have measured."""
-    mirror = np.diag([1.0, -1.0, 1.0])
-    return replace(
-        each, positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror
-    )
-
-
-def _ordered(order: NDArray[np.intp], joints: FloatArray) -> FloatArray:
-    return joints[:, order]
-
-
-def _mixed(matrix: FloatArray, joints: FloatArray) -> FloatArray:
-    return joints @ matrix.T
-
-
-def _all_moved(problem: Problem, sets: Sets, rows: int) -> Sets:
-    return tuple(_few(_moved(problem, each, rows)) for each in sets)
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:

@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A report as one HTML file that needs nothing else: no network, no files beside it.
 
-jinja2 and plotly's JavaScript are imported here only; `render` returns None where they are not
-installed. All text of others is escaped by the template.
+jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
+None where they are not installed. All text of others is escaped by the template.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
@@ -25,7 +26,10 @@ MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
 )
-BLOCK = 1 << 20
+MISSING_PDF = (
+    'report.pdf is not written: it needs weasyprint and jinja2 (pip install "calib_ros[pdf]", or '
+    'apt install weasyprint)'
+)
 
 
 @dataclass(frozen=True)
@@ -128,6 +132,7 @@ def render(report: Report, script: str = '') -> str | None:
         'report.html.jinja',
         report=report,
         marks=MARKS,
+        drawings=None,
         script=script,
         plotly=plotly,
         data={
@@ -137,28 +142,53 @@ def render(report: Report, script: str = '') -> str | None:
     )
 
 
+def on_paper(report: Report) -> bytes | None:
+    """Return a report as PDF: a certificate first; None where jinja2 or weasyprint is missing.
+
+    Figures are drawn by matplotlib, those in space are left out: paper cannot be turned.
+    """
+    try:
+        import weasyprint
+    except (ImportError, OSError):  # OSError: its libraries of the system
+        return None
+    from calib_ros.report.plots import drawing
+
+    heights = {each.name: each.height for each in report.sections} | {'cumulated': 260}
+    drawn = ((each.name, drawing(each.figure, heights[each.name])) for each in report.sections)
+    logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
+    page = filled(
+        'report.html.jinja',
+        report=report,
+        marks=MARKS,
+        drawings={name: each for name, each in drawn if each},
+    )
+    if page is None:
+        return None
+    found: bytes = weasyprint.HTML(string=page).write_pdf()
+    return found
+
+
 def filled(template: str, **values: Any) -> str | None:
     """Return a page with the style and the scripts of all; None where jinja2 is not installed."""
     try:
         import jinja2
     except ImportError:
         return None
-    folder = resources.files('calib_ros.report') / 'templates'
-
-    def source(name: str) -> str:
-        return (folder / name).read_text(encoding='utf-8')
-
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(source),
+        loader=jinja2.FunctionLoader(_template),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         finalize=_shown,
         trim_blocks=True,
     )
     page: str = environment.get_template(template).render(
-        css=source('report.css'), js=source('report.js'), **values
+        css=_template('report.css'), js=_template('report.js'), **values
     )
     return page
+
+
+def _template(name: str) -> str:
+    return (resources.files('calib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
 def _shown(value: object) -> object:
@@ -180,7 +210,7 @@ def input_of(path: Path) -> tuple[Input, ...]:
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with path.open('rb') as file:
-        while block := file.read(BLOCK):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
 

@@ -4,7 +4,11 @@
 
 from __future__ import annotations
 
+import base64
+import html
+from collections.abc import Mapping, Sequence
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -169,3 +173,88 @@ def _png(figure: Figure) -> bytes:
     image = BytesIO()
     figure.savefig(image, format='png', dpi=120)
     return image.getvalue()
+
+
+def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
+    """Return a figure of plotly as PNG in base64, `height` in pixels; None for one in space.
+
+    It knows what `figures.py` makes: curves, dots with intervals, and maps of colours.
+    """
+    data = [] if figure is None else figure['data']
+    if figure is None or any(each['type'] == 'scatter3d' for each in data):
+        return None
+    layout = figure['layout']
+    count = layout.get('grid', {}).get('columns', 1)
+    paper = Figure(figsize=(9.0, height / 90.0), layout='constrained')
+    FigureCanvasAgg(paper)
+    for end, axes in zip(('', '2'), paper.subplots(1, count, squeeze=False)[0], strict=False):
+        for each in data:
+            if each.get('xaxis', 'x') == f'x{end}':
+                (_draw_colours if each['type'] == 'heatmap' else _draw_curve)(axes, each)
+        _draw_axes(axes, layout[f'xaxis{end}'], layout[f'yaxis{end}'])
+        for line in layout.get('shapes', ()):
+            style = {'color': line['line']['color'], 'linestyle': '--', 'linewidth': 1}
+            if line.get('xref') == 'paper':
+                axes.axhline(line['y0'], **style)
+            else:
+                axes.axvline(line['x0'], **style)
+        if any(each['type'] == 'scatter' for each in data):
+            axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False)
+    return base64.b64encode(_png(paper)).decode()
+
+
+def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
+    style = {'dash': '--', 'dot': ':', 'solid': '-'}
+    look = curve.get('line') or curve['marker']
+    line = style[look.get('dash', 'solid')] if 'lines' in curve['mode'] else ''
+    mark = {'diamond': 'D'}.get(curve.get('marker', {}).get('symbol', ''), 'o')
+    error = curve.get('error_x', {}).get('array')
+    axes.errorbar(
+        curve['x'],
+        _plain(curve['y']),
+        xerr=error,
+        color=look['color'],
+        linestyle=line,
+        marker=mark if 'markers' in curve['mode'] else '',
+        markersize=4,
+        label=curve['name'],
+    )
+
+
+def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
+    values = np.array(mesh['z'], dtype=float)
+    colours = {'RdBu': 'RdBu_r', 'Viridis': 'viridis_r'}[mesh['colorscale']]
+    x, y = (
+        np.arange(len(each)) if isinstance(each[0], str) else np.array(each)
+        for each in (mesh['x'], mesh['y'])
+    )
+    drawn = axes.pcolormesh(x, y, values, shading='nearest', cmap=colours, rasterized=True)
+    drawn.set_clim(mesh.get('zmin'), mesh.get('zmax'))
+    if mesh.get('showscale', True):
+        axes.figure.colorbar(drawn, ax=axes, label=mesh['colorbar']['title']['text'])
+    for name, ticks in (('x', mesh['x']), ('y', mesh['y'])):
+        if isinstance(ticks[0], str):
+            turned = {'rotation': 90} if name == 'x' else {}
+            getattr(axes, f'set_{name}ticks')(range(len(ticks)), _plain(ticks), **turned)
+
+
+def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
+    for name, axis in (('x', x), ('y', y)):
+        title = axis.get('title', {}).get('text', '').replace('<br>', '\n')
+        axes.set(**{f'{name}label': title})
+        if 'range' in axis:
+            axes.set(**{f'{name}lim': axis['range']})
+        if axis.get('type') == 'log':
+            axes.set(**{f'{name}scale': 'log'})
+        if axis.get('rangemode') == 'tozero':
+            axes.set_xlim(left=0.0)
+    if y.get('autorange') == 'reversed':
+        axes.invert_yaxis()
+
+
+def _plain(names: Sequence[Any]) -> list[Any]:
+    """Return names without what plotly or matplotlib would read as marks."""
+    return [
+        html.unescape(each).replace('$', r'\$') if isinstance(each, str) else each
+        for each in names
+    ]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import pdist
 
@@ -274,6 +274,7 @@ def test_choosing_by_an_index_raises_it(criterion):
 # The choice
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     """Of 126 choices of 4 from 9; and the bound of how good it is holds."""
@@ -360,8 +361,7 @@ def test_wrong_arguments_are_refused():
 # What planning is for
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('name', ['ur10e', 'puma560'])
+@pytest.mark.parametrize(('name', 'oriented'), [('ur10e', True), ('puma560', False)])
 def test_25_planned_poses_beat_random_ones_on_unseen_poses(name, oriented):
     """After identification, and predicted: the mean of 200 random draws."""
     nominal = arm(name)
@@ -377,16 +377,15 @@ def test_25_planned_poses_beat_random_ones_on_unseen_poses(name, oriented):
         error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
         return np.sqrt((error**2).sum(axis=1).mean())
 
-    planned = np.mean([found(chosen) for _ in range(20)])
-    assert planned < np.mean([found(nominal.random_joints(25, rng)) for _ in range(12)])
+    planned = np.mean([found(chosen) for _ in range(12)])
+    assert planned < np.mean([found(nominal.random_joints(25, rng)) for _ in range(8)])
     random = [accuracy(design, nominal.random_joints(25, rng), unseen)[-1] for _ in range(200)]
     predicted = accuracy(design, chosen, unseen)[-1]
     assert predicted < min(np.mean(random), np.quantile(random, 0.01))
     assert planned == pytest.approx(predicted, rel=0.1)  # what is predicted comes true
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('name', ['ur10e', 'puma560'])
+@pytest.mark.parametrize(('name', 'oriented'), [('ur10e', False), ('puma560', True)])
 def test_in_a_small_range_25_planned_poses_are_worth_50_random_ones(name, oriented):
     nominal = arm(name)
     rng = np.random.default_rng(6)
@@ -424,14 +423,7 @@ def measured_problem(name, session):
 
 @measured_robots
 @pytest.mark.parametrize(
-    ('name', 'session'),
-    [
-        ('ur10_ipa_leica', 'B'),
-        ('ur5_jacobi_lasertracker', 'grid'),
-        ('wam7_jacobi_lasertracker', 'grid'),
-        ('positioner_2axis_pose', 'all'),
-        ('fr3_camera_eyeinhand', 'all'),
-    ],
+    ('name', 'session'), [('wam7_jacobi_lasertracker', 'grid'), ('fr3_camera_eyeinhand', 'all')]
 )
 def test_half_of_the_measured_poses_predict_as_well_as_all(name, session):
     """Chosen without what was measured there; and the noise found is what is left on others."""
@@ -449,23 +441,17 @@ def test_half_of_the_measured_poses_predict_as_well_as_all(name, session):
 @measured_robots
 @pytest.mark.parametrize(
     ('name', 'session', 'least'),
-    [
-        ('ur10_ipa_leica', 'B', 0.8),
-        ('ur5_jacobi_lasertracker', 'grid', 0.65),
-        ('wam7_jacobi_lasertracker', 'grid', 0.8),
-        ('positioner_2axis_pose', 'all', 0.45),
-        ('fr3_camera_eyeinhand', 'all', 0.8),
-    ],
+    [('wam7_jacobi_lasertracker', 'grid', 0.8), ('positioner_2axis_pose', 'all', 0.45)],
 )
 def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, session, least):
-    """Over the outer fifths of every joint's values, each left out: not by much more than that.
+    """Over the outer fifths of a joint's values, each left out: not by much more than that.
 
-    By less on two robots: errors that neighbours share count against the parameters as a whole
+    By less on the positioner: errors that neighbours share count against the parameters as a whole
     there, and are less than that at the edge of the range (docs/planning.md).
     """
     problem = measured_problem(name, session)
     squares = []
-    for column in problem.observations.joints.T:
+    for column in problem.observations.joints.T[::2]:
         order = np.argsort(column)
         fifth = len(order) // 5
         for out in (order[:fifth], order[-fifth:]):
@@ -476,7 +462,6 @@ def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, sessi
             variance = np.diagonal(result.pose_covariance(part.joints), axis1=1, axis2=2)
             variance = variance[judged, :3] + (problem.sigma_position * result.noise.position) ** 2
             squares.append(np.mean(result.validation.after.position[judged] ** 2 / variance))
-    # the FR3 errs by 1.29: what its geometric model lacks is no effect that is considered
     assert least < np.sqrt(np.mean(squares)) < 1.35
 
 
@@ -572,6 +557,7 @@ def travel(q, order, speeds):
     return (np.abs(np.diff(q[list(order)], axis=0)) / speeds).max(axis=1).sum()
 
 
+@settings(max_examples=25)
 @given(st.integers(0, 10_000))
 def test_the_way_is_close_to_the_shortest(seed):
     rng = np.random.default_rng(seed)
@@ -628,9 +614,10 @@ def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     assert all(float(planned) < float(random) for _, planned, random in rows)
     assert 'the tool is unknown' in out
     before = (tmp_path / 'plan.csv').read_bytes()
-    assert run('--chain', 'ur10e', '--seed', 1, '--out', 'plan.csv')[0] == 1
+    again = ('--chain', 'ur10e', '--seed', 1, '--draw', 100, '--out', 'plan.csv')
+    assert run(*again)[0] == 1
     assert (tmp_path / 'plan.csv').read_bytes() == before
-    assert run('--chain', 'ur10e', '--seed', 1, '--out', 'plan.csv', '--force')[0] == 0
+    assert run(*again, '--force')[0] == 0
     assert (tmp_path / 'plan.csv').read_bytes() != before
 
 
@@ -683,7 +670,7 @@ def test_plan_with_too_few_poses_says_so(run):
         (('--velocity', 1, 2), '--velocity: give one value, or 6'),
         (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
         (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
-        (('--box', 9, 9, 9, 10, 10, 10), 'random poses only'),
+        (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
         (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
         (('--iso9283', '--poses', 20), '--poses is of no use with --iso9283'),
         (('--iso9283', '--candidates', 'q.csv'), '--candidates is of no use'),

@@ -31,7 +31,8 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.report import advice, explorer
 from calib_ros.report.maps import workspace_report
-from calib_ros.report.page import Input, Origin, Report, Verdict, render
+from calib_ros.report.page import Input, Origin, Report, Verdict, on_paper, render
+from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
 from calib_ros.report.verified import verification_report
@@ -237,6 +238,24 @@ def test_a_refused_page_says_why_and_what_to_do():
     assert 'map' not in figures_of(page)
 
 
+def test_paper_begins_with_a_certificate(solved):
+    report = report_of(*solved)
+    content = on_paper(report)
+    assert content.startswith(b'%PDF')
+    assert len(content) < 2e6
+    assert on_paper(replace(report, sections=())).startswith(b'%PDF')
+
+
+def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
+    arm = Calibration.of(solved[1])
+    found = survey(arm, 500, np.random.default_rng(0))
+    for report in (report_of(*solved), workspace_report(arm, found, Origin())):
+        for each in report.sections:
+            drawn = drawing(each.figure, each.height)
+            assert (drawn is not None) == (each.figure is not None)
+    assert drawing({'data': [{'type': 'scatter3d'}], 'layout': {}}, 100) is None
+
+
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     problem, result = solved
     poses = poses_of(problem, result)
@@ -302,7 +321,8 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
     out = tmp_path / 'out'
     told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
     arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
-    assert main([*arguments, '--tolerance', '5']) == 0
+    assert main([*arguments, '--tolerance', '5', '--pdf']) == 0
+    assert (out / 'report.pdf').read_bytes().startswith(b'%PDF')
     page = Page((out / 'report.html').read_text())
     digest = hashlib.sha256(table.read_bytes()).hexdigest()
     for text in ('A. Smith', 'tracker 7', '0012', digest, 'tolerance of 5 mm'):
@@ -321,12 +341,14 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
 def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, 'jinja2', None)
     out = tmp_path / 'out'
-    assert main(['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out)]) == 0
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
+    assert main(arguments) == 0
     said = capsys.readouterr().err
-    assert said.count('\n') == 1
+    assert said.count('\n') == 2
     assert 'calib_ros[report]' in said
+    assert 'calib_ros[pdf]' in said
     names = {path.name for path in out.iterdir()}
-    assert 'report.html' not in names
+    assert not {'report.html', 'report.pdf'} & names
     assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
 
 

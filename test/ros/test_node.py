@@ -23,8 +23,6 @@ from geometry_msgs.msg import (
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from ros_cell import (
@@ -87,17 +85,15 @@ def motion(truth, recording):
     return replace(recording, poses=poses.at(stamps), held_out=none)
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
-def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, executor, storage):
+@pytest.mark.parametrize(('mode', 'storage'), [('dwell', 'mcap'), ('continuous', 'sqlite3')])
+def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, storage):
     recording = request.getfixturevalue('recording' if mode == 'dwell' else 'motion')
     expected = direct(recording, mode=mode)
     replayed = CalibrationSession(load_chain('ur10e'), Settings(mode=mode))
     write_bag(tmp_path / 'bag', recording, storage)
     assert replay(tmp_path / 'bag', replayed).warnings == ()
     parameters = {'chain': 'ur10e', 'mode': mode, 'data_dir': str(tmp_path)}
-    with Cell(executor, **parameters) as cell:
+    with Cell(**parameters) as cell:
         cell.play(
             {
                 'measured_pose': pose_messages(recording.poses),
@@ -164,11 +160,10 @@ def cell(tmp_path):
         yield cell
 
 
-@pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth, executor):
+def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):
     target = tmp_path / 'sub' / 'saved.yaml'
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'target_filename': str(target)}
-    with Cell(executor, **parameters) as cell:
+    with Cell(**parameters) as cell:
         refused = cell.call('save')
         assert not refused.success
         assert 'identify' in refused.message
@@ -550,10 +545,7 @@ def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recordin
         assert (used['chain'], used['serial'], used['folds']) == ('ur10e', '7', 4)
 
 
-@pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-def test_messages_are_taken_while_an_identification_runs(
-    monkeypatch, tmp_path, recording, executor
-):
+def test_messages_are_taken_while_an_identification_runs(monkeypatch, tmp_path, recording):
     release, problems = threading.Event(), []
 
     def slow(problem, model, progress):
@@ -563,7 +555,7 @@ def test_messages_are_taken_while_an_identification_runs(
 
     monkeypatch.setattr(node_module, 'identify_model', slow)
     joints, poses = topics(recording).values()
-    with Cell(executor, chain='ur10e', data_dir=str(tmp_path)) as cell:
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         cell.play({'joint_states': joints[:1000], 'measured_pose': poses[:80]})
         first = cell.start_call('identify')
         cell.spin_until(lambda: problems)
@@ -994,9 +986,8 @@ def test_several_robots_in_one_process(tmp_path, recording, truth):
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('executor', ['events', 'single_threaded'])
-def test_signals_end_the_node_cleanly(tmp_path, number, executor):
-    with Child(chain='ur10e', max_gap=1, executor=executor, data_dir=tmp_path) as child:
+def test_signals_end_the_node_cleanly(tmp_path, number):
+    with Child(chain='ur10e', max_gap=1, data_dir=tmp_path) as child:
         child.wait_for('ready to calibrate ur10e')
         assert child.end(number) == 0, child.output
         assert 'Traceback' not in child.output
@@ -1045,7 +1036,6 @@ def test_whole_numbers_are_numbers(tmp_path):
     [
         ({}, 'parameter "chain" is not set'),
         ({'chain': 'ur10e', 'folds': 1}, 'folds'),
-        ({'chain': 'ur10e', 'executor': 'fast'}, 'must be one of events'),
     ],
 )
 def test_a_wrong_parameter_ends_the_node_with_one_clear_line(parameters, said):

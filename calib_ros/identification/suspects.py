@@ -1,0 +1,257 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The usual mistakes in what is given for an arm: what makes each good, and the option to give."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import shipped_chains
+from calib_ros.kinematics.se3 import FloatArray
+
+Sets: TypeAlias = tuple[Observations, ...]
+Change: TypeAlias = Callable[[Observations], Observations]
+ROWS = (1, -1, 2, -2)
+"""Rows by which joint values may stand beside another measurement."""
+QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
+"""Zeros of joints [rad] that differ between conventions."""
+SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A mistake that may have been made.
+
+    Attributes
+    ----------
+    what : str
+        What was done, in words.
+    remedy : str
+        The option to give.
+    change : callable
+        Makes of the samples those that should have been given.
+    rank : int
+        Of those that explain the same, the lowest are named.
+    chain : Chain, optional
+        The nominal chain, as it had to be; as it is if None.
+    rows : int
+        By how many rows below the joint values of a measurement stand.
+
+    """
+
+    what: str
+    remedy: str
+    change: Change
+    rank: int = 1
+    chain: Chain | None = None
+    rows: int = 0
+
+
+def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
+    """Yield what may have gone wrong, the most usual first."""
+    turning = np.array([joint.type == 'revolute' for joint in chain.joints])
+    degrees = _joints(np.diag(np.where(turning, np.radians(1.0), 1.0)))
+    if not any(each.socket for each in sets):
+        yield from _units(degrees)
+        if all(each.oriented.any() for each in sets):
+            yield from _conventions(degrees, any(each.inverse for each in sets))
+        yield Suspect(
+            'the axes of the measuring device are left-handed',
+            'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
+            _mirrored,
+            3,
+        )
+    yield Suspect('the joint values are in degrees, not radians', '--joint-angle deg', degrees)
+    yield Suspect(
+        'the joint values are in radians, not degrees',
+        '--joint-angle rad',
+        _joints(np.diag(np.where(turning, np.degrees(1.0), 1.0))),
+    )
+    yield from _of_joints(chain)
+    yield from _of_arms(chain)
+    for rows in ROWS:
+        where = 'below' if rows > 0 else 'above'
+        count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
+        yield Suspect(
+            f'the joint values stand {count} {where} the measurement that they belong to',
+            f'--shift {rows}',
+            _as_it_is,
+            2,
+            rows=rows,
+        )
+
+
+def _units(degrees: Change) -> Iterator[Suspect]:
+    """Yield units of lengths, and of angles at the same time."""
+    for unit, size in SCALES.items():
+        for way, option, scaled in (
+            (f'in {unit}, not metres', f'--length {unit}', _scaled(size)),
+            (f'in metres, not {unit}', '--length m', _scaled(1.0 / size)),
+        ):
+            yield Suspect(f'the positions are {way}', option, scaled)
+            yield Suspect(
+                f'the positions are {way} and the joint values in degrees',
+                f'{option} --joint-angle deg',
+                _one_by_one(scaled, degrees),
+                2,
+            )
+
+
+def _conventions(degrees: Change, inverse: bool) -> Iterator[Suspect]:
+    """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too."""
+    flange = (
+        'the poses are those of the world in the target, as by a camera on the flange',
+        '--eye-in-hand (or --inverse, where the device stands)',
+    )
+    if inverse:
+        flange = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
+    again: Change = Observations.inverted if inverse else _as_it_is
+    ways: tuple[tuple[str, str, Change], ...] = (
+        (
+            'the quaternions are w x y z, not x y z w',
+            '--quaternion wxyz',
+            _one_by_one(_reordered([1, 2, 3, 0]), again),
+        ),
+        (
+            'the quaternions are x y z w, not w x y z',
+            '--quaternion xyzw',
+            _one_by_one(_reordered([3, 0, 1, 2]), again),
+        ),
+        (
+            'the rotations are transposed, those of the device in the target',
+            '--columns qx=-qx,qy=-qy,qz=-qz',
+            _one_by_one(_transposed, again),
+        ),
+        (*flange, _as_it_is if inverse else Observations.inverted),
+    )
+    in_mm = _scaled(SCALES['mm'])
+    for what, remedy, change in ways:
+        for more, option, others in (
+            ('', '', ()),
+            (', and the positions in mm', ' --length mm', (in_mm,)),
+            (', and the joint values in degrees', ' --joint-angle deg', (degrees,)),
+            (
+                ', the positions in mm and the joint values in degrees',
+                ' --length mm --joint-angle deg',
+                (in_mm, degrees),
+            ),
+        ):
+            made = _one_by_one(_as_measured, *others, change)
+            yield Suspect(f'{what}{more}', f'{remedy}{option}', made, 2 if more else 1)
+
+
+def _of_joints(chain: Chain) -> Iterator[Suspect]:
+    """Yield signs, zeros, order and couplings of joints."""
+    names = chain.joint_names
+    count = len(names)
+    revolute = [joint.type == 'revolute' for joint in chain.joints]
+    for k, name in enumerate(names):
+        other_way = np.eye(count)
+        other_way[k, k] = -1.0
+        yield Suspect(
+            f'{name} counts the other way round',
+            f'sign: {-chain.joints[k].sign} in the chain file, or --columns q{k + 1}=-q{k + 1}',
+            _joints(other_way),
+        )
+        for degrees, angle in QUARTERS.items() if revolute[k] else ():
+            yield Suspect(
+                f'{name} has its zero {degrees[1:]} degrees away',
+                f'theta {degrees} degrees in the chain file, or --columns '
+                f'q{k + 1}=q{k + 1}{degrees[0]}{abs(angle):.16g}',
+                _joints(np.eye(count), angle * np.eye(count)[k]),
+            )
+    for i in range(count):
+        for j in range(i + 1, count):
+            order = np.arange(count)
+            order[[i, j]] = j, i
+            yield Suspect(
+                f'{names[i]} and {names[j]} are swapped',
+                f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}',
+                _joints(np.eye(count)[order]),
+                2,
+            )
+    for k in range(1, count):
+        for sign in (1.0, -1.0) if revolute[k] and revolute[k - 1] else ():
+            coupled = np.eye(count)
+            coupled[k, k - 1] = sign
+            yield Suspect(
+                f'{names[k]} is not given against {names[k - 1]}: they are coupled',
+                f'--columns q{k + 1}=q{k + 1}{"+" if sign > 0.0 else "-"}q{k}',
+                _joints(coupled),
+                2,
+            )
+
+
+def _of_arms(chain: Chain) -> Iterator[Suspect]:
+    """Yield the other convention, and other arms with the same kinds of joints."""
+    other = 'modified' if chain.convention == 'standard' else 'standard'
+    yield Suspect(
+        f'the DH table is in the {other} convention, not the {chain.convention} one',
+        f'convention: {other} in the chain file',
+        _as_it_is,
+        3,
+        replace(
+            chain, convention='modified' if other == 'modified' else 'standard', parallel=None
+        ),
+    )
+    types = [joint.type for joint in chain.joints]
+    for ours in shipped_chains():
+        alike = [joint.type for joint in ours.joints] == types
+        if alike and not np.allclose(ours.table, chain.table, atol=1e-6):
+            yield Suspect(
+                f'the arm is a {ours.name}, not a {chain.name}',
+                f'--chain {ours.name}',
+                _as_it_is,
+                2,
+                replace(ours, base=chain.base, tool=chain.tool),
+            )
+
+
+def _as_it_is(each: Observations) -> Observations:
+    return each
+
+
+def _one_by_one(*changes: Change) -> Change:
+    def changed(each: Observations) -> Observations:
+        for change in changes:
+            each = change(each)
+        return each
+
+    return changed
+
+
+def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
+    return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
+
+
+def _scaled(size: float) -> Change:
+    return lambda each: replace(each, positions=size * each.positions)
+
+
+def _reordered(order: list[int]) -> Change:
+    return lambda each: replace(
+        each, rotations=se3.from_quat(se3.to_quat(each.rotations)[:, order])
+    )
+
+
+def _transposed(each: Observations) -> Observations:
+    return replace(each, rotations=np.swapaxes(each.rotations, 1, 2))
+
+
+def _as_measured(each: Observations) -> Observations:
+    return each.inverted() if each.inverse else each
+
+
+def _mirrored(each: Observations) -> Observations:
+    """Return what a device with its y axis the other way round should have measured."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    return replace(
+        each, positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror
+    )
