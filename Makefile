@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test fuzz mutants lint oldest screenshots clean
+.PHONY: demo test fuzz mutants lint oldest screenshots docs clean
 
 demo: $(VENV)/commands
 	$(BIN)/calib_ros demo --out demo --force
@@ -83,6 +83,11 @@ $(VENV)/%_msgs/installed: $(VENV)/installed test/messages.cmake test/%_msgs/msg/
 # Pictures of the report for docs/; needs Chromium and CALIB_ROS_DATA.
 screenshots: $(VENV)/installed
 	$(BIN)/python benchmarks/report.py --screenshots docs
+
+# The site, into build/site.
+docs: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m mkdocs build --strict
 
 clean:
 	rm -rf $(VENV) $(OLDEST) demo build install log *.egg-info

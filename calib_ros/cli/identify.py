@@ -17,10 +17,13 @@ from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
+    add_history,
     add_identity,
     add_layout,
     add_out,
     add_settings,
+    filing_of,
+    history_of,
     origin_of,
     results,
     settings_of,
@@ -39,6 +42,7 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     from calib_ros.cli.inputs import Loaded
     from calib_ros.cli.screen import Screen
+    from calib_ros.files.history import History
     from calib_ros.settings import Settings
 
 LAYOUT = (
@@ -94,6 +98,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     )
     group = parser.add_argument_group('what to write')
     add_out(group, 'calibration, result and report')
+    add_history(group)
     group.add_argument('--json', action='store_true', help='print the result as JSON')
     group.add_argument(
         '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
@@ -128,6 +133,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     if options.previous is not None:
         return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
+    history = history_of(options)
     if options.out is None:
         found = _identified(options, screen)
     else:
@@ -135,6 +141,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             found = _identified(options, screen)
             made = result_files(found, screen, options.out, options.tolerance, options.pdf)
             write_files(folder, made)
+    if history is not None:
+        _file(history, found, options)
     for warning in (*found.warnings, *found.result.remarks):
         screen.warn(warning)
     if options.json:
@@ -142,6 +150,16 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     else:
         show(found, screen, options.out)
     return 0 if found.result.accepted else NOT_ACCEPTED
+
+
+def _file(history: History, found: Identified, options: argparse.Namespace) -> None:
+    from calib_ros.files.rows import identified, settings_hash
+
+    problem = found.loaded.problem
+    hashed = settings_hash(problem.chain, settings_of(options), options.largest_loss)
+    measured = options.csv or options.detections or options.measured
+    about = filing_of(options, (*problem.sets, *problem.judging), measured, hashed)
+    history.file(identified(found.result, about, found.warnings))
 
 
 def _source(options: argparse.Namespace) -> str:

@@ -54,6 +54,7 @@ from calib_ros.ros.advisor import Guide
 from calib_ros.ros.arguments import NODE, typed, usage
 from calib_ros.ros.deferred import DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
+from calib_ros.ros.filer import Filer
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import Exportable, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
@@ -112,6 +113,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove
         )
+        self.session.socket_distance = given.socket_distance
+        self._filer = Filer(given.history, given.serial, chain)
         self._last = 'nothing identified yet'
         self._progress = Progress('identifying')
         self._observability = ''
@@ -338,6 +341,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self._guide.show(found)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
+        self._last += self._filer.identified(given.problem, result, self.session.settings)
         return result.accepted, self._last
 
     def _page(self, given: Snapshot, result: Identification) -> str | None:
@@ -356,9 +360,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return self._progress.cancel()
 
     def _on_capture(self, request: Any) -> tuple[bool, str]:
-        count, why = self.session.capture()
+        socket = self.get_parameter('socket').value
+        count, why = self.session.capture(socket)
         if not count:
             return False, f'no sample taken: {why}'
+        if socket:
+            return True, f'sample {len(self.session.samples)} taken: ball in socket {socket}'
         taken = self.session.samples[-count:]
         words = ', '.join(
             f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken
@@ -370,10 +377,11 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
-        now, nominal = self.session.validate()
+        figures = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # else there was nothing to judge
-        return words.verdict(calibration, now, nominal)
+        holds, text = words.verdict(calibration, *figures)
+        return holds, text + self._filer.validated(self.session, figures, holds)
 
     def _to_check(self) -> tuple[Calibration, Problem]:
         self._take_messages()

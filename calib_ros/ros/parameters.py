@@ -53,12 +53,14 @@ class Given:
     chain: str
     links: Links
     serial: str
+    history: str
     data_dir: Path | None
     allowed_folders: tuple[Path, ...]
     resume: bool
     autoload: bool
     candidates: Path | None
     frames: FrameNames
+    socket_distance: float
     settings: Settings
 
 
@@ -86,12 +88,14 @@ def declare_all(node: Node) -> Given:
         chain=own['chain'],
         links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
         serial=own['serial'],
+        history=own['history'],
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
         resume=own['resume'],
         autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
+        socket_distance=own['socket_distance'],
         settings=settings,
     )
 

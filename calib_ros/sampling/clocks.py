@@ -14,6 +14,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
+from calib_ros.sampling.making import POSITION, QUAT
 from calib_ros.sampling.rows import Rows
 from calib_ros.sampling.slices import Piece, Slice, StreamKey, merged
 from calib_ros.settings import Settings
@@ -175,8 +176,29 @@ class Clocks:
         if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
             return
         self._looked_ns = now_ns or 0
-        self._found = collector.find_delay(self._chain, now_ns)
+        self._found = self._find(collector, now_ns)
         collector.holding = self.delay is None and now_ns is not None
+
+    def _find(self, collector: Collector, now_ns: int | None) -> Delay | None:
+        """Return how late the waiting measurements are; from now on the collector uses it.
+
+        One that has rivals is not used.
+        """
+        stamps, joints, positions = collector.known(now_ns)
+        found = []
+        for measured, rows in positions:
+            quats = rows[:, QUAT]
+            oriented = len(rows) > 0 and not np.isnan(quats).any()
+            rotations = se3.from_quat(quats) if oriented else None
+            delay = find_delay(self._chain, stamps, joints, measured, rows[:, POSITION], rotations)
+            if delay is not None:
+                found.append(delay)
+        if not found:
+            return None
+        best = max(found, key=lambda delay: (not delay.rivals, delay.correlation))
+        if not best.rivals:
+            collector.delay_ns = round(best.seconds * 1e9)
+        return best
 
     def wake(self, unrest: int, taken: int) -> None:
         """Watch again if more measurements at stops were not at rest, with so many samples."""

@@ -17,12 +17,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.delay import Delay, find_delay
 from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.making import POSITION, QUAT, RESTLESS, VIBRATING, WIDTH, Maker
+from calib_ros.sampling.making import RESTLESS, VIBRATING, WIDTH, Maker
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, Slice, StreamKey
@@ -40,6 +37,8 @@ MOST_RESTS = 1000
 """Rests in which no stop shows that are counted."""
 MOST_STREAMS = 50
 """Streams of measurements that are told apart: a tracker may number its markers without end."""
+SOCKET_LOOKS = 11
+"""Joint values that are averaged while a ball sits in a socket."""
 TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
 
 
@@ -86,42 +85,23 @@ class Collector:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
 
-    def find_delay(self, chain: Chain, now_ns: int | None) -> Delay | None:
-        """Return how late the waiting measurements are, and take it into account from now on.
+    def known(
+        self, now_ns: int | None
+    ) -> tuple[Stamps, FloatArray, list[tuple[Stamps, FloatArray]]]:
+        """Return stamps and joint values, and stamps and rows (N, WIDTH) of waiting positions.
 
-        One that has rivals is not taken into account.
-        Only what is older by `lateness` than the stamp `now_ns` counts, of which all has come;
-        None: everything counts.
+        Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
         """
         self._sort()
-        stamps, joints = self.track.samples()
         until = np.iinfo(np.int64).max if now_ns is None else now_ns - self._lateness_ns
+        stamps, joints = self.track.samples()
         complete = stamps <= until
-        found = []
-        for key, rows in self._waiting.items():
-            if key.distance or key.eye_in_hand:
-                continue
-            known = rows.stamps <= until
-            values = rows.values[known]
-            oriented = not np.isnan(values[:, QUAT]).any()
-            rotations = se3.from_quat(values[:, QUAT]) if oriented and len(values) else None
-            found.append(
-                find_delay(
-                    chain,
-                    stamps[complete],
-                    joints[complete],
-                    rows.stamps[known],
-                    values[:, POSITION],
-                    rotations,
-                )
-            )
-        convincing = [delay for delay in found if delay is not None]
-        if not convincing:
-            return None
-        best = max(convincing, key=lambda delay: (not delay.rivals, delay.correlation))
-        if not best.rivals:
-            self.delay_ns = round(best.seconds * 1e9)
-        return best
+        positions = [
+            (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
+            for key, rows in self._waiting.items()
+            if not (key.distance or key.eye_in_hand)
+        ]
+        return stamps[complete], joints[complete], positions
 
     def reach(self, given: Slice) -> int:
         """Return how many of the first messages come up to one that gives something to do."""
@@ -245,8 +225,11 @@ class Collector:
         """Return how many measurements at stops were not at rest."""
         return self.dropped[VIBRATING] + self.dropped[RESTLESS]
 
-    def capture(self) -> tuple[int, str]:
-        """Take one sample of each stream now; return how many, and why not more in words."""
+    def capture(self, place: str = '') -> tuple[int, str]:
+        """Take one sample of each stream now; return how many, and why not more in words.
+
+        With a place the target sits in a socket there, and nothing needs to be measured.
+        """
         if self.settings.mode == 'continuous':
             return 0, 'every measurement is taken in mode continuous'
         self._sort()
@@ -254,7 +237,7 @@ class Collector:
         newest = self.track.newest_ns
         if not newest:
             return 0, 'no joint states have come'
-        if not self.waiting:
+        if not (self.waiting or place):
             return 0, 'no measurements have come since the last sample'
         shortest = round(self.settings.shortest_stop * 1e9)
         if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
@@ -263,6 +246,10 @@ class Collector:
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
         begin = int(stands[-1, 0])
+        if place:
+            stamps = np.linspace(begin + shortest, newest, SOCKET_LOOKS).astype(np.int64)
+            self.maker.in_socket(place, stamps, self.track.at(stamps, standing=True))
+            return 1, ''
         self._round(begin)  # a stop before is not waited for any longer
         before, dropped = len(self.maker.fresh), self.dropped.copy()
         self._average(begin, newest)

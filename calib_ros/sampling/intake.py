@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.sampling.cdr import Alike, decode, transforms
+from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
     LINKS,
     TRANSFORM,
@@ -30,7 +31,7 @@ from calib_ros.sampling.messages import (
     transforms_in,
     usable,
 )
-from calib_ros.sampling.session import CalibrationSession, Part
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Links, Pair

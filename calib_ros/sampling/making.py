@@ -103,6 +103,19 @@ class Maker:
             spread=mean.spread,
         )
 
+    def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
+        """Make a sample of a ball that sits in a socket, at stamps (N,) while the arm stands."""
+        steps = unwrapped(motion.joints - motion.joints[0], self._revolute)
+        sample = Sample(
+            stamp_ns=int(stamps[-1]),
+            joints=motion.joints[0] + steps.mean(axis=0),
+            approach=motion.approach[0].copy(),
+            device=place,
+            socket=True,
+        )
+        self.remember([sample])
+        self.fresh.append(sample)
+
     def _add(
         self, key: StreamKey, stamp_ns: int, rows: FloatArray, position: FloatArray, **more: Any
     ) -> None:

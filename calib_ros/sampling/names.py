@@ -102,6 +102,11 @@ class FrameNames:
         """Return the usual frame of a device; None while few measurements have come."""
         return self._usual.get(device)
 
+    @property
+    def settled(self) -> int:
+        """Return of how many devices the usual frame is known."""
+        return len(self._usual)
+
     def main(self, device: str) -> str | None:
         """Return the usual frame of a device, or the most frequent one while few have come."""
         known = self._known.get(device)

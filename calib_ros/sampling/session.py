@@ -7,10 +7,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification.calibration import Calibration
@@ -24,13 +22,21 @@ from calib_ros.sampling.account import Account
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import Delay
+from calib_ros.sampling.entry import Entry, Part
 from calib_ros.sampling.hints import Hint, restless, sparse
-from calib_ros.sampling.live import Estimate, LiveEstimate, barely_moved
-from calib_ros.sampling.messages import LARGEST, MessageError, Readings
+from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.names import FrameNames, JointNames, strange
-from calib_ros.sampling.sample import Frames, Sample, collect, named
-from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice, StreamKey
-from calib_ros.sampling.sources import Source
+from calib_ros.sampling.progress import progress
+from calib_ros.sampling.sample import (
+    SOCKETS,
+    Frames,
+    Sample,
+    collect,
+    named,
+    socket_pairs,
+    socket_place,
+)
+from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.strays import STRAY, Gate
 from calib_ros.sampling.track import APART
 from calib_ros.settings import Settings
@@ -43,20 +49,9 @@ ONE_FRAME = (
 )
 RECENT = 20
 """Samples that a check of the calibration in use looks at: a few stops of daily work."""
-NOT_NOISE = 3.0
-"""RMS residual [what measurements scatter by] from which it is no noise, and more samples would
-average nothing: chance alone does not reach it with the fewest samples of which it is told."""
 LEAST_FAR = 1.0
 """Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
 what has not come yet; joint states up to `max_gap` apart belong together."""
-
-
-class Part(NamedTuple):
-    """What messages of one stream say, and their places (N,) among others; source None: joints."""
-
-    places: NDArray[np.intp]
-    source: Source | None
-    readings: Readings
 
 
 def check_settings(chain: Chain, settings: Settings) -> None:
@@ -108,6 +103,8 @@ class CalibrationSession:
             )
         check_settings(chain, self.settings)
         self.recording = True
+        self.socket_distance = SOCKETS
+        """Distance of the two sockets of a location [m]."""
         self.calibration: Calibration | None = None
         """The last one that was accepted or loaded."""
         self._known: frozenset[Sample] = frozenset()  # that were there by then
@@ -124,14 +121,9 @@ class CalibrationSession:
         self._gate = Gate(max(settings.lateness + settings.max_gap, LEAST_FAR))
         self._frames = FrameNames()
         self._names = JointNames(self.joint_names)
+        self._entry = Entry(self._names, self._frames, len(self.chain.joints))
         self._live = LiveEstimate(self.problem_of)
         self.samples: list[Sample] = []
-        self.received: Counter[str] = Counter()
-        """Messages that came so far, by kind."""
-        self.latest: tuple[int, Sequence[float]] | None = None
-        """Stamp [ns] and values of the last joint state that named all joints."""
-        self._dropped: Counter[str] = Counter()
-        self._unused: Counter[str] = Counter()
         self._notes: Counter[str] = Counter()
         self._newest = {JOINTS: 0, POSES: 0}
         self._once: set[tuple[str, str]] = set()
@@ -158,10 +150,10 @@ class CalibrationSession:
         They are kept by slices up to a joint state after which there is something to do. An error
         costs the slice that makes it, and none after it.
         """
-        pieces = [
-            *self._joints([each for each in parts if each.source is None]),
-            *self._measured([each for each in parts if each.source is not None]),
-        ]
+        settled = self._frames.settled
+        pieces = self._entry.pieces(parts, self.recording, self.settings.frame_id)
+        if self._frames.settled != settled:
+            self._leave_out_strange()
         error: Exception | None = None
         for given in self._slices(pieces):
             try:
@@ -173,77 +165,7 @@ class CalibrationSession:
 
     def miss(self, kind: str, count: int, cause: str) -> None:
         """Count messages that came and cannot be used."""
-        self.received[kind] += count
-        self._dropped[f'{kind}: {cause}'] += count
-
-    def _joints(self, parts: Sequence[Part]) -> Iterator[Piece]:
-        """Yield joint values that can be used, those of the chain."""
-        latest = -1
-        for places, _, (stamps, (_, *names), numbers) in parts:
-            try:
-                columns, index = self._names.layout(tuple(names))
-            except MessageError as err:
-                self.miss(JOINTS, len(stamps), str(err))
-                continue
-            values = numbers[:, index]
-            size = np.abs(values).max(axis=1)
-            good = size <= LARGEST
-            if not good.all():
-                infinite = int((~np.isfinite(size)).sum())
-                for count, cause in (
-                    (infinite, 'NaN or infinite joint value'),
-                    (int((~good).sum()) - infinite, 'joint value beyond 1e6'),
-                ):
-                    if count:
-                        self.miss(JOINTS, count, cause)
-                places, stamps, values = places[good], stamps[good], values[good]
-            self.received[JOINTS] += len(stamps)
-            if len(columns) == len(self.chain.joints) and len(stamps) and places[-1] > latest:
-                latest = int(places[-1])
-                self.latest = (int(stamps[-1]), values[-1].tolist())
-            if self.recording:
-                yield Piece(columns, places, stamps, values)
-            elif len(stamps):
-                self._unused['joints: not recording'] += len(stamps)
-
-    def _measured(self, parts: Sequence[Part]) -> Iterator[Piece]:
-        """Yield measurements that can be used."""
-        for places, source, readings in self._by_frame(parts):
-            assert source is not None
-            count, frame_id = len(places), readings.strings[0]
-            self.received[POSES] += count
-            if not self.recording:
-                self._unused['poses: not recording'] += count
-            elif self._is_in_frame(source.device, frame_id, count):
-                width = readings.numbers.shape[1]
-                if width > 7:  # a covariance of zeros stands for none
-                    none = ~readings.numbers[:, 7:].any(axis=1)
-                    readings.numbers[none, 7:] = np.nan
-                key = StreamKey(
-                    source.device,
-                    source.target or readings.child,
-                    source.validation,
-                    width == 1,
-                    source.eye_in_hand,
-                    frame_id,
-                )
-                yield Piece(key, places, readings.stamps_ns, readings.numbers)
-
-    def _by_frame(self, parts: Sequence[Part]) -> list[Part]:
-        """Return measurements one by one while it is open which of several frames is the usual."""
-        frames: dict[str, set[str]] = {}
-        for each in parts:
-            assert each.source is not None
-            if self._frames.usual(each.source.device) is None:
-                frames.setdefault(each.source.device, set()).add(each.readings.strings[0])
-        if all(len(some) == 1 for some in frames.values()):
-            return sorted(parts, key=lambda part: int(part.places[0]))
-        single = [
-            Part(part.places[k : k + 1], part.source, part.readings.rows(slice(k, k + 1)))
-            for part in parts
-            for k in range(len(part.places))
-        ]
-        return sorted(single, key=lambda part: int(part.places[0]))
+        self._entry.miss(kind, count, cause)
 
     def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
         """Yield messages up to one that gives something to do, when those before are kept."""
@@ -277,18 +199,6 @@ class CalibrationSession:
             self._collector.round()
         self._take()
 
-    def _is_in_frame(self, device: str, frame_id: str, count: int = 1) -> bool:
-        """Tell whether measurements are in the frame of their device; count them if not."""
-        before = self._frames.usual(device)
-        try:
-            self._frames.check(device, frame_id, self.settings.frame_id, count)
-        except MessageError as err:
-            self._dropped[f'poses: {err}'] += count
-            return False
-        if self._frames.usual(device) != before:
-            self._leave_out_strange()
-        return True
-
     def finish(self) -> None:
         """Make samples of everything that still waits; nothing more will come."""
         for held in self._gate.release():
@@ -298,11 +208,24 @@ class CalibrationSession:
         self._collector.finish()
         self._take()
 
+    @property
+    def received(self) -> Counter[str]:
+        """Return how many messages came so far, by kind."""
+        return self._entry.received
+
+    @property
+    def latest(self) -> tuple[int, Sequence[float]] | None:
+        """Return stamp [ns] and values of the last joint state that named all joints."""
+        return self._entry.latest
+
     # Samples
 
-    def capture(self) -> tuple[int, str]:
-        """Take one sample of each source now; return how many, and why none if so."""
-        found = self._collector.capture()
+    def capture(self, socket: str = '') -> tuple[int, str]:
+        """Take one sample of each source now; return how many, and why none if so.
+
+        With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
+        """
+        found = self._collector.capture(socket_place(socket) if socket else '')
         self._take()
         return found
 
@@ -318,7 +241,7 @@ class CalibrationSession:
         if not self.samples:
             raise InputError('there is no sample to remove')
         sample = self.samples.pop()
-        self._unused['poses: of a sample that was taken back'] += sample.count
+        self._entry.unused['poses: of a sample that was taken back'] += sample.count
         self._collector.forget(sample)
         self._live.restart()
         self.on_removed(sample)
@@ -380,7 +303,7 @@ class CalibrationSession:
         frame_id = self._frame_of(sample)
         strays = sample.frame_id != frame_id
         if strays:
-            self._dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
+            self._entry.dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
         return strays
 
     @property
@@ -419,7 +342,7 @@ class CalibrationSession:
                 self.samples
             ) - len(usable)
         strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._gate.dropped.items()})
-        dropped = self._dropped + collector.dropped + strays
+        dropped = self._entry.dropped + collector.dropped + strays
         return Account(
             self.received['joints'],
             self.received['poses'],
@@ -427,7 +350,7 @@ class CalibrationSession:
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
-            dict(sorted((self._unused + collector.unused).items())),
+            dict(sorted((self._entry.unused + collector.unused).items())),
             dict(sorted(dropped.items())),
             dict(sorted(notes.items())),
             self._names.foreign,
@@ -475,37 +398,14 @@ class CalibrationSession:
         What an operator must know or do comes first: who has room for a line only cuts the rest.
         `work` is what goes on besides.
         """
-        fitted = [sample for sample in self.usable if not sample.validation]
+        told = [self.state, work, *(hint.status for hint in self.hints)]
         estimate = self.estimate
-        words = [self.state, work]
-        words += [hint.status for hint in self.hints]
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
-            words.append(f'sample {number} does not fit to the others, was the target moved?')
-        counted = f'{len(fitted)} samples'
-        if estimate is not None:
-            counted += f', {1e3 * estimate.sigma:.3f} mm expected, {self._forecast(estimate)}'
-        words.append(counted)
-        if fitted:
-            still = barely_moved(self.chain, np.array([sample.joints for sample in fitted]))
-            if still:
-                words.append(f'hardly moved so far: {", ".join(still)}')
-        return '; '.join(filter(None, words))
-
-    def _forecast(self, estimate: Estimate) -> str:
-        """Return in words what it takes until positions are known as well as wanted."""
-        wanted = self.settings.wanted_accuracy
-        more = estimate.more_for(wanted)
-        if not more:
-            return 'enough for the accuracy wanted'
-        if estimate.excess is None:
-            return 'too few to tell how many it takes'
-        if estimate.excess > NOT_NOISE:
-            advice = 'is the target firm? More'
-            if self.settings.model == 'geometric':
-                advice = 'set model to auto, more'
-            return f'{advice} will not help: what is left is {estimate.excess:.0f} x noise'
-        return f'{more} more expected for {1e3 * wanted:g} mm'
+            told.append(f'sample {number} does not fit to the others, was the target moved?')
+        fitted = [sample.joints for sample in self.usable if not sample.validation]
+        told += progress(self.chain, fitted, estimate, self.settings)
+        return '; '.join(filter(None, told))
 
     # Identification
 
@@ -535,8 +435,9 @@ class CalibrationSession:
             When there is none to fit.
 
         """
-        settings = self.settings
-        fitted, held_out = collect(samples, (settings.sigma_position, settings.sigma_orientation))
+        settings, frames = self.settings, Frames()
+        sigmas = (settings.sigma_position, settings.sigma_orientation)
+        fitted, held_out = collect(samples, sigmas, frames)
         if not fitted:
             raise InputError(f'no samples to fit: {self._came}')
         return Problem(
@@ -544,6 +445,9 @@ class CalibrationSession:
             fitted[0],
             held_out,
             more=fitted[1:],
+            separations=tuple(
+                (*pair, self.socket_distance) for pair in socket_pairs(samples, frames)
+            ),
             world_frame=samples[0].frame_id,  # it is the frame of `base`
             **settings.for_problem(),
         )

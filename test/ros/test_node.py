@@ -52,6 +52,7 @@ from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError
 from calib_ros.files.archive import Archive
 from calib_ros.files.bags import replay, write_bag
+from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.ros import node as node_module
@@ -408,7 +409,9 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
 
 
 def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recording):
+    history = tmp_path / 'history'
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    parameters['history'] = str(history)
     other = tmp_path / 'ur10e_on_linear_axis_20990101T000000000000Z.yaml'
     other.write_text('of another robot, whose name begins alike')
     with Cell(**parameters) as cell:
@@ -441,6 +444,13 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         assert not broken.success
         assert 'does not hold any more' in broken.message
         assert 'RMS 3.0' in broken.message
+    filed = {(row.kind, row.verdict): row for row in History(history).rows('7')}
+    holds, broken = (filed['validate', text] for text in ('holds', 'does not hold'))
+    assert set(filed) == {
+        ('identify', 'accepted'),
+        *((r.kind, r.verdict) for r in (holds, broken)),
+    }
+    assert broken.rms_mm > 3.0 > holds.rms_mm
 
 
 def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, recording):

@@ -144,20 +144,13 @@ def test_the_covariance_of_a_stop_is_the_mean_of_its_measurements():
     motion = stops(STOPS[:2], MOVE, STAND)
     spread = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) * 1e-8
     spread[0, 1] = spread[1, 0] = 5e-9
-
-    def reading(stamp, value, size):
-        return Reading(stamp, 'world', tuple(value), (0.0, 0.0, 0.0, 1.0), tuple(size))
-
     times = np.arange(0.003, 3.5, 0.02)
+    sizes = np.where(np.arange(len(times))[:, np.newaxis] % 2, 3.0, 1.0) * spread.ravel()
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    rows = np.concatenate([place(motion(times)), turns, sizes], axis=1)
     events = [
-        (time, lambda made, row=(stamp, value, size): made.add(POSE, reading(*row)))
-        for time, stamp, value, size in zip(
-            times.tolist(),
-            stamps(times).tolist(),
-            place(motion(times)).tolist(),
-            np.where(np.arange(len(times))[:, np.newaxis] % 2, 3.0, 1.0) * spread.ravel(),
-            strict=True,
-        )
+        (time, POSE, stamp, row)
+        for time, stamp, row in zip(times.tolist(), stamps(times), rows, strict=True)
     ]
     sample = play(collector(), joint_events(motion, 3.5), events)[0]
     share = 1.0 / sample.count  # an odd count has one more of either
