@@ -27,7 +27,8 @@ from scipy import linalg
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identifiability import independent
-from calib_ros.identification.leastsquares import Samples, System, triangular_factor
+from calib_ros.identification.leastsquares import System, triangular_factor
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 

@@ -92,7 +92,8 @@ def _start(given):
 
 def fit(given):
     """Only fit, from a start with frames: what the others below do, too."""
-    from calib_ros.identification.leastsquares import Samples, System, minimise
+    from calib_ros.identification.leastsquares import System, minimise
+    from calib_ros.identification.samples import Samples
 
     start, names, sigmas = _start(given)
     system = System((Samples(_observations(given, given.samples), *sigmas),))
@@ -109,7 +110,7 @@ class Streamed:
 
     def blocks(self, chain, names):
         """Yield weighted rows of Jacobian and residual; see `leastsquares.Samples`."""
-        from calib_ros.identification.leastsquares import Samples
+        from calib_ros.identification.samples import Samples
 
         for chunk in self.given.chunks():
             yield from Samples(_observations(self.given, chunk), *self.sigmas).blocks(chain, names)
@@ -126,7 +127,8 @@ def streamed(given):
 
 def one_by_one(given):
     """Only fit, with the same code, one sample at a time."""
-    from calib_ros.identification.leastsquares import Samples, System, minimise
+    from calib_ros.identification.leastsquares import System, minimise
+    from calib_ros.identification.samples import Samples
 
     start, names, sigmas = _start(given)
     joints, positions, rotations = given.samples

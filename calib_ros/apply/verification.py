@@ -30,12 +30,14 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -51,7 +53,7 @@ MOST = 10_000
 LOST = {'base': 2, 'tool': 1}
 """Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
 three; the turn of a tool does not move the target."""
-FAR = 0.1
+FAR = Compensator.largest_turn
 """Distance [rad or m] from commanded joint values that no correction makes."""
 UNIT = (1e-3, 1e-3)
 """Sigmas [m, rad] that weigh all samples alike."""

@@ -30,8 +30,9 @@ from scipy.spatial.transform import Rotation
 from calib_ros.errors import CalibrationError
 from calib_ros.escapes import from_cell, to_cell
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash

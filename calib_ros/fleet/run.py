@@ -211,7 +211,9 @@ def _version() -> str:
     return calib_ros.__version__
 
 
-def _done(client: Any, tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
+def _done(
+    client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
+) -> Iterator[tuple[Task, Outcome]]:
     """Yield tasks with what became of them, as they are done."""
     if not tasks:
         return

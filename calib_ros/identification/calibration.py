@@ -27,9 +27,9 @@ import calib_ros
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification import records
 from calib_ros.identification.identification import Identification
-from calib_ros.identification.leastsquares import BLOCK
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.region import Region, region_of_record
+from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (

@@ -34,7 +34,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg, special
+from scipy import special
+from scipy.linalg import lapack
 
 from calib_ros.identification.leastsquares import System, normal_equations
 from calib_ros.kinematics import effects
@@ -199,10 +200,10 @@ def posterior_of(
     own = stds[: len(every)].tolist()
     priors = {name: std for name, std in zip(every, own, strict=True) if std < np.inf}
     arm = np.s_[: len(every)]
-    mean, root, _ = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
+    mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
     doubted = []
     for weight, other in near:
-        there, its_root, _ = _solved(matrix, vector, evidence.stds(other) ** -2)
+        there, its_root = _solved(matrix, vector, evidence.stds(other) ** -2)
         doubted.append((weight, there[arm], its_root[arm] @ its_root[arm].T))
     return Posterior(
         chain,
@@ -242,15 +243,23 @@ def _few(system: System) -> tuple[System, int]:
 
 def _solved(
     matrix: FloatArray, vector: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return mean (P,), a root (P, P) of the covariance, and its log determinant."""
-    whole = matrix + np.diag(precision)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    scaled = whole * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
-    factor = linalg.cholesky(scaled, lower=True, check_finite=False)
-    inverse = linalg.solve_triangular(factor, np.diag(scale), lower=True, check_finite=False)
-    volume = 2.0 * float(np.log(scale).sum() - np.log(np.diag(factor)).sum())
-    return inverse.T @ (inverse @ vector), np.ascontiguousarray(inverse.T), volume
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (P,) and a root (P, P) of the covariance."""
+    scaled, scale = _scaled(matrix, precision)
+    inverse, failed = lapack.dtrtri(np.linalg.cholesky(scaled), lower=1)
+    assert not failed
+    inverse *= scale
+    return inverse.T @ (inverse @ vector), inverse.T
+
+
+def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return matrices (..., P, P) of unit diagonal with precisions (..., P) added, and scales."""
+    size = np.arange(len(matrix))
+    diagonal = matrix[size, size] + precision
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
+    scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
+    scaled[..., size, size] = diagonal * scale**2 + ROUNDING
+    return scaled, scale
 
 
 class _Evidence:
@@ -282,12 +291,12 @@ class _Evidence:
         size, width = self._typical.copy(), np.log(SPREAD) ** -2
         if self._own.sum() == self._member.sum():
             free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
-            mean, root, _ = _solved(self._matrix, self._vector, free)
+            mean, root = _solved(self._matrix, self._vector, free)
             surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
             self._lengthen(surely**2, 1.0, size)
         for _ in range(ROUNDS):
             weight = self._weight(size)
-            mean, root, _ = _solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
+            mean, root = _solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
             variance = (root**2).sum(axis=1)
             told = (self._member - weight * variance).sum(axis=1)
             slope = weight @ mean**2 - told - width * (size - self._typical)
@@ -297,14 +306,12 @@ class _Evidence:
             if np.abs(step).max(initial=0.0) < SETTLED:
                 break
         for k, name in enumerate(self._names):
-            none, usual = (
-                np.where(np.arange(len(size)) == k, self._typical[k] + change, size)
-                for change in (np.log(LEAST), 0.0)
-            )
-            without = self._of(none)
-            shown = self._of(size) - without > SHOWN
-            if name in considered and not shown and without - self._of(usual) > REFUTED:
-                size = none
+            if name in considered:
+                tried = np.tile(size, (3, 1))
+                tried[1:, k] = self._typical[k] + np.log(LEAST), self._typical[k]
+                here, without, usual = self._of(tried).tolist()
+                if not here - without > SHOWN and without - usual > REFUTED:
+                    size = tried[1]
         return size, self._near(size, 2.0 * np.maximum(told, 0.0) + width)
 
     def _near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
@@ -317,16 +324,14 @@ class _Evidence:
         some = np.flatnonzero(size > self._typical + np.log(LEAST))
         if not len(some):
             return [(1.0, size)]
-        found = []
-        for k in some:
-            step = np.sqrt(len(some) / slope[k]) * np.eye(len(size))[k]
-            pair = [self._within(size + step), self._within(size - step)]
-            prior = [float(np.sum(((s - self._typical) / np.log(SPREAD)) ** 2)) for s in pair]
-            upper = special.expit(
-                self._of(pair[0]) - self._of(pair[1]) + 0.5 * (prior[1] - prior[0])
-            )
-            found += [(upper / len(some), pair[0]), ((1.0 - upper) / len(some), pair[1])]
-        return found
+        steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
+        tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
+        told = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
+            axis=1
+        )
+        upper = special.expit(told[::2] - told[1::2])
+        weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
+        return list(zip(weights.tolist(), tried, strict=True))
 
     def _within(self, size: FloatArray) -> FloatArray:
         """Return sizes (G,) no further from the typical ones than any that are looked for."""
@@ -354,9 +359,16 @@ class _Evidence:
         """Return (G, P) the inverse variances of the parameters of each group."""
         return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
 
-    def _of(self, size: FloatArray) -> float:
-        """Return the logarithm of the evidence of sizes (G,), given by their logarithms."""
-        precision = self._given + self._weight(size).sum(axis=0)
-        mean, _, volume = _solved(self._matrix, self._vector, precision)
-        fit = float(self._vector @ mean) + volume
-        return 0.5 * fit - float(self._member.sum(axis=1) @ size)
+    def _of(self, sizes: FloatArray) -> FloatArray:
+        """Return the logarithm of the evidence of sizes (S, G), given by their logarithms."""
+        weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
+        scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
+        # the last row of the factor of [A b; b^T c] is L^-1 b
+        wide = np.zeros((len(sizes), scaled.shape[1] + 1, scaled.shape[1] + 1))
+        wide[:, :-1, :-1] = scaled
+        wide[:, -1, :-1] = scale * self._vector
+        wide[:, -1, -1] = 1e300  # more than any square
+        factor = np.linalg.cholesky(wide)
+        volume = 2.0 * np.log(scale / np.einsum('spp->sp', factor)[:, :-1]).sum(axis=1)
+        fit = (factor[:, -1, :-1] ** 2).sum(axis=1)
+        return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))

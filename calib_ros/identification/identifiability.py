@@ -8,6 +8,7 @@ matrix, which squares the condition number.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -45,16 +46,18 @@ def independent(
         Least share of a frame's column; of other columns RANK_TOLERANCE.
 
     """
-    basis = np.zeros((len(factor), 0))
-    kept = []
-    for name, column in zip(names, factor.T, strict=True):
-        rest = column - basis @ (basis.T @ column)
-        rest -= basis @ (basis.T @ rest)  # once more: Gram-Schmidt loses orthogonality
-        size = float(np.linalg.norm(rest))
-        placed = Parameter(name).kind in FRAME_KINDS
-        least = (frame_tolerance if placed else RANK_TOLERANCE) * float(np.linalg.norm(column))
-        if size > least and size > 0.0:
-            basis = np.column_stack([basis, rest / size])
+    least = np.where(
+        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
+    ) * np.linalg.norm(factor, axis=0)
+    basis = np.zeros(factor.shape)
+    kept: list[str] = []
+    for name, column, short in zip(names, factor.T, least.tolist(), strict=True):
+        known = basis[:, : len(kept)]
+        rest = column - known @ (known.T @ column)
+        rest -= known @ (known.T @ rest)  # once more: Gram-Schmidt loses orthogonality
+        size = math.sqrt(rest @ rest)
+        if size > short and size > 0.0:
+            basis[:, len(kept)] = rest / size
             kept.append(name)
     return tuple(kept)
 
@@ -114,9 +117,10 @@ def structurally_independent(
             shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
-        jacobian = model.jacobian(posed, approach, velocity if kind.moving else None)
+        came, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
+        jacobian = model.jacobian(posed, came, rates)
         if kind.distance:
-            line = anywhere.forward(posed, approach, kind.base, kind.tool)[:, :3, 3]
+            line = anywhere.forward(posed, came, kind.base, kind.tool)[:, :3, 3]
             if kind.plane:
                 line[:] = [0.0, 0.0, 1.0]
             line /= np.linalg.norm(line, axis=1, keepdims=True)
@@ -138,10 +142,10 @@ MEETING_STEPS = 100
 
 
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
-    """Return joint values (N, n) that bring the target to one place, and that place (3,) [m].
+    """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
     It is that of the first, of planes the height in the middle; the others are led there by damped
-    Gauss-Newton steps.
+    Gauss-Newton steps. Those few that do not arrive, stretched, are left out.
     """
     free = [2] if kind.plane else [0, 1, 2]
     driven = [j.driven for j in chain.joints]
@@ -151,13 +155,14 @@ def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, 
     wanted = np.array([0.0, 0.0, np.median(places[:, 2])]) if kind.plane else places[0]
     for _ in range(MEETING_STEPS):
         left = (wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3])[:, free]
-        if np.abs(left).max() < MEETING:
+        met = np.abs(left).max(axis=1) < MEETING
+        if met.all():
             break
         jacobian = model.jacobian(joints)[:, free] * signs
         square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(len(free))
         step = np.linalg.solve(square, left[..., np.newaxis])
         joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
-    return joints, wanted
+    return joints[met], wanted
 
 
 def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:
@@ -216,6 +221,8 @@ class Uncertainty(Shown):
 
 TRADE = 1e-4
 """Least share of a parameter in a trade to be named."""
+ROUNDING = 1e-12
+"""Length of a column beside the longest one from which on it is more than rounding."""
 
 
 def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
@@ -223,19 +230,20 @@ def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dic
 
     Moving the one, and the others by the right amounts, leaves every measured pose as it is.
     """
-    columns = dict(zip(names, factor.T, strict=True))
-    scales = {name: float(np.linalg.norm(column)) for name, column in columns.items()}
-    basis = np.array([columns[name] / (scales[name] or 1.0) for name in kept]).T
-    partners: dict[str, list[str]] = {}
-    for name in names:
-        if name in kept:
-            continue
-        if scales[name] == 0.0:
-            partners[name] = []
-            continue
-        shares = np.linalg.lstsq(basis, columns[name] / scales[name], rcond=None)[0]
-        strong = np.abs(shares) > TRADE * np.abs(shares).max()
-        partners[name] = [other for other, yes in zip(kept, strong, strict=True) if yes]
+    sizes = np.linalg.norm(factor, axis=0)
+    known = sizes > ROUNDING * sizes.max(initial=0.0)
+    scaled = factor[:, known] / sizes[known]
+    number = {
+        name: k for k, name in enumerate(n for n, yes in zip(names, known, strict=True) if yes)
+    }
+    fitted = [name for name in kept if name in number]
+    left_out = [name for name in number if name not in set(kept)]
+    basis, columns = (scaled[:, [number[n] for n in part]] for part in (fitted, left_out))
+    shares = np.abs(np.linalg.lstsq(basis, columns, rcond=None)[0])
+    strong = (shares > TRADE * shares.max(axis=0, initial=0.0)).T
+    partners: dict[str, list[str]] = {name: [] for name in names if name not in set(kept)}
+    for name, marks in zip(left_out, strong, strict=True):
+        partners[name] = [other for other, yes in zip(fitted, marks, strict=True) if yes]
     return partners
 
 

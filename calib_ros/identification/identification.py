@@ -10,24 +10,32 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
 
-from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import identifiability, mistakes, suspicions
+from calib_ros.identification.acceptance import Findings, refusals, remarks
 from calib_ros.identification.drift import chance_of_gain
-from calib_ros.identification.evidence import Posterior, considered, posterior_of
-from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.evidence import Posterior, considered
+from calib_ros.identification.fitting import (
+    Fitted,
+    Simpler,
+    excited_names,
+    fit_all,
+    require_enough,
+    some,
+)
+from calib_ros.identification.leastsquares import minimise, triangular_factor
 from calib_ros.identification.misfits import arms_own
-from calib_ros.identification.noise import Noise, noise_of
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Learned, Problem
+from calib_ros.identification.noise import Noise
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import KNOWN, Region, region_of
-from calib_ros.identification.robust import OUTLIER, Robust, reweighted, thorough_fit
+from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.start import start_frames
 from calib_ros.identification.steps import Step, find_step
@@ -35,8 +43,6 @@ from calib_ros.identification.validation import (
     Comparison,
     ParameterRow,
     compare,
-    refusals,
-    remarks,
     residuals,
     validate,
 )
@@ -45,16 +51,9 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_frame, as_html
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
-
-SOME = 500
-"""Pairs that are enough for a first fit."""
-FOLLOWED = 2.0
-"""Part of what it lacks that the geometric model does not follow: one over this."""
-HELD = 0.05
-"""Share of a parameter's variance that is its prior's from which on the prior is fitted with."""
 
 
 @dataclass(frozen=True)
@@ -199,6 +198,35 @@ class Identification(Shown):
         """Return the pairs of parameters whose correlation exceeds a threshold."""
         return identifiability.correlated(self.covariance, self.names, threshold)
 
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas.DataFrame [m, rad]; `within_95` are half widths."""
+        rows = self.parameters
+        return as_frame(
+            {
+                'parameter': [str(p.name) for p in rows],
+                'value': [p.value for p in rows],
+                'offset': [p.offset for p in rows],
+                'std': [p.std for p in rows],
+                'within_95': [p.half_width() for p in rows],
+                'unit': [p.name.unit for p in rows],
+                'status': [p.status for p in rows],
+            }
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the verdict, its reasons and what was fitted, for notebooks."""
+        before, after = (self.validation or self.fitted).figures
+        rows = [('parameter', 'offset [mm, mrad]', '± (95 %)')]
+        rows += [
+            (str(p.name), f'{1e3 * p.offset:+.4f}', f'{1e3 * (p.half_width() or 0.0):.4f}')
+            for p in self.parameters
+            if p.std is not None
+        ]
+        figures = f'RMS {before.rms_mm:.3f} → {after.rms_mm:.3f} mm, by {self.validated_by}'
+        verdict = 'accepted' if self.accepted else 'not accepted'
+        notes = (figures, *self.refusals, *self.remarks)
+        return as_html(f'{self.chain.name}: {verdict}', notes, rows)
+
     @property
     def not_excited(self) -> tuple[str, ...]:
         """Return those of them that other poses would determine."""
@@ -217,97 +245,67 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         With fewer equations than parameters.
 
     """
-    model = problem.model
+    known = None
+    if simpler is not None:
+        known = Simpler(simpler.chain, simpler.distances, simpler.noise)
     system = problem.system(problem.sets)
     structural = identifiability.structurally_independent(
-        model, problem.free, problem.kinds, system.separation_rows
+        problem.model, problem.free, problem.kinds, system.separation_rows
     )
-    priors = problem.prior_sigmas
-    determined = [name for name in structural if name not in priors]
-    _require_enough(problem, determined)
+    require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
     start = start_frames(
-        model, problem.sets, problem.sigma_position, problem.sigma_orientation, problem.loss
+        problem.model,
+        problem.sets,
+        problem.sigma_position,
+        problem.sigma_orientation,
+        problem.loss,
     )
-    wanted = [n for n in problem.free if n in structural or n in priors]
-    few = problem.system([_some(each) for each in problem.sets])
-    names = identifiability.excited(triangular_factor(start, wanted, few), wanted)
-    if len(names) < len(wanted):  # more samples may determine more
-        names = identifiability.excited(triangular_factor(start, wanted, system), wanted)
-    problem = _guarded(problem, names, triangular_factor(start, names, few), simpler)
-    rough = start
-    if simpler is not None:
-        rough = simpler.chain.with_effects([name for name, _ in model.effects])
-    elif few.count < system.count // 2:
-        few = problem.system([_some(each) for each in problem.sets])
-        rough = minimise(start, names, few, tolerance=1e-2).chain
-    fitted = _fit(problem, rough, names, simpler)
-    guarded = _guarded(problem, names, fitted.factor, simpler)
-    if guarded is not problem:  # without its outliers a session tells less
-        problem = guarded
-        fitted = _fit(problem, rough, names, simpler)
-    whole = fitted.noise.size
-    size = _told_by(fitted.noise, simpler)
-    told = _posterior(problem, fitted, names, size)
-    if _matter(problem, names, told):
-        priors = {
-            name: min(told.priors[name], problem.common_sense(name))
-            for name in names
-            if not model.owns_frame(name)
-        }
-        problem = replace(problem, learned=Learned(priors, size))
-        fitted = _fit(problem, fitted.robust.fit.chain, names, simpler, again=True)
-    robust, noise, uncertainty = fitted.robust, fitted.noise, fitted.uncertainty
-    fit = robust.fit
-    before = minimise(start, [n for n in names if model.owns_frame(n)], fitted.system)
-    explained = (
-        None if simpler is None or simpler.validation is None else simpler.validation.judged
-    )
-    validation, validated_by = validate(problem, before.chain, fit.chain, names, robust, explained)
-    parameters = _parameters(problem, fit.chain, structural, names, uncertainty)
-    chance = _chance(replace(problem, learned=None), before.chain, names, robust)
-    converged = before.converged and fit.converged and robust.settled
-    if not noise.consistent:  # targets of one stop share what the model lacks
-        whole *= _targets(problem)
+    names, factor = excited_names(problem, structural, start)
+    fitted = fit_all(problem, names, start, factor, known)
+    problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
+    before = minimise(start, [n for n in names if start.owns_frame(n)], fitted.system)
+    explained = simpler.validation.judged if simpler and simpler.validation else None
+    validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
+    parameters = _parameters(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)
-    posterior = _posterior(
-        problem,
-        fitted,
-        names,
-        whole,
-        considered(fit.chain, names),
-        rounding_errors(problem, coarse),
+    posterior = fitted.posterior(
+        _size(fitted), considered(chain, names), rounding_errors(problem, coarse)
     )
-    region = region_of(posterior, problem.sets, uncertainty.overall)
     step = find_step(problem, names, robust)
-    own = arms_own(problem, robust) if step is None else None
-    good = [distances <= OUTLIER for distances in robust.distances]
-    unsure = bool(coarse) and may_be_rounding(problem, before.chain, names, coarse, good)
-    known = {name: problem.prior_sigmas[name] for name, _ in model.effects}
-    failed = refusals(
-        problem, converged, parameters, validation, chance, region, step, own, unsure
+    found = Findings(
+        converged=before.converged and robust.fit.converged and robust.settled,
+        parameters=parameters,
+        validation=validation,
+        chance=_chance(problem, before.chain, names, robust),
+        region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
+        step=step,
+        own_behaviour=arms_own(problem, robust) if step is None else None,
+        may_be_rounding=bool(coarse)
+        and may_be_rounding(problem, before.chain, names, coarse, robust.good),
     )
+    compared = compare(before.chain, chain, problem.sets)
     result = Identification(
-        chain=fit.chain,
+        chain=chain,
         before=before.chain,
         parameters=parameters,
         names=names,
-        uncertainty=uncertainty,
-        fitted=replace(compare(before.chain, fit.chain, problem.sets), judged=~robust.outliers),
+        uncertainty=fitted.uncertainty,
+        fitted=replace(compared, judged=~robust.outliers),
         validation=validation,
         validated_by=validated_by,
-        noise=noise,
+        noise=fitted.noise,
         distances=robust.distances,
         outliers=_outliers(problem, robust),
-        gauges=_gauges(problem, fit.chain, names),
+        gauges=_gauges(problem, chain, names),
         observability=identifiability.observability(fitted.factor, system.count),
-        priors={**known, **problem.given},
+        priors=_priors(problem),
         world_frame=problem.world_frame,
         iterations=robust.iterations,
-        converged=converged,
-        chance=chance,
-        refusals=failed,
+        converged=found.converged,
+        chance=found.chance,
+        refusals=refusals(problem, found),
         posterior=posterior,
-        region=region,
+        region=found.region,
         weak=_weak(problem, parameters),
         step=step,
         remarks=remarks(problem, step, coarse),
@@ -316,102 +314,19 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     return suspicions.remarked(problem, named, another=named is result)
 
 
-@dataclass(frozen=True, eq=False)
-class _Fitted:
-    """A robust fit with what follows from its residuals."""
-
-    system: System
-    robust: Robust
-    factor: FloatArray
-    noise: Noise
-    uncertainty: identifiability.Uncertainty
-
-
-def _fit(
-    problem: Problem,
-    chain: Chain,
-    names: Sequence[str],
-    simpler: Identification | None,
-    again: bool = False,
-) -> _Fitted:
-    """Fit the named parameters from a chain that is near, or `again` from one that was fitted."""
-    system = problem.system(problem.sets)
-    if simpler is None and not again:
-        robust = thorough_fit(chain, names, system, problem.loss)
-    else:
-        distances = None if simpler is None else simpler.distances
-        robust = reweighted(chain, names, system, problem.loss, distances)
-    fit = robust.fit
-    factor = fit.normal.factor()
-    if factor is None:
-        factor = triangular_factor(fit.chain, names, system)
-    noise, uncertainty = noise_of(fit, names, system, factor)
-    return _Fitted(system, robust, factor, noise, uncertainty)
-
-
-def _posterior(
-    problem: Problem,
-    fitted: _Fitted,
-    names: Sequence[str],
-    noise: float,
-    more: Sequence[str] = (),
-    doubts: Mapping[str, float] | None = None,
-) -> Posterior:
-    """Return what the data of a fit tell, with `more` effects considered."""
-    chain, system = fitted.robust.fit.chain, fitted.system
-    return posterior_of(chain, problem.model, names, system, noise, problem.given, more, doubts)
-
-
-def _targets(problem: Problem) -> float:
-    """Return the root of how many sets see a configuration, on average."""
-    numbers = problem.configurations
+def _size(fitted: Fitted) -> float:
+    """Return the size of the noise [sigma given]; targets of one stop share what a model lacks."""
+    if fitted.noise.consistent:
+        return fitted.size
+    numbers = fitted.problem.configurations
     seen = sum(len(np.unique(each)) for each in numbers)
-    return float(np.sqrt(seen / len(np.unique(np.concatenate(numbers)))))
+    return fitted.size * float(np.sqrt(seen / len(np.unique(np.concatenate(numbers)))))
 
 
-def _told_by(noise: Noise, simpler: Identification | None) -> float:
-    """Return the size of the noise [sigma given] against which a prior is weighed.
-
-    What the geometric model lacks is no noise to it: it can follow a part of it. On measured
-    robots errors in regions left out were least with more weight on the prior, those on held-out
-    rows of the same session with less; with what is not shared by neighbours, over FOLLOWED, they
-    are those of least squares (`benchmarks/real_robots.py`).
-    """
-    if simpler is not None or noise.consistent:
-        return noise.size
-    return max(noise.size / (FOLLOWED * noise.widened), min(noise.size, 1.0))
-
-
-def _guarded(
-    problem: Problem, names: Sequence[str], factor: FloatArray, simpler: Identification | None
-) -> Problem:
-    """Return the problem with priors that keep a first fit from going astray.
-
-    `factor` (P, P) is that of some samples at the start, or of what a robust fit has left. DH
-    parameters that they tell no better than common sense does get a third of what no faulty robot
-    exceeds as a prior.
-    """
-    known = problem.prior_sigmas
-    stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
-    guards = {
-        name: problem.common_sense(name)
-        for name, std in zip(names, stds, strict=True)
-        if name not in known
-        and not problem.model.owns_frame(name)
-        and std > problem.common_sense(name)
-    }
-    if problem.learned is not None:
-        more = replace(problem.learned, priors={**problem.learned.priors, **guards})
-        return replace(problem, learned=more) if guards else problem
-    noise = 1.0 if simpler is None else _told_by(simpler.noise, None)
-    return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
-
-
-def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
-    """Tell whether priors that the data have told would change a fit without them."""
-    if problem.learned is not None or problem.model.effects:
-        return True
-    return any(posterior.held(name) > HELD for name in names if name not in problem.given)
+def _priors(problem: Problem) -> dict[str, float]:
+    """Return the priors that were known before: those of effects, and those given."""
+    known = {name: problem.prior_sigmas[name] for name, _ in problem.model.effects}
+    return {**known, **problem.given}
 
 
 def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
@@ -421,14 +336,13 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     """
     if any(each.socket for each in problem.sets):
         return None
-    good = [distances <= OUTLIER for distances in robust.distances]
     sets = [
-        _some(each.select(np.flatnonzero(which)))
-        for each, which in zip(problem.sets, good, strict=True)
+        some(each.select(np.flatnonzero(which)))
+        for each, which in zip(problem.sets, robust.good, strict=True)
     ]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
-    return chance_of_gain(before, frames, arm, problem.system(sets))
+    return chance_of_gain(before, frames, arm, problem.system(sets, learned=False))
 
 
 def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
@@ -446,17 +360,12 @@ def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ..
     )
 
 
-def _some(observations: Observations) -> Observations:
-    """Return enough pairs, evenly spread, to come close to the result and to see its rank."""
-    return observations.select(np.arange(0, len(observations), 1 + len(observations) // SOME))
-
-
 def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, list[str]]:
     """Return what each parameter that was left out trades against, seen on a part of the pairs."""
     free = problem.free
     if len(names) == len(free):
         return {}
-    few = problem.system([_some(each) for each in problem.sets])
+    few = problem.system([some(each) for each in problem.sets])
     factor = triangular_factor(chain, free, few, priors=False)
     return identifiability.trades(factor, free, names)
 
@@ -470,23 +379,6 @@ def _outliers(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
             stamp = int(each.stamps_ns[sample])
             found.append(Outlier(number, int(sample), stamp, float(distances[sample])))
     return tuple(found)
-
-
-def _require_enough(problem: Problem, names: Sequence[str]) -> None:
-    rows = configurations = 0
-    for each, kind in zip(problem.sets, problem.kinds, strict=True):
-        if not len(each):
-            raise InputError(f'there are no pairs to fit between {each.base} and {each.tool}')
-        count = int(each.configurations.max()) + 1
-        rows += count * kind.rows
-        configurations += count
-    if rows < len(names):
-        width = problem.kinds[0].rows
-        raise TooFewObservationsError(
-            configurations,
-            -(-len(names) // width),
-            f'{width} equations each for {len(names)} parameters',
-        )
 
 
 def _parameters(

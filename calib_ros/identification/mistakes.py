@@ -21,14 +21,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib_ros.identification.acceptance import MOST_OUTLIERS
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms
 from calib_ros.identification.suspects import Sets, Suspect, suspects
-from calib_ros.identification.validation import MOST_OUTLIERS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER

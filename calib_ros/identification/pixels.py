@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.leastsquares import BLOCK, Samples, seen_residuals
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.samples import BLOCK, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import View, at_the_board, require_lens, view

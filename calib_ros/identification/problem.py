@@ -255,8 +255,13 @@ class Problem(Shown):
         """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
         return (self.largest_length if Parameter(name).is_length else self.largest_angle) / 3.0
 
-    def system(self, sets: Sequence[Observations]) -> System:
-        """Return sets of observations, and the priors, as the solver takes them."""
+    def system(self, sets: Sequence[Observations], learned: bool = True) -> System:
+        """Return sets of observations, and the priors, as the solver takes them.
+
+        Without the priors that were `learned` from the data if asked.
+        """
+        if not learned and self.learned is not None:
+            return replace(self, learned=None).system(sets)
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None
@@ -281,20 +286,17 @@ class Problem(Shown):
         """
         model = self.model
         used = {name for each in self.sets for name in (each.base, each.tool)}
-        held = [f'{k}.*' for k in model.frame_names if k not in used]
+        held: set[str] = set()
         for key in model.frame_names:
             frame = model.frame(key)
-            if frame.fixed:
-                held += parameters_of(key, (*FRAME_KINDS, DELAY))
-            if frame.lens is None or frame.lens.fixed:
-                held += parameters_of(key, LENS_KINDS)
-        held += [f'{each.base}.r?' for each in self.sets if each.socket]
+            if frame.fixed or key not in used:
+                held.update(parameters_of(key, (*FRAME_KINDS, DELAY)))
+            if frame.lens is None or frame.lens.fixed or key not in used:
+                held.update(parameters_of(key, LENS_KINDS))
+        for each in self.sets:
+            held.update(parameters_of(each.base)[3:] if each.socket else ())
+        for pattern in self.fixed:
+            held.update(fnmatch.filter(model.parameter_names, pattern))
         known = dict(model.effects)
-        ordered = sorted(
-            model.parameter_names, key=lambda name: 2 * (name in known) + (name.kind == 'd')
-        )
-        return tuple(
-            name
-            for name in ordered
-            if not any(fnmatch.fnmatchcase(name, pattern) for pattern in (*self.fixed, *held))
-        )
+        names = [name for name in model.parameter_names if name not in held]
+        return tuple(sorted(names, key=lambda name: 2 * (name in known) + (name.kind == 'd')))

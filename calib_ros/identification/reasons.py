@@ -8,7 +8,7 @@ from enum import Enum, auto
 
 
 class Rule(Enum):
-    """What a result can fail; `validation.refusals` says how each is judged."""
+    """What a result can fail; `acceptance.py` says how each is judged."""
 
     ENCODER = auto()
     MOVED = auto()

@@ -14,9 +14,10 @@ import numpy as np
 from calib_ros.errors import ConfigError
 from calib_ros.identification.evidence import ROUNDING
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
 from calib_ros.kinematics.parameter import DH_KINDS, parameters_of

@@ -26,10 +26,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.leastsquares import BLOCK
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.records import packed, unpacked
+from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
@@ -175,16 +176,17 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     near, far = np.split(judge.sigma, [len(measured)])
     limit = float(near.max())
     order = np.argsort(far)
-    own = [*range(len(measured))]
-    inner = [*own, *(len(measured) + order[far[order] <= limit]).tolist()]
+    own = judge.products([*range(len(measured))])
+    inner = own + judge.products(len(measured) + order[far[order] <= limit])
     if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
         return None
     shells = len(measured) + order[far[order] > limit]
     for first in range(0, len(shells), SHELL):
-        shell = shells[first : first + SHELL].tolist()
-        if not judge.risk(shell, inner + shell) < RISK:
+        shell = shells[first : first + SHELL]
+        added = judge.products(shell)
+        if not judge.risk(added, inner + added) < RISK:
             break
-        inner += shell
+        inner = inner + added
         limit = float(judge.sigma[shell[-1]])
     share = float(np.mean(far <= limit))
     return Region(
@@ -219,12 +221,16 @@ class _Judge:
         chain, names = posterior.chain, posterior.names
         frames = [*parameters_of(ends.base), *parameters_of(ends.tool)[:3]]
         every = list(dict.fromkeys([*frames, *names]))
-        rows = ErrorModel(chain, every, ends.base, ends.tool).jacobian(joints)[:, :3]
-        column = {name: k for k, name in enumerate(every)}
+        model = ErrorModel(chain, every, ends.base, ends.tool)
+        shift = model.linearise(np.ascontiguousarray(joints.T))[2]
+        row = dict(zip(every, model.order.tolist(), strict=True))
         own = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
-        self.sigma = _length(rows[:, :, [column[name] for name in names]], posterior.square)
-        self._frames = rows[:, :, : len(frames)]
-        self._rows = rows[:, :, [column[names[k]] for k in own]]
+        found = shift[[row[name] for name in names]]
+        flat = found.reshape(len(names), -1)
+        squares = ((posterior.square @ flat) * flat).sum(axis=0).reshape(3, -1).sum(axis=0)
+        self.sigma = np.sqrt(np.maximum(squares, 0.0))
+        self._placed = len(frames)
+        self._rows = shift[[row[name] for name in [*frames, *(names[k] for k in own)]]]
         self._offsets = posterior.offsets[own]
         self._doubted = [
             (weight, mean[own], covariance[np.ix_(own, own)])
@@ -232,17 +238,23 @@ class _Judge:
         ]
         self._freedom = freedom
 
-    def risk(self, which: Sequence[int], around: Sequence[int]) -> float:
-        """Return it for some poses, in frames fitted to those around."""
-        frames, rows = self._frames[around], self._rows[around]
-        known = frames.reshape(-1, frames.shape[2])
-        taken = np.linalg.lstsq(known, rows.reshape(len(known), -1), rcond=1e-9)[0]
-        left = (self._rows[which] - self._frames[which] @ taken).reshape(-1, rows.shape[2])
-        gain = left @ self._offsets
-        slope = left.T @ gain
+    def products(self, which: Sequence[int] | NDArray[np.intp]) -> FloatArray:
+        """Return (K, K) the products of the columns with each other, over some poses."""
+        rows = self._rows[:, :, which].reshape(len(self._rows), -1)
+        return np.asarray(rows @ rows.T)
+
+    def risk(self, which: FloatArray, around: FloatArray) -> float:
+        """Return it for some poses, in frames fitted to those around; both by their products."""
+        frames, arm = np.s_[: self._placed], np.s_[self._placed :]
+        root = inverse_root(around[frames, frames], np.diag(around)[frames])
+        taken = root @ (root.T @ around[frames, arm])
+        cross = taken.T @ which[frames, arm]
+        left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
+        slope = left @ self._offsets
+        gain = float(slope @ self._offsets)
         risk = 0.0
         for weight, mean, covariance in self._doubted:
-            margin = float(slope @ mean) - 0.5 * float(gain @ gain)
+            margin = float(slope @ mean) - 0.5 * gain
             spread = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
             if spread == 0.0:
                 risk += weight * (margin <= 0.0)

@@ -62,6 +62,11 @@ class Robust:
     loss: str
 
     @property
+    def good(self) -> tuple[NDArray[np.bool_], ...]:
+        """Return (N,) which samples of each set are near enough to be no gross errors."""
+        return tuple(each <= OUTLIER for each in self.distances)
+
+    @property
     def outliers(self) -> NDArray[np.bool_]:
         """Return (N,) which samples of all sets, one after the other, are of gross error."""
         return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')

@@ -32,8 +32,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from calib_ros.identification.leastsquares import Fit, Samples, System
+from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.observations import stops
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -106,8 +107,8 @@ class _Stops:
             far, nearest = cKDTree(self.place).query(self.place, k=NEAREST + 1)
             first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < APART / 2)
-            pairs = np.sort(np.column_stack([first, second])[good], axis=1)
-            first, second = np.unique(pairs, axis=0).T
+            ends = np.sort([first[good], second[good]], axis=0)
+            first, second = np.divmod(np.unique(count * ends[0] + ends[1]), count)
         links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
         return csr_array(links + links.T)
 

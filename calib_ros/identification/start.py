@@ -26,16 +26,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
-from calib_ros.identification.leastsquares import (
-    Samples,
-    System,
-    minimise,
-    residual_arrays,
-    triangular_factor,
-)
+from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
+from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens

@@ -30,12 +30,13 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import Samples, System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.mistakes import NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains

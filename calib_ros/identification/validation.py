@@ -1,44 +1,32 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Judging a result on poses that were not fitted, and the rules of acceptance."""
+"""Judging a result on poses that were not fitted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.identification.leastsquares import (
-    System,
-    minimise,
-    residual_arrays,
-    seen_residuals,
-    without_each,
-)
+from calib_ros.identification.leastsquares import System, minimise, without_each
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.identification.region import KNOWN, Region
+from calib_ros.identification.region import KNOWN
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weights_of
-from calib_ros.identification.steps import Step
+from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_frame
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
-CERTAIN = 0.99
-"""The same to claim that the error with outliers got worse."""
-WORSE = 0.01
-"""Growth of that error that counts, of the RMS; less is how metres happen to lie."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
-MOST_OUTLIERS = 0.35
-"""Share of outliers beyond which nothing is accepted."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +125,16 @@ class Comparison(Shown):
     def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after, without outliers."""
         return self.before.figures(self.judged), self.after.figures(self.judged)
+
+    def to_frame(self) -> Any:
+        """Return the residuals of position [m] before and after as a pandas.DataFrame."""
+        columns = {
+            f'{when}_{axis}': residuals.position[:, k]
+            for when, residuals in (('before', self.before), ('after', self.after))
+            for k, axis in enumerate('xyz')
+        }
+        groups = {'configuration': self.after.configurations, 'judged': self.judged}
+        return as_frame(columns | groups)
 
     @property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
@@ -351,161 +349,6 @@ def _leave_one_place_out(
         ),
         f'leaving out one of {len(places)} places at a time',
     )
-
-
-def refusals(
-    problem: Problem,
-    converged: bool,
-    parameters: Sequence[ParameterRow],
-    validation: Comparison | None,
-    chance: float | None,
-    region: Region | None,
-    step: Step | None,
-    own: str | None,
-    unsure: bool,
-) -> tuple[Reason, ...]:
-    """Return the rules of acceptance that fail, in words.
-
-    1. The fit has converged.
-    2. The rank is full after gauges: no parameter that other poses would determine is left out.
-    3. The RMS position error on held-out poses is lower than before, by more than its
-       uncertainty (one-sided 95 %, Student's t over configurations; see `log_gain`). The
-       orientation must not get worse by the same measure.
-    4. The gain is no chance: where what is measured in succession shares errors, moved in time
-       they are explained as well (`chance.py`; 95 %).
-    5. No DH parameter is certainly (by three standard deviations) further from nominal than
-       `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
-       another robot, not a faulty one.
-    6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
-    7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains
-       more than half of the residuals (`steps.py`).
-    8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not
-       get worse: neither its mean, nor certainly (99 %) its RMS.
-    9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
-    10. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
-    """
-    failed: list[Reason] = []
-
-    def refuse(rule: Rule, text: str) -> None:
-        failed.append(Reason(rule, text))
-
-    if step is not None and step.harmful:
-        failed.append(step.reason)
-    if own is not None:
-        refuse(Rule.OWN_BEHAVIOUR, own)
-    if not converged:
-        refuse(Rule.CONVERGENCE, 'the fit has not converged')
-    not_excited = [p.name for p in parameters if p.status == 'not excited']
-    if not_excited:
-        refuse(
-            Rule.EXCITATION,
-            f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            'in more combinations, or fix these parameters',
-        )
-    for p in parameters:
-        length = p.name.is_length
-        limit = problem.largest_length if length else problem.largest_angle
-        if p.std is None or not p.name.of_dh:
-            continue
-        if abs(p.offset) - 3.0 * p.std > limit:
-            refuse(
-                Rule.COMMON_SENSE,
-                f'{p.name} is off by {1e3 * p.offset:.0f} {"mm" if length else "mrad"}, '
-                'more than a faulty robot of this kind can be: is it the right chain file?',
-            )
-    if validation is None:
-        refuse(
-            Rule.CONFIGURATIONS,
-            'there are too few configurations to judge the result on any held out',
-        )
-        return tuple(failed)
-    share = validation.outliers / len(validation.judged)
-    if share > MOST_OUTLIERS:
-        failed += [step.reason] if step is not None and not step.harmful else []
-        refuse(
-            Rule.OUTLIERS,
-            f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
-            'and what is predicted do not belong together',
-        )
-        return tuple(failed)
-    before, after = validation.figures
-    if after.rms_mm > 1e3 * problem.largest_error:
-        refuse(
-            Rule.LARGEST_ERROR,
-            f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
-            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?',
-        )
-    judged = validation.deciding
-    groups = validation.after.configurations[judged]
-    gain, limit = log_gain(
-        validation.before.position[judged], validation.after.position[judged], groups
-    )
-    if not gain > limit:
-        refuse(
-            Rule.GAIN,
-            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
-            f'before, {after.rms_mm:.3f} mm after)',
-        )
-    elif chance is not None and chance > 1.0 - CONFIDENCE:
-        refuse(
-            Rule.DRIFT,
-            'the gain may be that of a drift, as of the tracker: moved in time against the joint '
-            f'values, residuals are explained as well in {100.0 * chance:.0f} % of the shifts; '
-            'measure the poses in random order, further apart, or more of them',
-        )
-    elif region is None:
-        refuse(
-            Rule.REGION,
-            'too little is known of the arm for the correction to help: what it removes is not '
-            'larger than its own uncertainty, even at the poses measured; measure more poses, '
-            'spread further',
-        )
-    if validation.outliers:
-        first, second = validation.figures_of_all
-        pairs = (validation.before.position, validation.after.position)
-        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
-        if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
-            refuse(
-                Rule.GAIN_WITH_OUTLIERS,
-                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
-                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
-                f'{second.mean_mm:.3f} mm)',
-            )
-    if unsure:
-        refuse(
-            Rule.ROUNDING,
-            'the gain may be that of rounded joint values, which are alike in many poses: record '
-            'them with more digits',
-        )
-    if after.rms_mrad is not None:
-        gain, limit = log_gain(
-            validation.before.orientation[judged], validation.after.orientation[judged], groups
-        )
-        if gain < -limit:
-            refuse(
-                Rule.ORIENTATION,
-                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
-                f'before, {after.rms_mrad:.3f} mrad after)',
-            )
-    return tuple(failed)
-
-
-def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
-    """Return what is suspicious about a result that is not refused for it.
-
-    `coarse` are the steps [rad or m] of rounded joint values.
-    """
-    found = [] if step is None or step.harmful else [str(step)]
-    if coarse:
-        kinds = {joint.name: joint.type for joint in problem.chain.joints}
-        steps = [
-            f'{name} ({1e3 * step:.3g} {"mrad" if kinds[name] == "revolute" else "mm"})'
-            for name, step in coarse.items()
-        ]
-        found.append(
-            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
-        )
-    return tuple(found)
 
 
 def log_gain(

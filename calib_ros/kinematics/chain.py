@@ -11,9 +11,9 @@
 
 The joint value q is the one reported plus the non-geometric effects of the chain (`effects.py`).
 
-A chain is a sequence of elementary motions, each along or about one axis of the moving frame.
-`Chain.trace` walks along it once: the end of the walk is the pose, and the axes met on the way
-are all that the error model (`differential.py`) needs.
+A chain is a sequence of elementary motions, each along or about one axis of the moving frame. A
+walk along it (`walk.py`) ends in the pose, and the axes met on the way are all that the error
+model (`jacobian.py`) needs.
 
 beta is Hayati's parameter (Hayati and Mirmirani 1985; Vacarescu et al., section 2). It replaces d
 at consecutive parallel revolute axes, where a tiny tilt moves the common normal arbitrarily far.
@@ -22,16 +22,19 @@ at consecutive parallel revolute axes, where a tiny tilt moves the common normal
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Literal, TypeAlias, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.joint import ANYWHERE
+from calib_ros.kinematics.joint import Frame as Frame
+from calib_ros.kinematics.joint import Joint as Joint
+from calib_ros.kinematics.joint import JointType as JointType
 from calib_ros.kinematics.parameter import (
     DELAY,
     DH_KINDS,
@@ -41,121 +44,13 @@ from calib_ros.kinematics.parameter import (
     parameters_of,
 )
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import Walk
 from calib_ros.shown import Shown
 
 Convention: TypeAlias = Literal['standard', 'modified']
-JointType: TypeAlias = Literal['revolute', 'prismatic']
-Recorder: TypeAlias = Callable[[Parameter, bool, FloatArray, FloatArray], None]
 
 PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
-
-# One DH transform as motions (kind of parameter, rotates, axis of the moving frame).
-_MOTIONS: dict[str, tuple[tuple[str, bool, int], ...]] = {
-    'standard': (
-        ('theta', True, 2),
-        ('d', False, 2),
-        ('a', False, 0),
-        ('alpha', True, 0),
-        ('beta', True, 1),
-    ),
-    'modified': (
-        ('alpha', True, 0),
-        ('a', False, 0),
-        ('beta', True, 1),
-        ('theta', True, 2),
-        ('d', False, 2),
-    ),
-}
-
-
-@dataclass(frozen=True)
-class Joint:
-    """One row of the DH table: lengths in m, angles in rad, limits in rad or m.
-
-    `mass` [kg] and `com` [m], its centre in the frame at the link's end, serve compliance only;
-    `gear_ratio` (motor turns per joint turn, 0 when unknown) serves gear harmonics.
-    """
-
-    name: str
-    type: JointType = 'revolute'
-    a: float = 0.0
-    alpha: float = 0.0
-    d: float = 0.0
-    theta: float = 0.0
-    beta: float = 0.0
-    sign: int = 1
-    lower: float | None = None
-    upper: float | None = None
-    mass: float = 0.0
-    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    gear_ratio: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse a row that no robot has."""
-        if not self.name or '.' in self.name:
-            raise ConfigError(f'a joint needs a name without dots, not "{self.name}"')
-        if self.type not in get_args(JointType):
-            raise UnknownNameError(f'type of joint "{self.name}"', self.type, get_args(JointType))
-        if self.sign not in (1, -1):
-            raise ConfigError(f'sign of joint "{self.name}" must be 1 or -1, not {self.sign}')
-        for kind in DH_KINDS:
-            if not math.isfinite(getattr(self, kind)):
-                raise ConfigError(f'{kind} of joint "{self.name}" must be a finite number')
-        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
-            raise ConfigError(
-                f'limits of joint "{self.name}": lower {self.lower} must be less than upper '
-                f'{self.upper}'
-            )
-
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Return the joint's Denavit-Hartenberg parameters, in the order of DH_KINDS."""
-        return parameters_of(self.name, DH_KINDS)
-
-    @cached_property
-    def driven(self) -> Parameter:
-        """Return the parameter that the joint's value is added to."""
-        return Parameter(self.name, 'theta' if self.type == 'revolute' else 'd')
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """A constant transform (4, 4); `fixed` when it is known and must not be fitted.
-
-    `delay` [s] is how much later than the joints' the stamps of the device at a base frame are;
-    None where the arm stood and no delay shows. `lens` belongs to a camera that is there.
-    """
-
-    matrix: FloatArray = field(default_factory=lambda: np.eye(4))
-    fixed: bool = False
-    delay: float | None = None
-    lens: Lens | None = None
-
-    def moved(self, offsets: Mapping[str, float]) -> Frame:
-        """Return the frame shifted by x, y, z [m] and turned by rx, ry, rz [rad].
-
-        Shift and turn are along and about the axes of the frame's parent (world for the base,
-        flange for the tool), the turn through the frame's own origin.
-        """
-        matrix = self.matrix.copy()
-        matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
-        turn = np.array([offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]])
-        if turn.any():
-            matrix[:3, :3] = se3.exp_rotation(turn) @ matrix[:3, :3]
-        delay = self.delay
-        if DELAY in offsets:
-            delay = (delay or 0.0) + offsets[DELAY]
-        lens = self.lens
-        if lens is not None:
-            lens = lens.moved({kind: offsets[kind] for kind in LENS_KINDS if kind in offsets})
-        return replace(self, matrix=matrix, delay=delay, lens=lens)
-
-    def offsets(self, reference: Frame | None = None) -> FloatArray:
-        """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""
-        start = np.eye(4) if reference is None else reference.matrix
-        turn = se3.log_rotation(self.matrix[:3, :3] @ start[:3, :3].T)
-        return np.concatenate([self.matrix[:3, 3] - start[:3, 3], turn])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -193,8 +88,8 @@ class Chain(Shown):
 
     def __post_init__(self) -> None:
         """Check the names and find the parallel axes if they are not given."""
-        if str(self.convention) not in _MOTIONS:
-            raise UnknownNameError('convention', self.convention, _MOTIONS)
+        if self.convention not in get_args(Convention):
+            raise UnknownNameError('convention', self.convention, get_args(Convention))
         if not self.joints:
             raise ConfigError(f'chain "{self.name}" has no joints')
         names = self.joint_names
@@ -260,7 +155,14 @@ class Chain(Shown):
     @property
     def table(self) -> FloatArray:
         """Return the DH table (n, 5) with columns a, alpha, d, theta, beta."""
-        return np.array([[getattr(joint, kind) for kind in DH_KINDS] for joint in self.joints])
+        return np.array([(j.a, j.alpha, j.d, j.theta, j.beta) for j in self.joints])
+
+    @cached_property
+    def walk(self) -> Walk:
+        """Return what the forward kinematics needs of the links."""
+        signs = np.array([float(joint.sign) for joint in self.joints])
+        turning = np.array([joint.type == 'revolute' for joint in self.joints])
+        return Walk(self.table, signs, turning, self.convention == 'standard')
 
     def value(self, name: str) -> float:
         """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
@@ -283,7 +185,7 @@ class Chain(Shown):
 
     def frame(self, name: str) -> Frame:
         """Return a base or tool frame by its name, the identity when nothing is known."""
-        return self._frames[name] or Frame()
+        return self._frames[name] or ANYWHERE
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""
@@ -301,10 +203,11 @@ class Chain(Shown):
         """Return the chain with further effects, of no size yet."""
         known = dict(self.effects)
         added = tuple((name, 0.0) for name in dict.fromkeys(names) if name not in known)
-        chain = replace(self, effects=(*self.effects, *added))
         for name, _ in added:
-            chain._split(name)
-        return chain
+            if name.partition('.')[0] not in self._joints:
+                raise UnknownNameError('parameter', name, self.parameter_names)
+            effects.check(name, self.joint_names)
+        return _with(self, {'effects': (*self.effects, *added)})
 
     def with_effect_values(self, values: Mapping[str, float]) -> Chain:
         """Return the chain with effects of given values."""
@@ -317,27 +220,31 @@ class Chain(Shown):
         A + dA leaves SE(3).
         """
         by_owner: dict[str, dict[str, float]] = {}
+        known = self._all_parameters
         for name, offset in offsets.items():
-            self._split(name)
+            if name not in known:
+                raise UnknownNameError('parameter', name, self.parameter_names)
             named = Parameter(name)
+            if not math.isfinite(offset):
+                raise ConfigError(f'the offset of {name} must be a finite number')
             by_owner.setdefault(named.owner, {})[named.kind] = float(offset)
         joints = []
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
             values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in DH_KINDS}
-            joints.append(replace(joint, **values) if values else joint)
+            joints.append(_with(joint, values) if values else joint)
         frames = {
             key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
             for key, frame in self._frames.items()
         }
-        return replace(
-            self,
-            joints=tuple(joints),
-            base=frames.pop('base'),
-            tool=frames.pop('tool'),
-            frames=tuple(frames.items()),
-            effects=tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
-        )
+        found: dict[str, object] = {
+            'joints': tuple(joints),
+            'base': frames.pop('base'),
+            'tool': frames.pop('tool'),
+            'frames': tuple(frames.items()),
+            'effects': tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
+        }
+        return _with(self, found)
 
     def forward(
         self,
@@ -360,90 +267,42 @@ class Chain(Shown):
         rows = np.ascontiguousarray(q.T)
         came = None if approach is None else np.ascontiguousarray(approach.T)
         axes, origin = self.trace(self.effective(rows, came), base=base, tool=tool)
-        rotation = np.empty((len(q), 3, 3))
-        for k in range(3):
-            rotation[:, :, k] = axes[k].T
-        return se3.transform(rotation, np.broadcast_to(origin.T, (len(q), 3)))
+        return se3.transform(axes.transpose(2, 1, 0), origin.T)
 
     def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the joint values (n, B) that the effects make of those reported (n, B)."""
         if not self.effects:
             return q
-        phi = effects.basis(self, [name for name, _ in self.effects], q, approach)
+        names = tuple(name for name, _ in self.effects)
+        phi = effects.basis(self, names, q, approach)
         q = q.copy()
         for (name, value), row in zip(self.effects, phi, strict=True):
-            q[self.joint_names.index(Parameter(name).owner)] += value * row
+            if value:
+                q[self.joint_names.index(Parameter(name).owner)] += value * row
         return q
 
     def trace(
-        self,
-        q: FloatArray,
-        record: Recorder | None = None,
-        base: str = 'base',
-        tool: str = 'tool',
-        links: list[tuple[list[FloatArray], FloatArray]] | None = None,
-    ) -> tuple[list[FloatArray], FloatArray]:
-        """Walk along the chain, reporting the axis of every parameter.
+        self, q: FloatArray, base: str = 'base', tool: str = 'tool'
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the target's axes (3, 3, B) and origin (3, B) [m] in the world.
 
-        Parameters
-        ----------
-        q : (n, B)
-            Effective joint values, a row per joint.
-        record : callable, optional
-            Called as record(name, rotates, axis, point), once per parameter. Raising the
-            parameter by epsilon shifts everything behind it by epsilon along the axis, or turns
-            it by epsilon about the axis through the point. Arrays are (3, B) or (3, 1), in world
-            coordinates, and are not modified afterwards.
-        base, tool : str
-            Frames at the ends of the chain.
-        links : list, optional
-            Gets the axes and the origin of the frame at the end of every link.
-
-        Returns
-        -------
-        axes : list of three (3, B)
-            x, y and z axis of the target, in world coordinates.
-        origin : (3, B)
-            Its origin [m].
-
+        At effective joint values (n, B); the first index of the axes counts them.
         """
-        report: Recorder = record or (lambda name, rotates, axis, point: None)
-        start, end = self.frame(base).matrix, self.frame(tool).matrix
-        axes = [start[:3, k : k + 1] for k in range(3)]
-        origin = start[:3, 3:]
-        from_base, to_tool = parameters_of(base), parameters_of(tool)
-        for k in range(3):
-            unit = np.eye(3)[:, k : k + 1]
-            report(from_base[k], False, unit, origin)
-            report(from_base[k + 3], True, unit, origin)
-        for joint, values in zip(self.joints, q, strict=True):
-            own = dict(zip(DH_KINDS, joint.parameters, strict=True))
-            for kind, rotates, k in _MOTIONS[self.convention]:
-                report(own[kind], rotates, axes[k], origin)
-                value = getattr(joint, kind)
-                if own[kind] == joint.driven:
-                    value = value + joint.sign * values
-                elif value == 0.0:
-                    continue
-                if rotates:
-                    cos, sin = np.cos(value), np.sin(value)
-                    i, j = (k + 1) % 3, (k + 2) % 3
-                    axes[i], axes[j] = (
-                        cos * axes[i] + sin * axes[j],
-                        cos * axes[j] - sin * axes[i],
-                    )
-                else:
-                    origin = origin + value * axes[k]
-            if links is not None:
-                links.append((list(axes), origin))
-        flange = list(axes)
-        for i in range(3):
-            report(to_tool[i], False, flange[i], origin)
-            axes[i] = sum(end[k, i] * flange[k] for k in range(3))
-        origin = origin + sum(end[k, 3] * flange[k] for k in range(3))
-        for i in range(3):
-            report(to_tool[i + 3], True, flange[i], origin)
-        return axes, origin
+        frames = np.empty((len(q) + 1, 4, 3, q.shape[1]))
+        self.walk.frames(q, self.frame(base).matrix, frames)
+        target = self.at_the_tool(frames[-1], tool)
+        return target[:3], target[3]
+
+    def at_the_tool(self, flange: FloatArray, tool: str) -> FloatArray:
+        """Return the frame (4, 3, B) of a tool from that of the flange (4, 3, B)."""
+        end = self.frame(tool).matrix
+        return np.asarray((end.T @ flange.reshape(4, -1)).reshape(flange.shape))
+
+    def ends(self, q: FloatArray) -> FloatArray:
+        """Return the frames (n, 4, 3, B) at the ends of the links: axes and origin [m]."""
+        found = np.empty((2, len(q) + 1, 4, 3, q.shape[1]))
+        self.walk.frames(q, self.frame('base').matrix, found[0], found[1])
+        return found[1, :-1]
 
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw joint values (count, n) within the limits, +-180 degrees or +-0.5 m by default."""
@@ -461,17 +320,15 @@ class Chain(Shown):
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
+        if name not in self._all_parameters:
+            raise UnknownNameError('parameter', name, self.parameter_names)
         named = Parameter(name)
-        owner, kind = named.owner, named.kind
-        if owner in self._frames and kind in (*FRAME_KINDS, DELAY, *LENS_KINDS):
-            return self.frame(owner), kind
-        joint = self._joints.get(owner)
-        if joint is not None and kind in DH_KINDS:
-            return joint, kind
-        if joint is not None and name in self._effect_values:
-            effects.check(name, self.joint_names)
-            return joint, kind
-        raise UnknownNameError('parameter', name, self.parameter_names)
+        return self._joints.get(named.owner) or self.frame(named.owner), named.kind
+
+    @cached_property
+    def _all_parameters(self) -> frozenset[str]:
+        """Return the names of all parameters that joints, frames and effects may have."""
+        return _parameters(self.joint_names, self.frame_names, tuple(self._effect_values))
 
     @cached_property
     def _frames(self) -> Mapping[str, Frame | None]:
@@ -484,3 +341,28 @@ class Chain(Shown):
     @cached_property
     def _effect_values(self) -> Mapping[str, float]:
         return dict(self.effects)
+
+
+@lru_cache(maxsize=64)
+def _parameters(
+    joints: tuple[str, ...], frames: tuple[str, ...], fitted: tuple[str, ...]
+) -> frozenset[str]:
+    placed = (*FRAME_KINDS, DELAY, *LENS_KINDS)
+    return frozenset(
+        (
+            *(f'{frame}.{kind}' for frame in frames for kind in placed),
+            *(f'{joint}.{kind}' for joint in joints for kind in DH_KINDS),
+            *fitted,
+        )
+    )
+
+
+Value = TypeVar('Value', Joint, Chain)
+
+
+def _with(value: Value, changes: dict[str, object]) -> Value:
+    """Return a value with other numbers in it: what was checked is not checked again."""
+    found = object.__new__(type(value))
+    known = vars(value)
+    vars(found).update({name: known[name] for name in value.__dataclass_fields__} | changes)
+    return found

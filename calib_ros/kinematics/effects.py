@@ -21,9 +21,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
@@ -95,6 +97,8 @@ def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
 
 
 WAVES = ('sin', 'cos')
+ROUNDING = 1e-12
+"""Share of gravity below which what turns a joint is a rounding error."""
 
 
 def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:
@@ -149,66 +153,73 @@ def basis(
     `approach` (n, B) holds the signs of the velocity with which each joint came to its value;
     without it no backlash shows.
     """
-    phi = np.empty((len(names), q.shape[1]))
-    number = {name: i for i, name in enumerate(chain.joint_names)}
-    torques: Torques | None = None
-    for row, name in enumerate(names):
-        first, rest = Parameter(name).effect
-        i = number[Parameter(name).owner]
-        if first == 'ratio':
-            phi[row] = q[i]
-        elif first == 'coupling':
-            phi[row] = q[number[rest]]
-        elif first == 'sin':
-            phi[row] = np.sin(float(rest) * q[i])
-        elif first == 'cos':
-            phi[row] = np.cos(float(rest) * q[i])
-        elif first == 'backlash':
-            phi[row] = 0.0 if approach is None else approach[i]
-        else:
-            torques = torques or Torques(chain, q)
-            phi[row] = (
-                torques.of_weight(i, number[rest]) if first == 'gravity' else torques.of_masses(i)
-            )
+    phi = np.zeros((len(names), q.shape[1]))
+    for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
+        if kind == 'ratio':
+            phi[rows] = q[joints]
+        elif kind == 'coupling':
+            phi[rows] = q[others.astype(int)]
+        elif kind in WAVES:
+            wave = np.sin if kind == 'sin' else np.cos
+            phi[rows] = wave(others[:, np.newaxis] * q[joints])
+        elif kind == 'backlash' and approach is not None:
+            phi[rows] = approach[joints]
+        elif kind in ('gravity', 'compliance'):
+            phi[rows] = _torques(chain, q, joints, others if kind == 'gravity' else None)
     return phi
 
 
-class Torques:
-    """Torques of gravity on the joints of a chain at joint values (n, B)."""
+@lru_cache(maxsize=256)
+def _by_kind(
+    names: tuple[str, ...], joint_names: tuple[str, ...]
+) -> dict[str, tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]]:
+    """Return by kind of effect the rows, the joints, and the harmonics or other joints."""
+    number = {name: i for i, name in enumerate(joint_names)}
+    found: dict[str, list[tuple[int, int, float]]] = {}
+    for row, name in enumerate(names):
+        first, rest = Parameter(name).effect
+        joint = Parameter(name).owner
+        other = number[rest] if rest in number else float(rest or 0)
+        found.setdefault(first, []).append((row, number[joint], other))
+    return {
+        kind: (np.array(rows), np.array(joints), np.array(others, dtype=float))
+        for kind, (rows, joints, others) in (
+            (kind, zip(*each, strict=True)) for kind, each in found.items()
+        )
+    }
 
-    def __init__(self, chain: Chain, q: FloatArray) -> None:
-        self._chain = chain
-        self._axes: dict[str, FloatArray] = {}
-        self._points: dict[str, FloatArray] = {}
-        self._links: list[tuple[list[FloatArray], FloatArray]] = []
 
-        def record(name: Parameter, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-            if name.kind == 'theta':
-                self._axes[name.owner], self._points[name.owner] = axis, point
+def _torques(
+    chain: Chain, q: FloatArray, joints: NDArray[np.intp], ends: FloatArray | None
+) -> FloatArray:
+    """Return torques of gravity (E, B) on joints at joint values (n, B).
 
-        chain.trace(q, record, links=self._links)
-        direction = np.asarray(chain.gravity) / np.linalg.norm(chain.gravity)
-        self._down = chain.frame('base').matrix[:3, :3] @ direction
-
-    def of_weight(self, joint: int, end: int) -> FloatArray:
-        """Return the torque (B,) [m] on a joint of a unit weight at the end of another's link."""
-        return self._about(joint, self._links[end][1])
-
-    def of_masses(self, joint: int) -> FloatArray:
-        """Return the torque (B,) [N m] on a joint of all masses that it carries."""
-        weight = float(np.linalg.norm(self._chain.gravity))
-        total = np.zeros(1)
-        for (axes, end), link in list(zip(self._links, self._chain.joints, strict=True))[joint:]:
-            if link.mass:
-                point = end + sum(link.com[i] * axes[i] for i in range(3))
-                total = total + link.mass * weight * self._about(joint, point)
-        return total
-
-    def _about(self, joint: int, point: FloatArray) -> FloatArray:
-        name = self._chain.joints[joint].name
-        arm = point - self._points[name]
-        x, y, z = self._down
-        moment = (arm[1] * z - arm[2] * y, arm[2] * x - arm[0] * z, arm[0] * y - arm[1] * x)
-        axis = self._axes[name]
-        sign = self._chain.joints[joint].sign  # the work is done along the reported value
-        return np.asarray(sign * (axis[0] * moment[0] + axis[1] * moment[1] + axis[2] * moment[2]))
+    Of a unit weight [m] at the `ends` (E,) of links, or [N m] of all masses that they carry.
+    """
+    start = chain.frame('base').matrix
+    found = np.empty((2, len(q) + 1, 4, 3, q.shape[1]))
+    chain.walk.frames(q, start, found[0], found[1])
+    down = start[:3, :3] @ np.asarray(chain.gravity)
+    # a weight along g at r turns the axis u through c by u . ((r - c) x g) = (r - c) . (g x u)
+    axes, points = found[0, :-1, 2], found[0, :-1, 3]
+    x, y, z = down
+    turned = np.stack(
+        [
+            y * axes[:, 2] - z * axes[:, 1],
+            z * axes[:, 0] - x * axes[:, 2],
+            x * axes[:, 1] - y * axes[:, 0],
+        ],
+        axis=1,
+    )
+    turned[np.abs(turned) < ROUNDING * np.linalg.norm(down)] = 0.0  # of a vertical axis
+    turned *= chain.walk.signs[..., np.newaxis]
+    places = found[1, :-1]
+    if ends is not None:
+        arms = places[ends.astype(int), 3] - points[joints]
+        return np.asarray(np.einsum('ecb,ecb->eb', arms, turned[joints]) / np.linalg.norm(down))
+    masses = np.array([joint.mass for joint in chain.joints])
+    centres = np.einsum('ik,ikcb->icb', [(*joint.com, 1.0) for joint in chain.joints], places)
+    carried = np.arange(len(masses)) >= joints[:, np.newaxis]  # (E, n)
+    moments = np.einsum('ei,i,icb->ecb', carried, masses, centres)
+    moments -= (carried @ masses)[:, np.newaxis, np.newaxis] * points[joints]
+    return np.asarray(np.einsum('ecb,ecb->eb', moments, turned[joints]))

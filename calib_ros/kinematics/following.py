@@ -150,12 +150,11 @@ class Follower:
         A joint that would go beyond a limit is held there, and the others do without it.
         """
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
-        shape = (3, q.shape[1])
         task = _Task(
             q,
             approach,
-            np.stack([np.broadcast_to(axis, shape) for axis in axes]),
-            np.broadcast_to(origin, shape),
+            axes,
+            origin,
             np.zeros(q.shape, dtype=bool),
             np.zeros_like(q),
         )

@@ -9,7 +9,7 @@ i - 1 (their eq. 3 and 4). Moved to the world, the link errors add up to the pos
 
 (eq. 6 as printed adds the Delta_i without moving them; `docs/model.md` lists the errata). Every
 Denavit-Hartenberg parameter is one elementary motion along or about one axis u through a point c,
-both met by `Chain.trace`. So the twist needs no table, for either convention:
+both met by a walk along the chain. So the twist needs no table, for either convention:
 
     translation (a, d)              dp = u              domega = 0
     rotation (alpha, theta, beta)   dp = u x (p - c)    domega = u
@@ -22,9 +22,9 @@ Arrays are laid out (parameter, component, sample): each operation runs over man
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,12 +64,11 @@ class ErrorModel:
         self.chain = chain
         self.names = tuple(names)
         self._ends = (base, tool)
-        driven = tuple(joint.driven for joint in chain.joints)
+        turning = tuple(bool(turns) for turns in chain.walk.turning)
         fitted = tuple(name for name, _ in chain.effects if name in self.names)
-        self._layout = _layout(
-            self.names, chain.joint_names, driven, chain.frame_names, fitted, self._ends
-        )
-        self._signs = {joint.name: joint.sign for joint in chain.joints}
+        standard = chain.convention == 'standard'
+        joints = tuple(zip(chain.joint_names, turning, strict=True))
+        self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
         self.rotations = self._layout.rotations
         """Number of rotational parameters; they come first in the arrays of `linearise`."""
         self.order = self._layout.order
@@ -80,7 +79,7 @@ class ErrorModel:
         q: FloatArray,
         approach: FloatArray | None = None,
         velocity: FloatArray | None = None,
-    ) -> tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return pose and derivatives for one block of samples.
 
         Parameters
@@ -94,8 +93,8 @@ class ErrorModel:
 
         Returns
         -------
-        axes : list of three (3, B)
-            The target's x, y and z axis.
+        axes : (3, 3, B)
+            The target's x, y and z axis; the first index counts them.
         origin : (3, B)
             Its position [m].
         shift : (P + 1, 3, B)
@@ -105,50 +104,49 @@ class ErrorModel:
             Derivative of the orientation as a rotation vector in the world. Likewise.
 
         """
-        samples, rotations, row = q.shape[1], self.rotations, self._layout.row
-        shift = np.empty((len(row) + 1, 3, samples))
-        turn = np.empty((rotations + 1, 3, samples))
-        arm = np.empty((rotations, 3, samples))
-        for k in self._layout.still:
-            (turn if k < rotations else shift)[k] = 0.0
-            if k < rotations:
-                arm[k] = 0.0
-        fitted = self._layout.effects
-        phi: dict[str, FloatArray] = {}
-        if fitted:
-            rows = effects.basis(self.chain, fitted, q, approach)
-            phi = dict(zip(fitted, rows, strict=True))
-
-        late = None
-        delay = Parameter(self._ends[0], DELAY)
-        if velocity is not None and delay in row:
-            late = _Twist(self.chain, velocity)
-
-        def put(k: int, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-            if rotates:
-                turn[k] = axis
-                arm[k] = point
-            else:
-                shift[k] = axis
-
-        def record(name: Parameter, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-            k = row.get(name)
-            if k is not None:
-                put(k, rotates, axis, point)
-            for effect in self._layout.driven.get(name, ()):
-                sign = self._signs[Parameter(effect).owner]
-                put(row[effect], rotates, axis * (sign * phi[effect]), point)
-            if late is not None:
-                late.add(name, rotates, axis, point)
-
-        effective = self.chain.effective(q, approach)
-        axes, origin = self.chain.trace(effective, record, *self._ends)
-        np.subtract(origin, arm, out=arm)
-        cross(turn[:-1], arm, shift[:rotations])
-        if late is not None:
-            k = row[delay]
-            turn[k], shift[k] = late.of(origin)
-        return axes, origin, shift, turn
+        layout, walk, base = self._layout, self.chain.walk, self.chain.frame(self._ends[0]).matrix
+        count, samples = q.shape
+        phi = None
+        if layout.effects:
+            phi = effects.basis(self.chain, layout.effects, q, approach)
+        # frames before the joints, of the flange, of the world at the base, of the flange's axes
+        # at the target
+        frames = np.empty((count + 3, 4, 3, samples))
+        walk.frames(self.chain.effective(q, approach), base, frames[: count + 1])
+        target = self.chain.at_the_tool(frames[count], self._ends[1])
+        frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
+        frames[count + 1, 3] += base[:3, 3, np.newaxis]
+        frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]
+        if layout.bent and walk.beta.any():  # a and alpha come before beta
+            behind = frames[layout.behind]
+            behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
+            behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
+        flat = frames.reshape(-1, 3, samples)
+        axes = flat[layout.axes]
+        levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
+        cross(axes, target[3] - flat[layout.points], levers[:-1])
+        shift = np.empty((len(layout.row) + 1, 3, samples))
+        turn = np.empty((self.rotations + 1, 3, samples))
+        np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
+        np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
+        np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')
+        for k in layout.still:
+            (turn if k < self.rotations else shift)[k] = 0.0
+        if phi is not None:
+            phi *= walk.signs[layout.joints]
+            shift[layout.driven] *= phi[:, np.newaxis]
+            turning = layout.driven < self.rotations
+            turn[layout.driven[turning]] *= phi[turning, np.newaxis]
+        if velocity is not None and layout.delay is not None:
+            rates = -walk.signs * velocity
+            turning = walk.turning
+            driven, points = frames[:count, 2], frames[:count, 3]
+            turn[layout.delay] = np.einsum('jb,jcb->cb', rates[turning], driven[turning])
+            moved = np.empty_like(driven)
+            cross(driven, target[3] - points, moved)
+            moved[~turning] = driven[~turning]
+            shift[layout.delay] = np.einsum('jb,jcb->cb', rates, moved)
+        return target[:3], target[3], shift, turn
 
     def jacobian(
         self,
@@ -176,85 +174,107 @@ class _Layout(NamedTuple):
     """Where the columns of parameters stand.
 
     `row` of each parameter, rotations first, of which there are so many; `order` of the rows in
-    the order of the names; the `effects` among them, and which of them every joint's parameter
-    drives; `still` the rows of what does not move a target between these frames.
+    the order of the names. Of the rows of all frames, four each, `axes` and `points` are those
+    that something turns about; `levers` (of these), `shifts` and `turns` the ones that each
+    parameter takes, `still` those that move nothing. `behind` are the frames behind the constant
+    part of each link, `bent` where something goes along or about x there; `effects` stand among
+    the parameters, with the rows `driven` and the `joints` that they drive; `delay` is the row of
+    a delay.
     """
 
     row: Mapping[str, int]
     rotations: int
     order: NDArray[np.intp]
-    effects: tuple[str, ...]
-    driven: Mapping[str, Sequence[str]]
+    axes: NDArray[np.intp]
+    points: NDArray[np.intp]
+    levers: NDArray[np.intp]
+    shifts: NDArray[np.intp]
+    turns: NDArray[np.intp]
     still: tuple[int, ...]
+    behind: slice
+    bent: bool
+    effects: tuple[str, ...]
+    driven: NDArray[np.intp]
+    joints: NDArray[np.intp]
+    delay: int | None
+
+
+Line: TypeAlias = tuple[int | None, int, bool]
+"""Frame of a walk, None for nowhere; axis along or about which something moves; if it turns."""
+
+
+def _lines(
+    joints: Mapping[str, int],
+    standard: bool,
+    frames: Sequence[str],
+    ends: tuple[str, str],
+) -> dict[str, Line]:
+    """Return along or about which line of a walk each parameter of joints and frames moves."""
+    at = {ends[0]: len(joints) + 1, ends[1]: len(joints) + 2}
+    found: dict[str, Line] = {}
+    for frame in frames:
+        for k, name in enumerate(parameters_of(frame)):
+            found[name] = (at.get(frame), k % 3, k > 2)
+        found[Parameter(frame, DELAY)] = (None, 0, True)
+        found |= dict.fromkeys(parameters_of(frame, LENS_KINDS), (None, 0, False))
+    along = {'a': 0, 'alpha': 0, 'beta': 1}
+    for joint, i in joints.items():
+        for name in parameters_of(joint, DH_KINDS):
+            here = i + 1 if standard and name.kind in along else i
+            found[name] = (here, along.get(name.kind, 2), name.kind in ANGLES)
+    return found
 
 
 @lru_cache(maxsize=64)
 def _layout(
     names: tuple[str, ...],
-    joints: tuple[str, ...],
-    driven: tuple[Parameter, ...],
+    joints: tuple[tuple[str, bool], ...],
+    standard: bool,
     frames: tuple[str, ...],
     fitted: tuple[str, ...],
     ends: tuple[str, str],
 ) -> _Layout:
-    """Return the layout of named parameters; each joint drives one of its own."""
-    rotates: dict[str, bool] = {}
-    for frame in frames:
-        rotates |= {name: name.kind.startswith('r') for name in parameters_of(frame)}
-        rotates[Parameter(frame, DELAY)] = True
-        rotates |= dict.fromkeys(parameters_of(frame, LENS_KINDS), False)
-    for joint in joints:
-        rotates |= {name: name.kind in ANGLES for name in parameters_of(joint, DH_KINDS)}
-    moves: dict[str, list[str]] = {}
-    for name in fitted:
-        drives = driven[joints.index(Parameter(name).owner)]
-        rotates[name] = rotates[drives]
-        moves.setdefault(drives, []).append(name)
+    """Return the layout of named parameters of joints (name, turning), frames and effects."""
+    number = {joint: i for i, (joint, _) in enumerate(joints)}
+    turning = [turns for _, turns in joints]
+    lines = _lines(number, standard, frames, ends)
+    owners = [number[Parameter(name).owner] for name in fitted]
+    lines |= {name: (i, 2, turning[i]) for name, i in zip(fitted, owners, strict=True)}
     for name in names:
-        if name not in rotates:
-            raise UnknownNameError('parameter', name, rotates)
-    turning = [name for name in names if rotates[name]]
-    shifting = [name for name in names if not rotates[name]]
-    row = {name: k for k, name in enumerate(turning + shifting)}
-    elsewhere = set(frames) - set(ends)
-    still = [
-        k
-        for name, k in row.items()
-        if Parameter(name).kind in (DELAY, *LENS_KINDS) or Parameter(name).owner in elsewhere
-    ]
-    order = np.array([row[name] for name in names], dtype=np.intp)
-    order.setflags(write=False)
-    return _Layout(row, len(turning), order, fitted, moves, tuple(still))
+        if name not in lines:
+            raise UnknownNameError('parameter', name, lines)
+    ordered = sorted(names, key=lambda name: not lines[name][2])
+    row = {name: k for k, name in enumerate(ordered)}
+    rotations = sum(lines[name][2] for name in names)
+    taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
+    moved = [lines[name][0] is not None for name in ordered]
+    # turned about itself the target stays where it is
+    away = [lines[name][0] not in (None, len(joints) + 2) for name in ordered[:rotations]]
+    axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
+    levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
+    return _Layout(
+        row,
+        rotations,
+        _indices(row[name] for name in names),
+        _indices(axes),
+        _indices(k // 4 * 4 + 3 for k in axes),
+        _indices(levers),
+        _indices(taken[rotations:]),
+        _indices(taken[:rotations]),
+        tuple(k for k, yes in enumerate(moved) if not yes),
+        slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
+        any(Parameter(name).kind in ('a', 'alpha') for name in names),
+        fitted,
+        _indices(row[name] for name in fitted),
+        _indices(owners),
+        row.get(Parameter(ends[0], DELAY)),
+    )
 
 
-class _Twist:
-    """The target's velocity, with the sign reversed: what a delay of one second would change."""
-
-    def __init__(self, chain: Chain, velocity: FloatArray) -> None:
-        self._rates: dict[str, FloatArray] = {
-            joint.driven: -joint.sign * values
-            for joint, values in zip(chain.joints, velocity, strict=True)
-        }
-        self._turn, self._shift = np.zeros((2, 3, velocity.shape[1]))
-
-    def add(self, name: str, rotates: bool, axis: FloatArray, point: FloatArray) -> None:
-        """Add what the motion of one joint does."""
-        rate = self._rates.get(name)
-        if rate is None:
-            return
-        if not rotates:
-            self._shift += rate * axis
-            return
-        self._turn += rate * axis
-        moment = np.empty_like(self._shift)
-        cross(np.broadcast_to(axis, moment.shape), np.broadcast_to(point, moment.shape), moment)
-        self._shift -= rate * moment
-
-    def of(self, origin: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return turn and shift (3, B) of a target at a position (3, B)."""
-        shift = np.empty_like(self._shift)
-        cross(self._turn, np.broadcast_to(origin, shift.shape), shift)
-        return self._turn, shift + self._shift
+def _indices(numbers: Iterable[int]) -> NDArray[np.intp]:
+    found = np.array([*numbers], dtype=np.intp)
+    found.setflags(write=False)
+    return found
 
 
 def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:
@@ -265,15 +285,15 @@ def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:
         out[..., k, :] -= first[..., j, :] * second[..., i, :]
 
 
-def orientation_error(measured: FloatArray, axes: Sequence[FloatArray]) -> FloatArray:
+def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
     """Return the rotation vector (3, B) in world axes that turns the model onto the measurement.
 
     Parameters
     ----------
     measured : (3, 3, B)
         Measured rotation matrices; the first index counts their columns.
-    axes : three (3, B)
-        Columns of the model's rotation matrices.
+    model : (3, 3, B)
+        The same of the model.
 
     Notes
     -----
@@ -281,7 +301,6 @@ def orientation_error(measured: FloatArray, axes: Sequence[FloatArray]) -> Float
     1/2 sum_k r_k x m_k, which is as long as log(R^T R_measured).
 
     """
-    model = np.stack([np.broadcast_to(axis, measured.shape[1:]) for axis in axes])
     parts = np.empty_like(model)
     cross(model, measured, parts)
     sine_vector = 0.5 * parts.sum(axis=0)

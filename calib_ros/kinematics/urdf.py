@@ -248,14 +248,8 @@ def _clean_angle(angle: float) -> float:
 
 def _ends(chain: Chain) -> FloatArray:
     """Return the frames (n, 4, 4) at the ends of the links at zero."""
-    links: list[tuple[list[FloatArray], FloatArray]] = []
-    chain.trace(np.zeros((len(chain.joints), 1)), links=links)
-    return np.array(
-        [
-            se3.transform(np.column_stack(axes), np.broadcast_to(origin, (3, 1))[:, 0])
-            for axes, origin in links
-        ]
-    )
+    found = chain.ends(np.zeros((len(chain.joints), 1)))[..., 0]
+    return se3.transform(np.swapaxes(found[:, :3], 1, 2), found[:, 3])
 
 
 def _on_axes(chain: Chain) -> FloatArray:

@@ -104,7 +104,7 @@ def table(path):
     problem = Problem(ARM, read.fitted[0], read.held_out, more=read.fitted[1:])
     for observations in (*read.fitted, *read.held_out):
         if observations.distances is None:
-            from calib_ros.identification.leastsquares import Samples
+            from calib_ros.identification.samples import Samples
 
             Samples(observations, problem.sigma_position, problem.sigma_orientation)
 

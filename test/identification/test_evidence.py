@@ -8,8 +8,9 @@ import pytest
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.evidence import TYPICAL, considered
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter

@@ -14,14 +14,13 @@ from calib_ros.identification import leastsquares
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.identification import Problem, identify, residuals
 from calib_ros.identification.leastsquares import (
-    BLOCK,
-    Samples,
     System,
     minimise,
     normal_equations,
     triangular_factor,
 )
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.samples import BLOCK, Samples
 from calib_ros.identification.start import _shortest, start_frames
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint

@@ -16,10 +16,10 @@ from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, meas
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.leastsquares import seen_residuals
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.pixels import PixelSamples
 from calib_ros.identification.resection import board_poses, resect
+from calib_ros.identification.samples import seen_residuals
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_yaml, load_chain
 from calib_ros.kinematics.parameter import Parameter

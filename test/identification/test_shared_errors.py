@@ -8,8 +8,10 @@ from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification import leastsquares, shared_errors
+from calib_ros.identification import samples as samples_module
+from calib_ros.identification import shared_errors
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import System
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, noise_in_words
 
@@ -156,7 +158,7 @@ def test_covariances_of_the_samples_change_nothing_when_equal():
 
 def shifted_run(monkeypatch, count, **constants):
     for name, value in constants.items():
-        module = leastsquares if name == 'BLOCK' else shared_errors
+        module = samples_module if name == 'BLOCK' else shared_errors
         monkeypatch.setattr(module, name, value)
     return run(7, count, drift=10.0)[1]
 
@@ -169,11 +171,11 @@ def test_blocks_and_samples_of_a_stop_do_not_change_the_result(monkeypatch):
 
 @pytest.mark.parametrize('block', [1, 24, 96])  # 24: the last one holds a single stop
 def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypatch, block):
-    monkeypatch.setattr(leastsquares, 'BLOCK', block)
+    monkeypatch.setattr(samples_module, 'BLOCK', block)
     rng = np.random.default_rng(11)
-    samples = leastsquares.Samples(measure(UR10E, along_path(96, rng)[:73], rng, *NOISE), *NOISE)
+    samples = samples_module.Samples(measure(UR10E, along_path(96, rng)[:73], rng, *NOISE), *NOISE)
     names = UR10E.parameter_names
-    system, kernels = leastsquares.System((samples,)), [(3.0, 2.0), (20.0, 0.5)]
+    system, kernels = System((samples,)), [(3.0, 2.0), (20.0, 0.5)]
     apart = np.abs(np.subtract.outer(np.arange(73), np.arange(73)))
     kernel = sum(size * np.exp(-apart / length) for length, size in kernels)
     rows = samples.rows_of(UR10E, names)[..., :-1]

@@ -14,8 +14,8 @@ from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.leastsquares import Samples, residual_arrays
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain

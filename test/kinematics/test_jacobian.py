@@ -118,7 +118,7 @@ def test_orientation_error_turns_the_model_onto_the_measurement(seed, angle):
     vector = angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)
     measured = se3.exp_rotation(vector) @ model
     columns = np.ascontiguousarray(measured.transpose(2, 1, 0))
-    found = orientation_error(columns, list(np.ascontiguousarray(model.transpose(2, 1, 0)))).T
+    found = orientation_error(columns, np.ascontiguousarray(model.transpose(2, 1, 0))).T
     np.testing.assert_allclose(se3.exp_rotation(found) @ model, measured, rtol=0, atol=1e-7)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), angle, rtol=1e-6, atol=1e-15)
 

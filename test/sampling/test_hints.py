@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from streams import POSE, START, TRACKER, S, joint_state, pose, stamps, stops, sweep
+from streams import START, S, hear, stamps, stops, sweep
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import InputError
@@ -51,15 +51,8 @@ def heard(
     positions = seen.positions + swing[:, np.newaxis]
     measured = measured + late(measured)
     made = CalibrationSession(UR5E, Settings(**more))
-    events = [(time, 0, k) for k, time in enumerate(times.tolist())]
-    events += [(time, 1, k) for k, time in enumerate(measured.tolist())]
-    known, others = stamps(times).tolist(), stamps(measured).tolist()
-    for _, kind, k in sorted(events):
-        if kind:
-            message = pose(others[k], positions[k], seen.rotations[k])
-            made.take(TRACKER, POSE, message)
-        else:
-            made.take_joints(joint_state(known[k], UR5E.joint_names, joints[k].tolist()))
+    known = times, stamps(times), joints
+    hear(made, known, (measured, stamps(measured), positions, seen.rotations))
     return made
 
 

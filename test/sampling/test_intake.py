@@ -114,12 +114,8 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
         end = begin + int(rng.choice([1, 10, 100, 400, 3000]))
         one.recording = many.recording = bool(rng.random() < 0.8)
         assert feed(many, messages[begin:end], STORE.deserialize_cdr) == []
-        for stream, data in messages[begin:end]:
-            message = STORE.deserialize_cdr(data, stream.type)
-            if stream.source is None:
-                one.take_joints(message)
-            else:
-                one.take(stream.source, stream.type, message)
+        for message in messages[begin:end]:
+            assert feed(one, [message], STORE.deserialize_cdr) == []
         assert outcome(one) == outcome(many)
         begin = end
     one.finish()

@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The rules of acceptance: what a result must show before it may replace the nominal parameters.
+
+1. The fit has converged.
+2. The rank is full after gauges: no parameter that other poses would determine is left out.
+3. The RMS position error on held-out poses is lower than before, by more than its uncertainty
+   (one-sided 95 %, Student's t over configurations; see `log_gain`). The orientation must not get
+   worse by the same measure.
+4. The gain is no chance: where what is measured in succession shares errors, moved in time they
+   are explained as well (`drift.py`; 95 %).
+5. No DH parameter is certainly (by three standard deviations) further from nominal than
+   `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
+   another robot, not a faulty one.
+6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
+7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains more
+   than half of the residuals (`steps.py`).
+8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not get
+   worse: neither its mean, nor certainly (99 %) its RMS.
+9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
+10. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.region import Region
+from calib_ros.identification.steps import Step
+from calib_ros.identification.validation import CONFIDENCE, Comparison, ParameterRow, log_gain
+
+CERTAIN = 0.99
+"""Confidence to claim that the error with outliers got worse."""
+WORSE = 0.01
+"""Growth of that error that counts, of the RMS; less is how metres happen to lie."""
+MOST_OUTLIERS = 0.35
+"""Share of outliers beyond which nothing is accepted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the rules go by: of a fit, of poses left out, and of what else explains the gain."""
+
+    converged: bool
+    parameters: Sequence[ParameterRow]
+    validation: Comparison | None
+    chance: float | None
+    region: Region | None
+    step: Step | None
+    own_behaviour: str | None
+    may_be_rounding: bool
+
+
+def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
+    """Return the rules of acceptance that fail, in words."""
+    failed = [*_of_the_fit(problem, found)]
+    validation = found.validation
+    if validation is None:
+        text = 'there are too few configurations to judge the result on any held out'
+        return (*failed, Reason(Rule.CONFIGURATIONS, text))
+    share = validation.outliers / len(validation.judged)
+    if share > MOST_OUTLIERS:
+        if found.step is not None and not found.step.harmful:
+            failed.append(found.step.reason)
+        text = (
+            f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
+            'and what is predicted do not belong together'
+        )
+        return (*failed, Reason(Rule.OUTLIERS, text))
+    return (*failed, *_of_the_gain(problem, found, validation), *_of_harm(found, validation))
+
+
+def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
+    """Yield what is wrong whatever the error on poses left out."""
+    if found.step is not None and found.step.harmful:
+        yield found.step.reason
+    if found.own_behaviour is not None:
+        yield Reason(Rule.OWN_BEHAVIOUR, found.own_behaviour)
+    if not found.converged:
+        yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
+    not_excited = [p.name for p in found.parameters if p.status == 'not excited']
+    if not_excited:
+        yield Reason(
+            Rule.EXCITATION,
+            f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
+            'in more combinations, or fix these parameters',
+        )
+    for p in found.parameters:
+        length = p.name.is_length
+        limit = problem.largest_length if length else problem.largest_angle
+        if p.std is not None and p.name.of_dh and abs(p.offset) - 3.0 * p.std > limit:
+            yield Reason(
+                Rule.COMMON_SENSE,
+                f'{p.name} is off by {1e3 * p.offset:.0f} {"mm" if length else "mrad"}, '
+                'more than a faulty robot of this kind can be: is it the right chain file?',
+            )
+
+
+def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> Iterator[Reason]:
+    """Yield why the error on poses left out does not show that the arm got better."""
+    before, after = validation.figures
+    if after.rms_mm > 1e3 * problem.largest_error:
+        yield Reason(
+            Rule.LARGEST_ERROR,
+            f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
+            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?',
+        )
+    judged = validation.deciding
+    gain, limit = log_gain(
+        validation.before.position[judged],
+        validation.after.position[judged],
+        validation.after.configurations[judged],
+    )
+    if not gain > limit:
+        yield Reason(
+            Rule.GAIN,
+            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
+            f'before, {after.rms_mm:.3f} mm after)',
+        )
+    elif found.chance is not None and found.chance > 1.0 - CONFIDENCE:
+        yield Reason(
+            Rule.DRIFT,
+            'the gain may be that of a drift, as of the tracker: moved in time against the joint '
+            f'values, residuals are explained as well in {100.0 * found.chance:.0f} % of the '
+            'shifts; measure the poses in random order, further apart, or more of them',
+        )
+    elif found.region is None:
+        yield Reason(
+            Rule.REGION,
+            'too little is known of the arm for the correction to help: what it removes is not '
+            'larger than its own uncertainty, even at the poses measured; measure more poses, '
+            'spread further',
+        )
+
+
+def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
+    """Yield what got worse, or may be no gain of the arm."""
+    if validation.outliers:
+        first, second = validation.figures_of_all
+        pairs = (validation.before.position, validation.after.position)
+        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
+        if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
+            yield Reason(
+                Rule.GAIN_WITH_OUTLIERS,
+                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
+                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
+                f'{second.mean_mm:.3f} mm)',
+            )
+    if found.may_be_rounding:
+        yield Reason(
+            Rule.ROUNDING,
+            'the gain may be that of rounded joint values, which are alike in many poses: record '
+            'them with more digits',
+        )
+    before, after = validation.figures
+    if after.rms_mrad is not None:
+        judged = validation.deciding
+        gain, limit = log_gain(
+            validation.before.orientation[judged],
+            validation.after.orientation[judged],
+            validation.after.configurations[judged],
+        )
+        if gain < -limit:
+            yield Reason(
+                Rule.ORIENTATION,
+                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
+                f'before, {after.rms_mrad:.3f} mrad after)',
+            )
+
+
+def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is suspicious about a result that is not refused for it.
+
+    `coarse` are the steps [rad or m] of rounded joint values.
+    """
+    found = [] if step is None or step.harmful else [str(step)]
+    if coarse:
+        kinds = {joint.name: joint.type for joint in problem.chain.joints}
+        steps = [
+            f'{name} ({1e3 * step:.3g} {"mrad" if kinds[name] == "revolute" else "mm"})'
+            for name, step in coarse.items()
+        ]
+        found.append(
+            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
+        )
+    return tuple(found)

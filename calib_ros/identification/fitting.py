@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The fit itself: what is fitted, from where, with which priors, and what its residuals tell.
+
+A first fit of some samples comes close; priors of common sense keep it from going astray where
+these tell little. The robust fit of all samples follows, and where its data tell priors that
+would change it (`evidence.py`), once more with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.identification import identifiability
+from calib_ros.identification.evidence import Posterior, posterior_of
+from calib_ros.identification.leastsquares import (
+    System,
+    factor_of,
+    factor_of_some,
+    minimise,
+    triangular_factor,
+)
+from calib_ros.identification.noise import Noise, noise_of
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Learned, Problem
+from calib_ros.identification.robust import Robust, reweighted, thorough_fit
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+SOME = 500
+"""Pairs that are enough for a first fit."""
+FOLLOWED = 2.0
+"""Part of what it lacks that the geometric model does not follow: one over this."""
+HELD = 0.05
+"""Share of a parameter's variance that is its prior's from which on the prior is fitted with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Simpler:
+    """What the fit of a simpler model, without effects, has told."""
+
+    chain: Chain
+    distances: tuple[FloatArray, ...]
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A robust fit with what follows from its residuals.
+
+    `problem` has the last priors; `size` [sigma given] is that of the noise before the data told
+    any.
+    """
+
+    problem: Problem
+    names: tuple[str, ...]
+    system: System
+    robust: Robust
+    factor: FloatArray
+    noise: Noise
+    uncertainty: identifiability.Uncertainty
+    size: float
+
+    @property
+    def chain(self) -> Chain:
+        """Return the fitted chain."""
+        return self.robust.fit.chain
+
+    def posterior(
+        self, noise: float, more: Sequence[str] = (), doubts: Mapping[str, float] | None = None
+    ) -> Posterior:
+        """Return what the data of the fit tell, with `more` effects considered."""
+        model, given = self.problem.model, self.problem.given
+        return posterior_of(self.chain, model, self.names, self.system, noise, given, more, doubts)
+
+
+def excited_names(
+    problem: Problem, structural: Sequence[str], start: Chain
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the parameters that the poses determine, and their factor by some samples."""
+    priors = problem.prior_sigmas
+    wanted = [n for n in problem.free if n in structural or n in priors]
+    few, every = problem.system([some(each) for each in problem.sets]), problem.sets
+    factor = factor_of(start, wanted, few)
+    names = identifiability.excited(factor, wanted)
+    if len(names) < len(wanted) and few.count < sum(map(len, every)):  # more may determine more
+        names = identifiability.excited(
+            triangular_factor(start, wanted, problem.system(every)), wanted
+        )
+    return names, factor_of_some(factor, [k for k, n in enumerate(wanted) if n in names])
+
+
+def fit_all(
+    problem: Problem,
+    names: tuple[str, ...],
+    start: Chain,
+    factor: FloatArray,
+    simpler: Simpler | None,
+) -> Fitted:
+    """Fit the named parameters from start frames, with priors where they are needed.
+
+    `factor` (P, P) is that of some samples at the start.
+    """
+    problem = _guarded(problem, names, factor, simpler)
+    rough = start
+    few = problem.system([some(each) for each in problem.sets])
+    if simpler is not None:
+        rough = simpler.chain.with_effects([name for name, _ in problem.model.effects])
+    elif few.count < sum(map(len, problem.sets)) // 2:
+        rough = minimise(start, names, few, tolerance=1e-2).chain
+    fitted = _fit(problem, rough, names, simpler)
+    guarded = _guarded(problem, names, fitted.factor, simpler)
+    if guarded is not problem:  # without its outliers a session tells less
+        problem = guarded
+        fitted = _fit(problem, rough, names, simpler)
+    size = _told_by(fitted.noise, simpler)
+    told = fitted.posterior(size)
+    if not _matter(problem, names, told):
+        return fitted
+    priors = {
+        name: min(told.priors[name], problem.common_sense(name))
+        for name in names
+        if not problem.model.owns_frame(name)
+    }
+    problem = replace(problem, learned=Learned(priors, size))
+    again = _fit(problem, fitted.chain, names, simpler, again=True)
+    return replace(again, size=fitted.size)
+
+
+def _fit(
+    problem: Problem,
+    chain: Chain,
+    names: tuple[str, ...],
+    simpler: Simpler | None,
+    again: bool = False,
+) -> Fitted:
+    """Fit the named parameters from a chain that is near, or `again` from one that was fitted."""
+    system = problem.system(problem.sets)
+    if simpler is None and not again:
+        robust = thorough_fit(chain, names, system, problem.loss)
+    else:
+        distances = None if simpler is None else simpler.distances
+        robust = reweighted(chain, names, system, problem.loss, distances)
+    fit = robust.fit
+    factor = fit.normal.factor()
+    if factor is None:
+        factor = triangular_factor(fit.chain, names, system)
+    noise, uncertainty = noise_of(fit, names, system, factor)
+    return Fitted(problem, names, system, robust, factor, noise, uncertainty, noise.size)
+
+
+def _told_by(noise: Noise, simpler: Simpler | None) -> float:
+    """Return the size of the noise [sigma given] against which a prior is weighed.
+
+    What the geometric model lacks is no noise to it: it can follow a part of it. On measured
+    robots errors in regions left out were least with more weight on the prior, those on held-out
+    rows of the same session with less; with what is not shared by neighbours, over FOLLOWED, they
+    are those of least squares (`benchmarks/real_robots.py`).
+    """
+    if simpler is not None or noise.consistent:
+        return noise.size
+    return max(noise.size / (FOLLOWED * noise.widened), min(noise.size, 1.0))
+
+
+def _guarded(
+    problem: Problem, names: Sequence[str], factor: FloatArray, simpler: Simpler | None
+) -> Problem:
+    """Return the problem with priors that keep a first fit from going astray.
+
+    `factor` (P, P) is that of some samples at the start, or of what a robust fit has left. DH
+    parameters that they tell no better than common sense does get a third of what no faulty robot
+    exceeds as a prior.
+    """
+    known = problem.prior_sigmas
+    stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
+    guards = {
+        name: problem.common_sense(name)
+        for name, std in zip(names, stds, strict=True)
+        if name not in known
+        and not problem.model.owns_frame(name)
+        and std > problem.common_sense(name)
+    }
+    if problem.learned is not None:
+        more = replace(problem.learned, priors={**problem.learned.priors, **guards})
+        return replace(problem, learned=more) if guards else problem
+    noise = 1.0 if simpler is None else _told_by(simpler.noise, None)
+    return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
+
+
+def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
+    """Tell whether priors that the data have told would change a fit without them."""
+    if problem.learned is not None or problem.model.effects:
+        return True
+    return any(posterior.held(name) > HELD for name in names if name not in problem.given)
+
+
+def some(observations: Observations) -> Observations:
+    """Return enough pairs, evenly spread, to come close to the result and to see its rank."""
+    return observations.select(np.arange(0, len(observations), 1 + len(observations) // SOME))
+
+
+def require_enough(problem: Problem, names: Sequence[str]) -> None:
+    """Refuse a problem with fewer equations than parameters (P,)."""
+    rows = configurations = 0
+    for each, kind in zip(problem.sets, problem.kinds, strict=True):
+        if not len(each):
+            raise InputError(f'there are no pairs to fit between {each.base} and {each.tool}')
+        count = int(each.configurations.max()) + 1
+        rows += count * kind.rows
+        configurations += count
+    if rows < len(names):
+        width = problem.kinds[0].rows
+        raise TooFewObservationsError(
+            configurations,
+            -(-len(names) // width),
+            f'{width} equations each for {len(names)} parameters',
+        )

@@ -1,0 +1,281 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of one set of observations as the solver takes them: weighted rows, block by block.
+
+Residual of a sample: p_measured - p and the rotation vector from the model's orientation to the
+measured one, both in world axes, weighted by the inverse of the measurement's covariance. Its
+derivative with respect to the parameters is the error model's, with the sign reversed. The
+orientation part leaves out the Jacobian of the logarithm: with equal weights on the three axes
+the gradient does not change, because that Jacobian leaves the residual itself as it is. A measured
+distance has the residual L - |p|, and its derivative is the position's along p. Pixels of a board
+have a module of their own (`pixels.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.lens import at_the_board, require_lens, view
+from calib_ros.kinematics.se3 import FloatArray
+
+BLOCK = 1024
+
+
+class Samples:
+    """One set of observations laid out for the solver: component first, sample last.
+
+    Parameters
+    ----------
+    observations : Observations
+    sigma_position, sigma_orientation : float
+        Standard deviations [m, rad] of measurements that bring no covariance of their own.
+
+    """
+
+    def __init__(
+        self, observations: Observations, sigma_position: float, sigma_orientation: float
+    ) -> None:
+        self.observations = observations
+        self.count = len(observations)
+        self.joints = np.ascontiguousarray(observations.joints.T)
+        self.positions = np.ascontiguousarray(observations.positions.T)
+        self.rotations = np.ascontiguousarray(observations.rotations.transpose(2, 1, 0))
+        approach = observations.approach
+        self.approach = None if approach is None else np.ascontiguousarray(approach.T)
+        self.distances = observations.distances
+        self.oriented = bool(observations.oriented.any()) and self.distances is None
+        width = 3 if self.distances is None else 1
+        self.rows = width * self.count + 3 * int(observations.oriented.sum()) * self.oriented
+        self.sigmas = (sigma_position, sigma_orientation)
+        self.whitening: FloatArray | None = None
+        mixed = self.oriented and not observations.oriented.all()
+        if mixed or (observations.covariance is not None and self.distances is None):
+            self.whitening = _whitening(observations, sigma_position, sigma_orientation)
+        self.weights: FloatArray | None = None
+        """Square roots of the weights (N,) of a robust loss; None where all count fully."""
+
+    def select(self, index: NDArray[np.generic]) -> Samples:
+        """Return the samples chosen by a mask or by indices, with their weights."""
+        few = type(self)(self.observations.select(index), *self.sigmas)
+        few.weights = None if self.weights is None else self.weights[index]
+        return few
+
+    def blocks(
+        self, chain: Chain, names: Sequence[str]
+    ) -> Iterator[tuple[FloatArray, FloatArray, ErrorModel]]:
+        """Yield weighted rows of Jacobian and residual, a block of samples at a time.
+
+        Yields
+        ------
+        shift : (P + 1, rows)
+            Weighted derivative of the residual, transposed; the last row is the residual.
+        turn : (P_rotational + 1, 3 B) or (0, 0)
+            The same of the orientation where it is kept apart: rotational parameters only.
+        model : ErrorModel
+            Knows the order of the parameters in the rows.
+
+        """
+        model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
+        nothing = np.zeros((0, 0))
+        joints, velocity = self.moving(chain)
+        for start in range(0, self.count, BLOCK):
+            part = slice(start, start + BLOCK)
+            approach = None if self.approach is None else self.approach[:, part]
+            moving = None if velocity is None else velocity[:, part]
+            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving)
+            if self.distances is not None:
+                shift = _along(origin, shift, self.distances[part], self.observations.plane)
+            else:
+                np.subtract(self.positions[:, part], origin, out=shift[-1])
+            if self.oriented:
+                turn[-1] = orientation_error(self.rotations[:, :, part], axes)
+            if self.weights is not None:
+                shift *= self.weights[part]
+                if self.oriented:
+                    turn *= self.weights[part]
+            if self.whitening is not None:
+                yield self._whitened(shift, turn, part), nothing, model
+                continue
+            shift /= self.sigmas[0]
+            flat = shift.reshape(len(shift), -1)
+            if not self.oriented:
+                yield flat, nothing, model
+                continue
+            turn /= self.sigmas[1]
+            yield flat, turn.reshape(len(turn), -1), model
+
+    def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
+        """Return joint values (n, N) at the device's delay, and velocities where it has one."""
+        delay = chain.frame(self.observations.base).delay
+        if self.observations.velocity is None or delay is None:
+            return self.joints, None
+        then = self.observations.earlier(delay)
+        velocity = np.ascontiguousarray(np.asarray(then.velocity).T)
+        return np.ascontiguousarray(then.joints.T), velocity
+
+    def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
+        """Yield the same rows by position and orientation, (P + 1, c, B) each, a block at a time.
+
+        Parameters stand in the order of their names, the residual last. Where orientation is
+        whitened together with the position, or not measured, there is one part only.
+        """
+        for shift, turn, model in self.blocks(chain, names):
+            order = [*model.order, len(names)]
+            found = [shift[order]]
+            if len(turn):
+                full = np.zeros((len(names) + 1, turn.shape[1]))
+                full[: model.rotations] = turn[:-1]
+                full[-1] = turn[-1]
+                found.append(full[order])
+            count = shift.shape[1] // self.width
+            yield tuple(part.reshape(len(part), -1, count) for part in found)
+
+    @property
+    def width(self) -> int:
+        """Return the number of rows of a sample's position, or of all of it where whitened."""
+        return 1 if self.distances is not None else 6 if self.whitening is not None else 3
+
+    def rows_of(self, chain: Chain, names: Sequence[str]) -> FloatArray:
+        """Return (N, 6, 3 or 1, P + 1) the weighted rows sample by sample, the residual last."""
+        found = [np.concatenate(parts, axis=1) for parts in self.parts(chain, names)]
+        return np.concatenate(found, axis=2).transpose(2, 1, 0)
+
+    def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
+        """Return (P + 1, 6 B): position and orientation rows mixed by each sample's whitening."""
+        assert self.whitening is not None
+        full = np.zeros((len(shift), 6, shift.shape[2]))
+        full[:, :3] = shift
+        full[: len(turn) - 1, 3:] = turn[:-1]
+        full[-1, 3:] = turn[-1] if self.oriented else 0.0
+        mixed = np.einsum('rsb,psb->prb', self.whitening[:, :, part], full, optimize=True)
+        return np.ascontiguousarray(mixed).reshape(len(shift), -1)
+
+    def position_errors(self, residuals: FloatArray) -> FloatArray:
+        """Return position errors (N, 3) [m] of weighted residuals (rows,), sample by sample.
+
+        Of distances the error is the first component.
+        """
+        rows = residuals.reshape(self.count, -1)
+        if self.whitening is not None:  # lower triangular, so that position is not mixed
+            mixing = self.whitening[:3, :3].transpose(2, 0, 1)
+            return np.asarray(np.linalg.solve(mixing, rows[:, :3, np.newaxis])[..., 0])
+        errors = np.zeros((self.count, 3))
+        width = 1 if self.distances is not None else 3
+        errors[:, :width] = self.sigmas[0] * rows[:, :width]
+        return errors
+
+    def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
+        """Return the residuals in sigma: position (N, 3 or 1), orientation (N, 3).
+
+        NaN where nothing was measured. Samples with covariances of their own are whitened as a
+        whole; their two parts are then only nearly those of position and orientation.
+        """
+        position, orientation = residual_arrays(chain, self.observations)
+        if self.whitening is not None:
+            both = np.concatenate([position, np.nan_to_num(orientation)], axis=1)
+            both = np.einsum('rsn,ns->nr', self.whitening, both)
+            position, turned = both[:, :3], both[:, 3:]
+            return position, np.where(self.observations.oriented[:, None], turned, np.nan)
+        return position / self.sigmas[0], orientation / self.sigmas[1]
+
+    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
+        """Yield residuals (M, c) in sigma that tell gross errors, and the (N,) row of each sample.
+
+        NaN where nothing was measured.
+        """
+        for part in self.whitened_residuals(chain):
+            yield part, slice(None)
+
+
+def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
+
+    Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
+    """
+    delay = chain.frame(observations.base).delay
+    then = observations if delay is None else observations.earlier(delay)
+    distances = observations.distances
+    position = np.empty((len(then), 3 if distances is None else 1))
+    orientation = np.full((len(then), 3), np.nan)
+    oriented = observations.oriented & (distances is None)
+    for start in range(0, len(then), BLOCK):
+        part = slice(start, start + BLOCK)
+        q = np.ascontiguousarray(then.joints[part].T)
+        came = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
+        axes, origin = chain.trace(
+            chain.effective(q, came), base=observations.base, tool=observations.tool
+        )
+        if distances is not None:
+            length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
+            position[part, 0] = distances[part] - length
+            continue
+        position[part] = observations.positions[part] - origin.T
+        if oriented[part].any():
+            measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
+            orientation[part] = orientation_error(measured, axes).T
+    orientation[~oriented] = np.nan
+    return position, orientation
+
+
+def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
+    """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m]."""
+    camera = observations.camera
+    lens = require_lens(chain.frame(camera).lens, camera)
+    delay = chain.frame(observations.base).delay
+    then = observations if delay is None else observations.earlier(delay)
+    first = np.flatnonzero(np.diff(then.images, prepend=-1))
+    assert then.pixels is not None
+    assert then.points is not None
+    q = np.ascontiguousarray(then.joints[first].T)
+    came = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
+    axes, origin = chain.trace(chain.effective(q, came), base=then.base, tool=then.tool)
+    pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
+    for start in range(0, len(then), BLOCK):
+        part = slice(start, start + BLOCK)
+        owner = then.images[part]
+        seen = view(
+            lens,
+            [axis[:, owner] for axis in axes],
+            origin[:, owner],
+            then.points[part].T,
+            then.on_flange,
+        )
+        residual = then.pixels[part].T - seen.pixels
+        pixels[part], shifts[part] = residual.T, at_the_board(seen, residual)
+    return pixels, shifts
+
+
+def _along(
+    origin: FloatArray, shift: FloatArray, distances: FloatArray, plane: bool
+) -> FloatArray:
+    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|.
+
+    Over a plane they are along its normal z.
+    """
+    if plane:
+        along = np.ascontiguousarray(shift[:, 2:])
+        along[-1, 0] = distances - origin[2]
+        return along
+    length = np.maximum(np.linalg.norm(origin, axis=0), 1e-12)
+    along = np.einsum('pcb,cb->pb', shift, origin / length)[:, np.newaxis]
+    along[-1, 0] = distances - length
+    return np.ascontiguousarray(along)
+
+
+def _whitening(
+    observations: Observations, sigma_position: float, sigma_orientation: float
+) -> FloatArray:
+    """Return W (6, 6, N) with W^T W the inverse covariance; zero rows for what is not measured."""
+    covariance = observations.covariances((sigma_position, sigma_orientation))
+    covariance[~observations.oriented, 3:, :] = 0.0
+    covariance[~observations.oriented, :, 3:] = 0.0
+    covariance[~observations.oriented, 3:, 3:] = np.eye(3)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    whitening[~observations.oriented, 3:, :] = 0.0
+    return np.ascontiguousarray(whitening.transpose(1, 2, 0))

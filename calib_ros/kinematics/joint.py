@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a chain is made of: rows of the DH table, and constant frames at its ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import (
+    DELAY,
+    DH_KINDS,
+    FRAME_KINDS,
+    LENS_KINDS,
+    Parameter,
+    parameters_of,
+)
+from calib_ros.kinematics.se3 import FloatArray
+
+JointType: TypeAlias = Literal['revolute', 'prismatic']
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One row of the DH table: lengths in m, angles in rad, limits in rad or m.
+
+    `mass` [kg] and `com` [m], its centre in the frame at the link's end, serve compliance only;
+    `gear_ratio` (motor turns per joint turn, 0 when unknown) serves gear harmonics.
+    """
+
+    name: str
+    type: JointType = 'revolute'
+    a: float = 0.0
+    alpha: float = 0.0
+    d: float = 0.0
+    theta: float = 0.0
+    beta: float = 0.0
+    sign: int = 1
+    lower: float | None = None
+    upper: float | None = None
+    mass: float = 0.0
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gear_ratio: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a row that no robot has."""
+        if not self.name or '.' in self.name:
+            raise ConfigError(f'a joint needs a name without dots, not "{self.name}"')
+        if self.type not in get_args(JointType):
+            raise UnknownNameError(f'type of joint "{self.name}"', self.type, get_args(JointType))
+        if self.sign not in (1, -1):
+            raise ConfigError(f'sign of joint "{self.name}" must be 1 or -1, not {self.sign}')
+        for kind in DH_KINDS:
+            if not math.isfinite(getattr(self, kind)):
+                raise ConfigError(f'{kind} of joint "{self.name}" must be a finite number')
+        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+            raise ConfigError(
+                f'limits of joint "{self.name}": lower {self.lower} must be less than upper '
+                f'{self.upper}'
+            )
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the joint's Denavit-Hartenberg parameters, in the order of DH_KINDS."""
+        return parameters_of(self.name, DH_KINDS)
+
+    @cached_property
+    def driven(self) -> Parameter:
+        """Return the parameter that the joint's value is added to."""
+        return Parameter(self.name, 'theta' if self.type == 'revolute' else 'd')
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A constant transform (4, 4); `fixed` when it is known and must not be fitted.
+
+    `delay` [s] is how much later than the joints' the stamps of the device at a base frame are;
+    None where the arm stood and no delay shows. `lens` belongs to a camera that is there.
+    """
+
+    matrix: FloatArray = field(default_factory=lambda: np.eye(4))
+    fixed: bool = False
+    delay: float | None = None
+    lens: Lens | None = None
+
+    def moved(self, offsets: Mapping[str, float]) -> Frame:
+        """Return the frame shifted by x, y, z [m] and turned by rx, ry, rz [rad].
+
+        Shift and turn are along and about the axes of the frame's parent (world for the base,
+        flange for the tool), the turn through the frame's own origin.
+        """
+        matrix = self.matrix.copy()
+        matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
+        turn = [offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]]
+        if any(turn):
+            matrix[:3, :3] = se3.turned(*turn) @ matrix[:3, :3]
+        delay = self.delay
+        if DELAY in offsets:
+            delay = (delay or 0.0) + offsets[DELAY]
+        lens = self.lens
+        if lens is not None:
+            lens = lens.moved({kind: offsets[kind] for kind in LENS_KINDS if kind in offsets})
+        return Frame(matrix, self.fixed, delay, lens)
+
+    def offsets(self, reference: Frame | None = None) -> FloatArray:
+        """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""
+        return _offsets(self, reference or ANYWHERE)
+
+
+@lru_cache(maxsize=256)
+def _offsets(frame: Frame, reference: Frame) -> FloatArray:
+    start = reference.matrix
+    turn = se3.log_rotation(frame.matrix[:3, :3] @ start[:3, :3].T)
+    found = np.concatenate([frame.matrix[:3, 3] - start[:3, 3], turn])
+    found.setflags(write=False)
+    return found
+
+
+ANYWHERE = Frame()

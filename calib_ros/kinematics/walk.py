@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The walk along a chain: the frames of all joints at many joint values at once.
+
+A link is a joint's motion along and about z, and a constant L = Tx(a) Rx(alpha) Ry(beta):
+
+    standard   A = Rz(theta) Tz(d) L        modified   A = L Rz(theta) Tz(d)
+
+Frames are (4, 3, B): the x, y and z axis and the origin in the world, of B samples, so a constant
+transform is one product of matrices. Every parameter of a joint moves what is behind it along or
+about an axis of one of these frames: theta and d along z of the frame before the joint's motion,
+a, alpha and beta along x, x and y of the frame behind L (before its turn by beta for the first).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics.se3 import FloatArray
+
+
+class Walk:
+    """What of a chain's links does not depend on the joint values.
+
+    Parameters
+    ----------
+    table : (n, 5)
+        DH table with columns a, alpha, d, theta, beta [m, rad].
+    signs : (n,)
+        Directions of the joint values.
+    turning : (n,) bool
+        True for revolute joints.
+    standard : bool
+        The convention; else the modified one.
+
+    """
+
+    def __init__(
+        self, table: FloatArray, signs: FloatArray, turning: NDArray[np.bool_], standard: bool
+    ) -> None:
+        a, alpha, d, theta, self.beta = table.T
+        self._theta = theta[:, np.newaxis]
+        self.signs = signs[:, np.newaxis]
+        self.turning = turning
+        self._all_turning = bool(turning.all())
+        self._turns = turning[:, np.newaxis]
+        self.standard = standard
+        cos, sin = np.cos(alpha), np.sin(alpha)
+        self.cos, self.sin = np.cos(self.beta), np.sin(self.beta)
+        links = np.zeros((len(table), 4, 4))
+        links[:, 0, 0], links[:, 0, 1], links[:, 0, 2] = (
+            self.cos,
+            sin * self.sin,
+            -cos * self.sin,
+        )
+        links[:, 1, 1], links[:, 1, 2] = cos, sin
+        links[:, 2, 0], links[:, 2, 1], links[:, 2, 2] = (
+            self.sin,
+            -sin * self.cos,
+            cos * self.cos,
+        )
+        links[:, 3, 0], links[:, 3, 3] = a, 1.0
+        if standard:  # d moves along z, first or last
+            links[:, 3, 2] = d
+        self._links = links
+        self._d = np.zeros_like(d) if standard else d
+
+    def frames(
+        self, q: FloatArray, base: FloatArray, found: FloatArray, ends: FloatArray | None = None
+    ) -> FloatArray:
+        """Write the frame before each joint's motion and the flange's into (n + 1, 4, 3, B).
+
+        Parameters
+        ----------
+        q : (n, B)
+            Effective joint values.
+        base : (4, 4)
+            T_world_base.
+        found : (n + 1, 4, 3, B)
+            Gets the frames, of which it is returned.
+        ends : (n, 4, 3, B), optional
+            Gets the frames at the ends of the links.
+
+        """
+        values = self.signs * q
+        angles = self._theta + (values if self._all_turning else values * self._turns)
+        cos, sin = np.cos(angles), np.sin(angles)
+        here, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
+        here[:] = base[:3].T[..., np.newaxis]
+        if self.standard:
+            found[0] = here
+        for i, link in enumerate(self._links):
+            before, after = found[i], found[i + 1]
+            if not self.standard:
+                np.matmul(link, here.reshape(4, -1), out=before.reshape(4, -1))
+            np.multiply(before[:2], cos[i], out=here[:2])
+            np.multiply(before[1::-1], sin[i], out=turned)
+            here[0] += turned[0]
+            here[1] -= turned[1]
+            here[2:] = before[2:]
+            if not self.turning[i]:
+                here[3] += (self._d[i] + values[i]) * here[2]
+            elif self._d[i]:
+                here[3] += self._d[i] * here[2]
+            if self.standard:
+                np.matmul(link, here.reshape(4, -1), out=after.reshape(4, -1))
+            if ends is not None:
+                ends[i] = after if self.standard else here
+        if not self.standard:
+            found[-1] = here
+        return found
