@@ -46,6 +46,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.progress import Progress
 from calib_ros.report import words
 from calib_ros.ros import to_ros
@@ -153,6 +154,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self, '~/export', self._answer, self._to_export, self._keeper.export
         )
         self._save = DeferredTrigger(self, '~/save', self._answer, self._to_save, self._on_save)
+        self._check = DeferredTrigger(
+            self, '~/check', self._answer, self._to_check, self._on_check
+        )
         for kind, name, callback in (
             (Trigger, '~/cancel', self._on_cancel),
             (Trigger, '~/capture', self._on_capture),
@@ -180,7 +184,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        working = (self._identify, self._save, self._export, self._guide)
+        working = (self._identify, self._save, self._export, self._check, self._guide)
         ended = [each.join(JOIN_TIMEOUT) for each in working]
         self._take_messages()
         self.session.finish()
@@ -379,6 +383,14 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         assert calibration is not None  # else there was nothing to judge
         holds, text = words.verdict(calibration, *figures)
         return holds, text + self._filer.validated(self.session, figures, holds)
+
+    def _to_check(self) -> tuple[Calibration, Problem]:
+        self._take_messages()
+        return self.session.recent()
+
+    def _on_check(self, found: tuple[Calibration, Problem]) -> tuple[bool, str]:
+        calibration, problem = found
+        return words.checked(recalibrate(calibration, problem, years_since(calibration.record)))
 
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)

@@ -13,7 +13,7 @@ from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.observations import configurations
+from calib_ros.identification.observations import Observations, configurations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
@@ -46,6 +46,8 @@ ONE_FRAME = (
     'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
     'its own for each source'
 )
+RECENT = 20
+"""Samples that a check of the calibration in use looks at: a few stops of daily work."""
 
 
 class CalibrationSession:
@@ -364,6 +366,26 @@ class CalibrationSession:
             does not have.
 
         """
+        calibration, sets = self._since()
+        nominal, now = compare(calibration.before, calibration.chain, sets).figures
+        return now, nominal
+
+    def recent(self) -> tuple[Calibration, Problem]:
+        """Return the calibration in use, and the last stops since then as a problem.
+
+        Raises
+        ------
+        InputError
+            As for `validate`.
+
+        """
+        calibration, sets = self._since(RECENT)
+        first, *more = sets
+        settings = self.settings.for_problem()
+        return calibration, Problem(self.chain, first, more=tuple(more), **settings)
+
+    def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
+        """Return the calibration, and the samples since, or the last of them, in its frames."""
         calibration = self.calibration
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
@@ -373,6 +395,7 @@ class CalibrationSession:
         # the first device and target are those of a file that does not name any
         frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
         since = [each for each in self.usable if each not in self._known]
+        since = since[-most:] if most else since
         sets = [each for part in collect(since, sigmas, frames) for each in part]
         if not sets:
             raise InputError('no samples have been taken since: measure some new poses first')
@@ -382,8 +405,7 @@ class CalibrationSession:
                 'the samples since were measured by a device or on a target that the '
                 'calibration does not know'
             )
-        nominal, now = compare(calibration.before, calibration.chain, sets).figures
-        return now, nominal
+        return calibration, sets
 
     def _take(self, made: Sequence[Sample]) -> int:
         """Keep the samples that were made; return how many there are now."""
