@@ -105,13 +105,13 @@ class Collector:
         if len(late):  # one by one
             count = max(int(late[0]), 1)
         due = joints[stamps >= self._advanced_ns + ADVANCE_NS]
-        count = min([count, *(due[:1] + 1).tolist()])
+        count = int(min([count, *(due[:1] + 1).tolist()]))
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
             room = self.track.room(columns)
             if room <= len(joints):
                 places = [each.places for each in given.pieces if each.key == columns]
                 full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
-                count = min([count, *(full + 1).tolist()])
+                count = int(min([count, *(full + 1).tolist()]))
         return count
 
     def take(self, given: Slice) -> bool:
