@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.making import WIDTH, Maker
+from calib_ros.sampling.names import MOST_NAMES
 from calib_ros.sampling.rests import Rests
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.sample import Sample
@@ -33,8 +34,8 @@ WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
-MOST_STREAMS = 50
-"""Streams of measurements that are told apart: a tracker may number its markers without end."""
+MOST_STREAMS = MOST_NAMES
+"""Streams of measurements that are told apart: a tracker may number markers without end."""
 TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
 
 
@@ -65,7 +66,7 @@ class Collector:
         self.delay_ns = round(settings.delay * 1e9)
         """How much later than the joints' the stamps of measurements are."""
         self.holding = False
-        """True while nothing may be taken because the delay is being looked for."""
+        """True while the delay is being looked for, so that nothing may be taken."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
         self.unused: Counter[str] = Counter()
@@ -104,14 +105,13 @@ class Collector:
         if len(late):  # one by one
             count = max(int(late[0]), 1)
         due = joints[stamps >= self._advanced_ns + ADVANCE_NS]
-        if len(due):
-            count = min(count, int(due[0]) + 1)
+        count = int(min([count, *(due[:1] + 1).tolist()]))
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
             room = self.track.room(columns)
             if room <= len(joints):
                 places = [each.places for each in given.pieces if each.key == columns]
                 full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
-                count = min([count, *(full + 1).tolist()])
+                count = int(min([count, *(full + 1).tolist()]))
         return count
 
     def take(self, given: Slice) -> bool:

@@ -20,9 +20,9 @@ from calib_ros.sampling.slices import StreamKey
 from calib_ros.sampling.stops import RestlessError, average
 from calib_ros.sampling.track import Motion
 
-WIDTH = 43
 DISTANCE, POSITION = slice(0, 1), slice(0, 3)
-QUAT, COVARIANCE = slice(3, 7), slice(7, WIDTH)
+QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
+WIDTH = COVARIANCE.stop
 VIBRATING = 'poses: still vibrating, or a spike'
 RESTLESS = 'poses: a stop that spreads more than the noise'
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-STILL = 6.0
+AT_REST = 6.0
 """What `still` must be at least [noise of the joints] for a stop to show as one."""
 MOST_RESTS = 1000
 """Rests in which no stop shows that are counted."""
@@ -30,5 +30,5 @@ class Rests:
         """Return what `still` must be at least where more rests passed unseen than not."""
         if len(self._unseen) <= self.sampled:
             return None
-        needed = STILL * float(np.median(self._unseen))
+        needed = AT_REST * float(np.median(self._unseen))
         return needed if needed > still else None
