@@ -13,7 +13,9 @@ import numpy as np
 
 import calib_ros
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import FALSE, reason_in_words
 from calib_ros.identification.identification import Identification, Noise, Outlier
+from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.region import Region
 from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
@@ -109,6 +111,23 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     for name, value in asdict(settings).items():
         parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
     return dump_yaml({'/**': {'ros__parameters': parameters}})
+
+
+def checked(found: Recalibration) -> tuple[bool, str]:
+    """Return whether the last stops agree with the calibration in use, and why in words."""
+    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} samples'
+    if found.changed:
+        reasons = '; '.join(reason_in_words(each) for each in found.changed)
+        return False, (
+            f'the calibration in use does not fit any more, {reasons}: was it bumped? {text}; '
+            'measure 8 poses or more and call ~/identify, or calib_ros identify --previous'
+        )
+    if found.unexplained <= FALSE:
+        return False, (
+            f'{text}, more than the calibration in use and noise explain, and no few parameters '
+            'do: measure new poses and call ~/identify'
+        )
+    return True, f'the calibration in use agrees with what was measured: {text}'
 
 
 def verdict(

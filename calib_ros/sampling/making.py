@@ -152,6 +152,11 @@ class Maker:
         fresh, self.fresh = self.fresh, []
         return fresh
 
+    @property
+    def unrest(self) -> int:
+        """Return how many measurements at stops were not at rest."""
+        return self.dropped[VIBRATING] + self.dropped[RESTLESS]
+
     def has(self, key: StreamKey) -> bool:
         """Tell whether there is a sample of a stream."""
         return bool(self._taken.get(key))

@@ -55,14 +55,12 @@ def test_a_bump_is_found_within_two_nights_and_its_joint_named(first, rng, name)
 
 
 def test_an_unchanged_arm_raises_no_alarm(first, rng):
-    """3,000 nights; one false alarm in a thousand is 1e-5 likely at one in 100 years."""
+    """1,000 nights at one false alarm in 100 years; 365 at ten a year, chance alone."""
     for scatter in (1.0, 2.0):
-        found = watch(list(nights(first, rng, 1500, scatter=scatter)))
+        found = watch(list(nights(first, rng, 500, scatter=scatter)))
         assert found.changes == ()
-        assert len(found.nights) == 1500
-    # at one in a year there are about as many: chances are right, with LAGS that share nights
-    often = sum(len(watch(list(nights(first, rng, 365)), years=0.1).changes) for _ in range(5))
-    assert 10 <= often <= 60
+        assert len(found.nights) == 500
+    assert 2 <= len(watch(list(nights(first, rng, 365)), years=0.1).changes) <= 20
 
 
 def test_a_drift_that_no_night_shows_is_found(first, rng):
