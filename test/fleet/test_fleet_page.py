@@ -41,7 +41,7 @@ def test_states_from_the_worst_to_the_best():
     assert [each.state for each in fleet] == states
     assert counts(fleet)['unreadable'] == 2
     assert str(change) == 'a changed, a.d by +0.100 ± 0.010 mm: was it bumped?'
-    assert str(replace(change, others=('b',))).startswith('a or b changed, ')
+    assert str(replace(change, others=('b',))).startswith('a (or b: they cannot be told apart) ')
 
 
 def test_what_a_reader_sees(tmp_path):
