@@ -121,7 +121,7 @@ class ErrorModel:
             behind = frames[layout.behind]
             behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
             behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
-        flat = frames.reshape(-1, 3, samples)
+        flat = frames.reshape(4 * len(frames), 3, samples)
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
         cross(axes, target[3] - flat[layout.points], levers[:-1])
