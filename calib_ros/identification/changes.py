@@ -284,7 +284,8 @@ def gauged(
     index = {name: k for k, name in enumerate(columns)}
     fitted = list(dict.fromkeys([*frames, *names]))
     known = flat[:, [index[name] for name in fitted]]
-    scale = np.maximum(np.linalg.norm(known, axis=0), 1e-300)
+    scale = np.linalg.norm(known, axis=0)
+    scale[scale == 0.0] = 1.0  # what moves nothing
     wanted = flat[:, [index[name] for name in others]]
     taken = linalg.lstsq(known / scale, wanted, cond=1e-9)[0]
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
