@@ -129,11 +129,7 @@ class Nobody:
     settings = Settings()
     warnings = ()
 
-    def uneventful(self, readings, among):
-        """Return that nothing ever happens."""
-        return np.ones(len(readings.stamps_ns), dtype=bool)
-
-    def keep(self, joints, measured):
+    def take(self, parts):
         """Do nothing."""
 
     def finish(self):

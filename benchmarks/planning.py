@@ -77,7 +77,7 @@ def naive(design, candidates, count):
     space = Candidates(design, candidates)
     rows, size = space.rows, space.rows.shape[2]
     each = [row.T @ row for row in rows]
-    start = space.known + choice.RIDGE * np.eye(size)
+    start = space.known + choice.ROUNDING * np.eye(size)
 
     def best(others, free):
         information = start + sum(each[k] for k in others)

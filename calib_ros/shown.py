@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import html
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
+
+from calib_ros.errors import ConfigError
 
 LONGEST = 60
 """Characters of a field's value; longer ones are told by their kind and size."""
@@ -31,6 +33,27 @@ class Shown:
             for name, value in _briefly(self)
         )
         return f'<table><caption>{type(self).__name__}</caption>{"".join(rows)}</table>'
+
+
+def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return paragraphs and a table, whose first row is its head, for notebooks."""
+    lines = [f'<p><strong>{html.escape(caption)}</strong></p>']
+    lines += [f'<p>{html.escape(each)}</p>' for each in text]
+    lines.append('<table>')
+    for k, row in enumerate(rows):
+        tag = 'td' if k else 'th'
+        cells = ''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in row)
+        lines.append(f'<tr>{cells}</tr>')
+    return '\n'.join([*lines, '</table>'])
+
+
+def as_frame(columns: Mapping[str, Any]) -> Any:
+    """Return columns by their names as a pandas.DataFrame, where pandas is installed."""
+    try:
+        import pandas
+    except ImportError as err:
+        raise ConfigError('a data frame needs pandas: pip install pandas') from err
+    return pandas.DataFrame(columns)
 
 
 def _briefly(value: Any) -> list[tuple[str, str]]:

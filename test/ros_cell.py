@@ -33,7 +33,7 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log
-from rclpy.experimental import EventsExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -50,6 +50,8 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import node as node_module
 from calib_ros.ros.node import CalibrationNode
+from calib_ros.sampling.intake import Stream, feed
+from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD
 from calib_ros.settings import Settings
@@ -71,7 +73,7 @@ class Cell:
     With parameters the first node is started at once.
     """
 
-    def __init__(self, executor_type=EventsExecutor, **parameters):
+    def __init__(self, **parameters):
         self._lock, self.domain = free_domain()
         self.context = rclpy.Context()
         rclpy.init(
@@ -80,7 +82,7 @@ class Cell:
             domain_id=self.domain,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self.executor = executor_type(context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
         self.peer = Node('peer', context=self.context)
         self.executor.add_node(self.peer)
         self.nodes = []
@@ -358,11 +360,12 @@ def direct(recording, **settings):
     """Return a session that has taken a recording without ROS."""
     session = CalibrationSession(load_chain('ur10e'), Settings(**settings))
     messages = [*joint_messages(recording), *pose_messages(recording.poses)]
-    for message in sorted(messages, key=stamp_ns):
-        if isinstance(message, PoseStamped):
-            session.take(STANDARD[0], STANDARD[0].type, message)
-        else:
-            session.take_joints(message)
+    pose, joints = Stream('poses', STANDARD[0].type, STANDARD[0]), Stream('joints', JOINT_STATE)
+    batch = [
+        (pose if isinstance(message, PoseStamped) else joints, message)
+        for message in sorted(messages, key=stamp_ns)
+    ]
+    assert feed(session, batch, lambda message, kind: message) == []
     return session
 
 

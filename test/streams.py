@@ -7,6 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from calib_ros.kinematics import se3
+from calib_ros.sampling.entry import Part
+from calib_ros.sampling.intake import Stream, feed
+from calib_ros.sampling.messages import JOINT_STATE, Readings
 from calib_ros.sampling.sources import Source
 
 MS = 1_000_000
@@ -17,6 +20,32 @@ POINT = 'geometry_msgs/msg/PointStamped'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
 RANGE = 'sensor_msgs/msg/Range'
 TRACKER = Source('measured_pose')
+
+
+def take(session, *come):
+    """Let a session take messages (source or None for joints, type, message) in their order."""
+    batch = [(Stream(source.topic if source else '', kind, source), m) for source, kind, m in come]
+    assert feed(session, batch, lambda message, kind: message) == []
+
+
+def of_joints(message):
+    return None, JOINT_STATE, message
+
+
+def hear(session, joints, measured):
+    """Let a session hear joint values (N, n), and positions and rotations or None, in order.
+
+    Each comes after the times at which they arrive (N,) and their stamps (N,).
+    """
+    (came, joint_stamps, values), (seen, seen_stamps, positions, rotations) = joints, measured
+    places = np.empty(len(came) + len(seen), dtype=int)
+    places[np.argsort(np.concatenate([came, seen]), kind='stable')] = np.arange(len(places))
+    if rotations is not None:
+        positions = np.hstack([positions, se3.to_quat(rotations)])
+    named = Readings(joint_stamps, ('', *session.joint_names), values)
+    poses = Readings(seen_stamps, ('tracker',), positions)
+    first, second = np.split(places, [len(came)])
+    session.take([Part(first, None, named), Part(second, TRACKER, poses)])
 
 
 def header(stamp_ns, frame_id='tracker'):

@@ -3,6 +3,7 @@
 """The package as colcon builds it, and what its files promise each other."""
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -26,7 +27,8 @@ JAZZY = {
 }
 """Packages of Jazzy: rosdep installs their Debian packages, ros-jazzy-NAME."""
 INSTALLED = tuple(f'config/{name}' for name in ('calibration_node.yaml', 'calibration.rviz'))
-INSTALLED += ('config/diagnostics.yaml', 'launch/calibration.launch.py', 'launch/cell.launch.py')
+INSTALLED += ('config/diagnostics.yaml', 'config/foxglove_layout.json')
+INSTALLED += ('launch/calibration.launch.py', 'launch/cell.launch.py')
 INSTALLED += ('security/policy.xml',)
 
 
@@ -77,7 +79,7 @@ def test_package_xml_names_everything_that_is_imported():
     declared = {element.text for element in package.iter('exec_depend')}
     # Extras of pip, imported only where they are used (setup.py).
     declared |= {'rosbags', 'openpyxl', 'cv2', 'distributed', 'fsspec', 'pyarrow'}
-    declared |= {'argcomplete', 'rich', 'weasyprint'}
+    declared |= {'argcomplete', 'pandas', 'rich', 'weasyprint'}
     keys = {'yaml': 'python3-yaml'}
     keys |= {
         name: f'python3-{name}' for name in ('jinja2', 'matplotlib', 'numpy', 'plotly', 'scipy')
@@ -122,6 +124,18 @@ def test_the_parameter_file_states_the_defaults():
             assert stated[item.name] == item.default
         else:
             assert stated[item.name] == pytest.approx(item.default, rel=1e-5)
+
+
+def test_foxglove_shows_what_the_node_has():
+    layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text())
+    rooms = ('node', 'advisor', 'outputs')
+    node = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in rooms)
+    panels = layout['configById']
+    names = {*re.findall('/calibration_node/([a-z_]+)', json.dumps(panels))}
+    assert {'identify', 'residuals', 'status'} <= names
+    for name in names:
+        assert f"'~/{name}'" in node
+    assert {*re.findall(r'"([A-Za-z0-9]+![a-z]+)"', json.dumps(layout['layout']))} == {*panels}
 
 
 def test_rviz_shows_what_the_node_publishes():

@@ -3,12 +3,17 @@
 """Public values on a screen."""
 
 import re
+import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import calib_ros
+from calib_ros.apply.design import Design
+from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
+from calib_ros.identification.reasons import Reason, Rule
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
@@ -26,6 +31,31 @@ def test_a_value_fits_on_a_screen(value):
     assert max(map(len, lines)) <= 99
     assert lines[0].startswith(type(value).__name__ + '(')
     assert len(re.findall('<tr>', value._repr_html_())) >= 5
+
+
+def test_a_result_is_a_data_frame():
+    frame = RESULT.to_frame()
+    assert list(frame['parameter']) == [p.name for p in RESULT.parameters]
+    assert frame['std'].isna().sum() == sum(p.std is None for p in RESULT.parameters)
+    residuals = RESULT.fitted.to_frame()
+    assert len(residuals) == 200
+    found = plan(Design.of(PROBLEM), JOINTS, JOINTS[:20], 12)
+    values = found.to_frame()
+    np.testing.assert_array_equal(values.filter(like='q'), found.joints[found.visit])
+
+
+def test_without_pandas_that_is_said(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    with pytest.raises(calib_ros.CalibrationError, match='pip install pandas'):
+        RESULT.to_frame()
+
+
+def test_a_notebook_shows_the_verdict_and_its_reasons():
+    refused = replace(RESULT, refusals=(Reason(Rule.GAIN, 'no <b>gain'),))
+    assert 'accepted</strong>' in RESULT._repr_html_()
+    shown = refused._repr_html_()
+    assert 'not accepted' in shown
+    assert 'no &lt;b&gt;gain' in shown
 
 
 def test_arrays_are_told_by_their_shape():

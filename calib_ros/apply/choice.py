@@ -33,12 +33,9 @@ CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
 Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """Returns the worth (N,) of candidates from information (P, P) and their rows (N, m, P)."""
 
-RIDGE = 1e-9
-"""Information about everything, in that of an average candidate, that keeps M invertible."""
-SWEEPS = 20
-"""Most rounds of exchanges."""
-GAIN = 1e-9
-"""Least relative gain of an exchange."""
+ROUNDING = 1e-9
+"""Information about everything, in that of an average candidate, that keeps M invertible; and the
+least relative gain of an exchange, so that exchanges come to an end."""
 
 
 def choose(
@@ -85,9 +82,8 @@ def choose(
     pick = _Pick(space, apart)
     for _ in range(count):
         pick.add(pick.best(first))
-    for _ in range(SWEEPS):
-        if not pick.exchange(score):
-            break
+    while pick.exchange(score):
+        pass
     again = _Pick(space, apart)
     for _ in range(count):
         again.add(again.best(first, pick.chosen))
@@ -99,7 +95,7 @@ class _Pick:
 
     def __init__(self, space: Candidates, apart: float) -> None:
         self._joints, self._rows = space.joints, space.rows
-        self._start = space.known + RIDGE * np.eye(len(space.known))
+        self._start = space.known + ROUNDING * np.eye(len(space.known))
         self._apart = apart
         self._near: list[NDArray[np.bool_]] = []
         self._blocked = np.zeros(len(space.rows), dtype=np.intp)
@@ -138,7 +134,7 @@ class _Pick:
             self.information = self.information - information_of(self._rows[old])
             worth = np.where(self._blocked > 0, -np.inf, score(self.information, self._rows))
             new = int(worth.argmax())
-            if worth[new] - worth[old] > GAIN * abs(worth[old]):
+            if worth[new] - worth[old] > ROUNDING * abs(worth[old]):
                 changed = True
             else:
                 new = old
@@ -212,7 +208,7 @@ def efficiency(
     (Kiefer and Wolfowitz 1960) bounds what the candidates with the steepest slopes would bring.
     """
     space = Candidates(design, candidates)
-    ridge = RIDGE * np.eye(len(space.known))
+    ridge = ROUNDING * np.eye(len(space.known))
     root = _root(space.known + information_of(space.rows[chosen]) + ridge)
     slope = root @ root.T
     if task is not None:

@@ -31,11 +31,10 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 EXACT, COMPROMISE = 1e-6, 0.02
-"""Orientation errors [rad] tolerated of arms that can reach every orientation, and of others."""
+"""Orientation errors [rad] tolerated of arms that can reach every orientation, and of others.
+By the former [rad or m] a command may lie beyond a limit: that is rounding."""
 CHANGE_FLOOR = 1e-5
 """Changes of the correction that are never a jump, in units of the largest correction."""
-ON_LIMIT = 1e-6
-"""How far [rad or m] a command may lie beyond a limit by rounding."""
 POSITIVE = (
     *('largest_turn', 'largest_shift', 'largest_position_error', 'largest_orientation_error'),
     *('orientation_weight', 'largest_change'),
@@ -261,7 +260,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     if tolerated is None:
         tolerated = EXACT if follower.complete else COMPROMISE
     command, correction = result.command, result.correction
-    beyond = (command < follower.lower - ON_LIMIT) | (command > follower.upper + ON_LIMIT)
+    beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
     remaining = result.position > compensator.largest_position_error
     remaining |= result.orientation > tolerated

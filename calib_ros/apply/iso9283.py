@@ -25,15 +25,11 @@ from calib_ros.kinematics.se3 import FloatArray
 
 CENTRES = 500
 """Reachable poses about which a cube is grown."""
-FIRST_EDGE, GROWTH = 0.02, 1.3
-"""Edge [m] of the first cube, and by how much it grows at a time."""
-FINER = 4
-"""Times that the growth is refined: to GROWTH ** (1 / 16)."""
+FIRST_EDGE, GROWTHS = 0.02, 1.3**0.5 ** np.arange(5)
+"""Edge [m] of the first cube, and by how much it grows at a time, finer and finer."""
 CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 PLANE = [7, 5, 0, 2]
 """Corners of the plane x = z of the cube, round about."""
-INSIDE = 0.8
-"""Where on the way from the centre to a corner a test pose is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +79,14 @@ def iso_9283_poses(
     middle = draw_candidates(design, CENTRES, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)
     cubes = _grown(design, visibility, _Cubes(0.0, design.targets(middle), middle, start))
-    if not cubes.edge:
+    if not len(cubes.centres):
         raise InputError(
             'the arm keeps one orientation in no cube of its workspace: choose test poses '
             'yourself; new ones anywhere will do'
         )
     travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
     best = cubes.select(travel.argmin()[np.newaxis])
-    wanted = _poses(design, best.centres, INSIDE * best.edge)[0, PLANE]
+    wanted = _poses(design, best.centres, 0.8 * best.edge)[0, PLANE]
     found = inverse.solve(design.chain, wanted, best.corners[0, PLANE], design.base, design.tool)
     if not found.converged.all():
         raise InputError(
@@ -101,16 +97,11 @@ def iso_9283_poses(
 
 def _grown(design: Design, visibility: Visibility | None, cubes: _Cubes) -> _Cubes:
     """Return the cubes that can be grown furthest."""
-    factor, finer = GROWTH, 0
-    while finer <= FINER:
-        edge = FIRST_EDGE if not cubes.edge else cubes.edge * factor
-        more = _at(design, visibility, cubes, edge)
-        if len(more.centres):
-            cubes = more
-        elif not cubes.edge:
-            return cubes
-        else:
-            factor, finer = factor**0.5, finer + 1
+    cubes = _at(design, visibility, cubes, FIRST_EDGE)
+    for factor in GROWTHS:
+        grown = cubes
+        while len(grown.centres):
+            cubes, grown = grown, _at(design, visibility, grown, grown.edge * factor)
     return cubes
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from calib_ros.apply.design import Design, accuracy, predicted
 from calib_ros.errors import InputError
 from calib_ros.identification.observations import STILL
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_frame
 
 RANDOM_DRAWS = 25
 """Random choices that a plan is compared with."""
@@ -92,6 +93,14 @@ class Plan(Shown):
     at_random: FloatArray
     efficiency: float | None
     lacking: tuple[str, ...]
+
+    def to_frame(self) -> Any:
+        """Return the joint values [rad or m] in the order of visit as a pandas.DataFrame.
+
+        `telling` is the place of a pose among the most telling ones, the first of which is 1.
+        """
+        columns = {f'q{k}': column[self.visit] for k, column in enumerate(self.joints.T, 1)}
+        return as_frame({'telling': self.visit + 1, **columns})
 
 
 def plan(

@@ -17,14 +17,18 @@ from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
+    add_history,
     add_identity,
     add_layout,
     add_out,
     add_settings,
+    filing_of,
+    history_of,
     origin_of,
     results,
     settings_of,
 )
+from calib_ros.cli.recalibrate import add_previous, recalibrated
 from calib_ros.cli.results import (
     RESULT_FILES,
     Identified,
@@ -36,7 +40,10 @@ from calib_ros.cli.results import (
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
+    from calib_ros.cli.inputs import Loaded
     from calib_ros.cli.screen import Screen
+    from calib_ros.files.history import History
+    from calib_ros.settings import Settings
 
 LAYOUT = (
     *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
@@ -91,6 +98,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     )
     group = parser.add_argument_group('what to write')
     add_out(group, 'calibration, result and report')
+    add_history(group)
     group.add_argument('--json', action='store_true', help='print the result as JSON')
     group.add_argument(
         '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
@@ -99,6 +107,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_settings(parser)
     add_layout(parser)
     add_identity(parser, pdf=True)
+    add_previous(parser)
 
 
 def _add_detections(parser: argparse.ArgumentParser) -> None:
@@ -122,6 +131,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
+    if options.previous is not None:
+        return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
+    history = history_of(options)
     if options.out is None:
         found = _identified(options, screen)
     else:
@@ -129,6 +141,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             found = _identified(options, screen)
             made = result_files(found, screen, options.out, options.tolerance, options.pdf)
             write_files(folder, made)
+    if history is not None:
+        _file(history, found, options)
     for warning in (*found.warnings, *found.result.remarks):
         screen.warn(warning)
     if options.json:
@@ -136,6 +150,16 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     else:
         show(found, screen, options.out)
     return 0 if found.result.accepted else NOT_ACCEPTED
+
+
+def _file(history: History, found: Identified, options: argparse.Namespace) -> None:
+    from calib_ros.files.rows import identified, settings_hash
+
+    problem = found.loaded.problem
+    hashed = settings_hash(problem.chain, settings_of(options), options.largest_loss)
+    measured = options.csv or options.detections or options.measured
+    about = filing_of(options, (*problem.sets, *problem.judging), measured, hashed)
+    history.file(identified(found.result, about, found.warnings))
 
 
 def _source(options: argparse.Namespace) -> str:
@@ -153,11 +177,10 @@ def _source(options: argparse.Namespace) -> str:
     return source
 
 
-def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
-    """Return what there is to identify in a table or a bag."""
+def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
+    """Return what there is to identify in a table or a bag, and the settings."""
     from calib_ros.files.boards import POSED, posed_arm
     from calib_ros.kinematics.chain_file import load_chain
-    from calib_ros.report import words
 
     source = _source(options)
     chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
@@ -170,6 +193,14 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
         loaded = of_table(options, chain, settings, screen)
     else:
         loaded = of_bag(options.measured, chain, settings, screen, options.largest_loss)
+    return loaded, settings
+
+
+def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
+    """Return what is identified."""
+    from calib_ros.report import words
+
+    loaded, settings = _loaded(options, screen)
     configuration = words.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
     return identified(loaded, settings, screen, origin_of(options, read, configuration))

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 SIGMA_TOUCH = 1e-4
 """Standard deviation [m] of heights over touched planes, if it is not given."""
-SOCKETS = 0.05
 """Distance [m] between two sockets of a place, if it is not given."""
 
 
@@ -99,6 +98,7 @@ def of_table(
 ) -> Loaded:
     """Return what is to be fitted of a table."""
     from calib_ros.identification.problem import Problem
+    from calib_ros.sampling.sample import SOCKETS
 
     found = table(options, options.csv, chain, settings, screen, options.eye_in_hand)
     sockets = SOCKETS if options.socket_distance is None else options.socket_distance

@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import fields
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -17,6 +18,9 @@ from calib_ros.errors import InputError
 if TYPE_CHECKING:
     from calib_ros.cli.screen import Screen
     from calib_ros.files.foreign import Foreign
+    from calib_ros.files.history import History
+    from calib_ros.files.rows import Filing
+    from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain import Chain
     from calib_ros.report.page import Origin, Report
     from calib_ros.settings import Settings
@@ -225,6 +229,38 @@ def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
         add(f'--{name}', default='', metavar='NAME', help=text)
     if pdf:
         add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
+
+
+def add_history(parser: Group) -> None:
+    """Add the option that says where a result is filed besides."""
+    parser.add_argument(
+        '--history',
+        metavar='DIR',
+        help='file the result there as well, by --serial',
+    )
+
+
+def history_of(options: argparse.Namespace) -> History | None:
+    """Return where a result is filed, if it is to be; refuse one without a serial number."""
+    if options.history is None:
+        return None
+    from calib_ros.files.history import History
+
+    if not options.serial:
+        raise InputError('--history files by serial number: give --serial as well')
+    return History(options.history)
+
+
+def filing_of(
+    options: argparse.Namespace, sets: Sequence[Observations], measured: Path, settings: str
+) -> Filing:
+    """Return what is filed of a result besides the result; `settings` is a hash."""
+    from calib_ros.files.rows import Filing, content_hash, measured_at
+    from calib_ros.report.page import input_of
+
+    changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
+    content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
+    return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
 
 
 def origin_of(

@@ -16,10 +16,13 @@ from calib_ros.cli.options import (
     OF_BAGS,
     add_calibration,
     add_chain,
+    add_history,
     add_identity,
     add_layout,
     add_out,
     add_settings,
+    filing_of,
+    history_of,
     origin_of,
     page_of,
     results,
@@ -32,6 +35,8 @@ if TYPE_CHECKING:
 
     from calib_ros.apply.verification import Verification
     from calib_ros.cli.screen import Screen
+    from calib_ros.files.history import History
+    from calib_ros.identification.calibration import Calibration
     from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain import Chain
 
@@ -75,6 +80,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         '--confidence', type=float, default=0.95, metavar='SHARE', help='of the verdict'
     )
     add_out(group, 'the report and the residuals')
+    add_history(group)
     add_settings(parser, OF_BAGS)
     add_layout(parser)
     add_identity(parser, pdf=True)
@@ -101,6 +107,7 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
     from calib_ros.report.poses import poses_to_verify
     from calib_ros.report.verified import verification_report
 
+    history = history_of(options)
     nominal = load_chain(options.chain)
     arm = load_calibration(options.calibration, nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
@@ -117,6 +124,8 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
             commanded,
             options.new_tool,
         )
+    if history is not None:
+        _file(history, found, options, arm, nominal, sets)
     for warning in warnings:
         screen.warn(warning)
     words = in_words(found)
@@ -170,6 +179,22 @@ def show(found: Verification, screen: Screen) -> None:
         screen.say(line.rstrip())
     for remark in remarks(found):
         screen.bullet(remark)
+
+
+def _file(
+    history: History,
+    found: Verification,
+    options: argparse.Namespace,
+    arm: Calibration,
+    nominal: Chain,
+    sets: Sequence[Observations],
+) -> None:
+    from calib_ros.files.rows import settings_hash, verified
+    from calib_ros.kinematics.chain_file import table_hash
+
+    judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
+    hashed = settings_hash(nominal, settings_of(options), table_hash(arm.chain), *judged_by)
+    history.file(verified(arm.chain, found, filing_of(options, sets, options.measured, hashed)))
 
 
 def _sets(

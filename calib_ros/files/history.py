@@ -108,7 +108,7 @@ class History:
         if len(new) >= UNCACHED:
             self._cache(serial, table)
         rows = [row for row in _rows_of(table) if row.key in keys]
-        return tuple(sorted(rows, key=lambda row: (row.time, row.key)))
+        return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))
 
     def _folder(self, serial: str) -> str:
         return f'{self._root}/{FOLDER}{quote(serial, safe="")}'

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files.tables import cells, columns
+from calib_ros.files.tables import SOCKET, cells, columns
 from calib_ros.sampling.sample import Sample
 
 
@@ -43,6 +43,7 @@ class Journal:
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
+        self._width: int | None = None  # of a journal without columns for sockets
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         try:
             self._lock()
@@ -60,6 +61,11 @@ class Journal:
             When the disk is full, say; what was written before is whole.
 
         """
+        if sample.socket and self._width:
+            raise OSError(
+                f'{self.path} is of an earlier version, without columns for sockets: call '
+                '~/clear to begin another'
+            )
         self._write(cells(sample))
 
     def remove(self, sample: Sample) -> None:
@@ -89,6 +95,9 @@ class Journal:
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""
         expected = ','.join(header).encode() + b'\n'
+        before = ','.join(header[: -len(SOCKET)]).encode() + b'\n'
+        if os.pread(self._file, len(before), 0) == before:
+            expected, self._width = before, len(header) - len(SOCKET)
         found = os.pread(self._file, len(expected), 0)
         if not expected.startswith(found):
             raise InputError(
@@ -104,6 +113,7 @@ class Journal:
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
+        row = row[: self._width]
         csv.writer(text).writerow(row)  # by its own end of lines it quotes names with any
         data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
         begin = os.fstat(self._file).st_size

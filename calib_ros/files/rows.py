@@ -120,6 +120,20 @@ def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
     return digest([chain_document(nominal), values, *more])
 
 
+def content_hash(files: Sequence[str], session: str = '') -> str:
+    """Return the hash of the content of files, by their own hashes, or of a session in them."""
+    return digest([session, *sorted(files)])
+
+
+def samples_hash(sets: Sequence[Observations]) -> str:
+    """Return the hash of samples that are in no file."""
+    found = hashlib.sha256()
+    for each in sets:
+        for array in (each.stamps_ns, each.joints, each.positions, each.rotations):
+            found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
 def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
     """Return when the last pose was measured; another time where stamps are no times."""
     last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
@@ -128,8 +142,8 @@ def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None)
     return datetime.fromtimestamp(last / 1e9, timezone.utc)
 
 
-def identified(result: Identification, about: Filing, kind: str = 'identify') -> Row:
-    """Return the row of an identification."""
+def identified(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:
+    """Return the row of an identification; `warnings` are of the measurements."""
     offsets = {str(each.name): each.offset for each in result.parameters}
     names = tuple(map(str, result.names))
     which = result.validation or result.fitted
@@ -138,10 +152,10 @@ def identified(result: Identification, about: Filing, kind: str = 'identify') ->
     limits = rms_interval(errors.position[shown], errors.configurations[shown], 0.975)
     freedom = result.uncertainty.overall
     return Row(
-        **_common(about, kind, result.chain),
+        **_common(about, 'identify', result.chain),
         verdict='accepted' if result.accepted else 'refused',
         reasons=tuple(map(str, result.refusals)),
-        remarks=tuple(map(str, result.remarks)),
+        remarks=tuple(map(str, (*warnings, *result.remarks))),
         **_figures(*which.figures, limits),
         freedom=freedom if np.isfinite(freedom) else None,
         names=names,

@@ -50,6 +50,7 @@ from calib_ros.values import (
 
 SPLITS = ('', 'train', 'test', 'removed')
 MOST_LINES = 5
+SOCKET = ('location', 'socket')
 """Lines that an error names."""
 
 
@@ -190,6 +191,7 @@ def columns(joints: int) -> list[str]:
         'spread',
         'session',
         'split',
+        *SOCKET,
     ]
 
 
@@ -208,10 +210,13 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row.append('' if sample.distance is None else repr(sample.distance))
     covariance = sample.covariance
     row += numbers(None if covariance is None else covariance[tuple(np.transpose(UPPER))], 21)
-    row += [to_cell(name) for name in (sample.device, sample.target, sample.frame_id)]
+    place = sample.device.rpartition('_')[::2] if sample.socket else ('', '')
+    device = '' if sample.socket else sample.device
+    row += [to_cell(name) for name in (device, sample.target, sample.frame_id)]
     row.append('1' if sample.eye_in_hand else '')
     row += [repr(sample.delay), str(sample.count), repr(sample.spread), sample.session]
-    return [*row, split or ('test' if sample.validation else 'train')]
+    row.append(split or ('test' if sample.validation else 'train'))
+    return [*row, *map(to_cell, place)]
 
 
 def table_text(samples: Sequence[Sample], joints: int) -> str:

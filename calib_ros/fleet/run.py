@@ -211,7 +211,9 @@ def _version() -> str:
     return calib_ros.__version__
 
 
-def _done(client: Any, tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
+def _done(
+    client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
+) -> Iterator[tuple[Task, Outcome]]:
     """Yield tasks with what became of them, as they are done."""
     if not tasks:
         return
@@ -221,23 +223,19 @@ def _done(client: Any, tasks: Sequence[Task]) -> Iterator[tuple[Task, Outcome]]:
     running: dict[str, Task] = {}
 
     def submitted(count: int) -> list[Any]:
-        futures = []
-        for task in islice(waiting, count):
-            future = client.submit(work, task, pure=False)
-            running[future.key] = task
-            futures.append(future)
-        return futures
+        chosen = list(islice(waiting, count))
+        futures = client.map(work, chosen, pure=False) if chosen else []
+        running.update(zip((future.key for future in futures), chosen, strict=True))
+        return list(futures)
 
     ahead = AHEAD * max(1, len(client.nthreads()))
     completed = as_completed(submitted(ahead), client.loop, with_results=True, raise_errors=False)
     for future, result in completed:
         if future.status in ('cancelled', 'lost'):
-            raise LostError(
-                'the scheduler is lost: what was done is filed, start again for the rest'
-            )
-        for more in submitted(1):
-            completed.add(more)
+            raise LostError('the scheduler is lost: results so far are filed, run again')
         task = running.pop(future.key)
+        if len(running) <= ahead // 2:  # many at once cost the scheduler less
+            completed.update(submitted(ahead - len(running)))
         if future.status == 'error':
             result = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
         yield task, result

@@ -13,9 +13,9 @@ An arm is bumped at one joint, not at all of them. That joint j alone changed, b
     d_j = W_jj^-1 u_j,   covariance W_jj^-1,
 
 explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution where nothing
-changed: as many degrees of freedom as j has parameters, over those of the noise. s^2 >= 1 is by
-how much the nights so far scatter more than their covariances tell: what warms up, what the model
-lacks. After a change all begins anew.
+changed: as many degrees of freedom as j has parameters, over those of the noise. s^2 is by how
+much the nights so far scatter more than their covariances tell, where they clearly do: what warms
+up, what the model lacks. After a change all begins anew.
 """
 
 from __future__ import annotations
@@ -206,10 +206,13 @@ class _Data:
                 chances[number, nights, j] = special.fdtrc(len(group), self._freedom[nights], gain)
         return _Tests(chances, pull, weight)
 
-    @staticmethod
-    def _usual(scatter: FloatArray) -> float:
-        """Return how much nights scatter, by their covariances; 1 where these are right."""
-        return max(1.0, float(np.median(scatter))) if scatter.size else 1.0
+    def _usual(self, scatter: FloatArray) -> float:
+        """Return how much nights scatter, by their covariances; 1 where these may be right."""
+        if not scatter.size:
+            return 1.0
+        middle = float(np.median(scatter))
+        error = np.sqrt(np.pi / (len(self._names) * scatter.size))  # of a median, in normal terms
+        return middle if middle > 1.0 + 2.0 * error else 1.0
 
     def change(self, tests: _Tests, lag: int, k: int, time: datetime, seen: datetime) -> Change:
         """Return the change that was found by a lag at a night."""

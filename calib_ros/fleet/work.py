@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
 from calib_ros.files.bags import replay
-from calib_ros.files.rows import Filing, Row, digest, identified, measured_at
+from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
 from calib_ros.files.tables import read_table
 from calib_ros.fleet.plant import Robot
 from calib_ros.identification.identification import Identification
@@ -94,6 +94,7 @@ def sources(robot: Robot) -> tuple[Source, ...]:
         for path, info in sorted(matched.items()):
             fingerprint, modified = _state(files, path, info)
             url = path if _is_local(files) else files.unstrip_protocol(path)
+            url += each.files[each.files.find('::') :] if '::' in each.files else ''
             found.append(Source(url, each.session, fingerprint, modified))
     return tuple(found)
 
@@ -104,7 +105,7 @@ def work(task: Task) -> Outcome:
     try:
         with fetched(task.source.url) as path:
             inputs = input_of(path)
-            content = digest([task.source.session, *sorted(each.sha256 for each in inputs)])
+            content = content_hash([each.sha256 for each in inputs], task.source.session)
             if content in task.known and not task.page:
                 return Outcome()
             problem, result, warnings, lines = _identify(path, task)
@@ -117,8 +118,7 @@ def work(task: Task) -> Outcome:
                 source.name,
                 source.fingerprint,
             )
-            row = identified(result, about)
-            row = replace(row, remarks=(*warnings, *row.remarks))
+            row = identified(result, about, warnings)
             page = ''
             if task.page:
                 origin = Origin(

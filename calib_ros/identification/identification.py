@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -50,7 +51,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_frame, as_html
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
 
@@ -196,6 +197,35 @@ class Identification(Shown):
     def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
         """Return the pairs of parameters whose correlation exceeds a threshold."""
         return identifiability.correlated(self.covariance, self.names, threshold)
+
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas.DataFrame [m, rad]; `within_95` are half widths."""
+        rows = self.parameters
+        return as_frame(
+            {
+                'parameter': [str(p.name) for p in rows],
+                'value': [p.value for p in rows],
+                'offset': [p.offset for p in rows],
+                'std': [p.std for p in rows],
+                'within_95': [p.half_width() for p in rows],
+                'unit': [p.name.unit for p in rows],
+                'status': [p.status for p in rows],
+            }
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the verdict, its reasons and what was fitted, for notebooks."""
+        before, after = (self.validation or self.fitted).figures
+        rows = [('parameter', 'offset [mm, mrad]', '± (95 %)')]
+        rows += [
+            (str(p.name), f'{1e3 * p.offset:+.4f}', f'{1e3 * (p.half_width() or 0.0):.4f}')
+            for p in self.parameters
+            if p.std is not None
+        ]
+        figures = f'RMS {before.rms_mm:.3f} → {after.rms_mm:.3f} mm, by {self.validated_by}'
+        verdict = 'accepted' if self.accepted else 'not accepted'
+        notes = (figures, *self.refusals, *self.remarks)
+        return as_html(f'{self.chain.name}: {verdict}', notes, rows)
 
     @property
     def not_excited(self) -> tuple[str, ...]:

@@ -5,8 +5,8 @@
 Where the nominal arm misses the measurements by more than faulty arms do, each suspect changes
 some samples, or the chain, and base and tool are found anew in closed form (`start.py`). Of the
 best few they are polished by least squares. A suspect is named when the typical error so is
-NEARER times that as given and within what faulty arms show; those that explain the same are named
-together.
+NEARER times that as given and within what faulty arms show; those that explain nearly as much are
+named with it.
 
 The typical error is the median over the samples of the distance and the angle times LEVER, in
 units of the spread of the positions.
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 SAMPLES = 48
 """Samples of a set, spread evenly, by which suspects are tried."""
 NEARER = 0.3
-"""Ratio of the typical errors from which a suspect is named."""
+"""Ratio of the typical errors from which a suspect is named, or another is not named with it."""
 ALIKE = 1.5
-"""Ratio of the typical errors of suspects that explain the same."""
+"""Ratio of the typical errors of suspects that explain the same: the most usual are named."""
 POLISHED = 6
 """Suspects that are polished."""
 MEANINGLESS = 0.25
@@ -145,10 +145,11 @@ def explained(problem: Problem) -> Explained | None:
         return None
     if best.share > min(NEARER * given.share, MEANINGLESS):
         return None
-    same = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
-    lowest = min(each.rank for each in same)
-    named = tuple(each for each in same if each.rank == lowest)[:3]
-    return Explained(named, given.error, best.error)
+    named = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
+    lowest = min(each.rank for each in named)
+    named = [each for each in named if each.rank == lowest]
+    named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
+    return Explained(tuple(named[:3]), given.error, best.error)
 
 
 def _known(frame: Frame | None) -> Frame | None:

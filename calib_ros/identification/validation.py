@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, as_frame
 
 CONFIDENCE = 0.95
 """One-sided confidence that a gain on held-out poses must have to be claimed."""
@@ -124,6 +125,16 @@ class Comparison(Shown):
     def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after, without outliers."""
         return self.before.figures(self.judged), self.after.figures(self.judged)
+
+    def to_frame(self) -> Any:
+        """Return the residuals of position [m] before and after as a pandas.DataFrame."""
+        columns = {
+            f'{when}_{axis}': residuals.position[:, k]
+            for when, residuals in (('before', self.before), ('after', self.after))
+            for k, axis in enumerate('xyz')
+        }
+        groups = {'configuration': self.after.configurations, 'judged': self.judged}
+        return as_frame(columns | groups)
 
     @property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:

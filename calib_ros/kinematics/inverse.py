@@ -78,18 +78,10 @@ def solve(
 
     """
     aim = Aim(chain, base, tool)
-    lower, upper = (end[:, np.newaxis] for end in limits(chain))
-    turns = np.array([[2.0 * np.pi * (joint.type == 'revolute')] for joint in chain.joints])
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
-    def within(q: FloatArray) -> FloatArray:
-        """Bring joint values into the limits, by a full turn where that helps."""
-        q = np.where((q > upper) & (q - turns >= lower), q - turns, q)
-        q = np.where((q < lower) & (q + turns <= upper), q + turns, q)
-        return np.clip(q, lower, upper)
-
-    q = within(np.array(start, dtype=float).T)
+    q = _within(chain, np.array(start, dtype=float).T)
     error, columns = aim.linearise(q, None, positions, axes, LEVER)
     size = np.linalg.norm(error, axis=0)
     least, first, most = DAMPING
@@ -103,7 +95,7 @@ def solve(
         normal = np.einsum('ikb,jkb->ijb', part, part)
         normal[diagonal] += damping[active]
         slope = np.einsum('ikb,kb->ib', part, error[:, active])
-        tried = within(q[:, active] + solve_positive(normal, slope))
+        tried = _within(chain, q[:, active] + solve_positive(normal, slope))
         new_error, new_columns = aim.linearise(
             tried, None, positions[:, active], axes[:, :, active], LEVER
         )
@@ -120,6 +112,15 @@ def solve(
         np.linalg.norm(error[3:], axis=0) / LEVER,
         size <= TOLERANCE,
     )
+
+
+def _within(chain: Chain, q: FloatArray) -> FloatArray:
+    """Bring joint values (n, B) into the limits, by a full turn where that helps."""
+    lower, upper = (end[:, np.newaxis] for end in limits(chain))
+    turns = np.array([[2.0 * np.pi * (joint.type == 'revolute')] for joint in chain.joints])
+    q = np.where((q > upper) & (q - turns >= lower), q - turns, q)
+    q = np.where((q < lower) & (q + turns <= upper), q + turns, q)
+    return np.clip(q, lower, upper)
 
 
 class Aim:

@@ -33,8 +33,6 @@ from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_ur
 
 DIGITS = 14
 """Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
-POSES = 1000
-"""Random poses at which a corrected URDF, read back, is held against the arm."""
 EXACT = 1e-9
 """Largest difference [m or 1] of poses by a corrected chain and by the URDF written from it."""
 MOST_JOINTS = 50
@@ -91,12 +89,10 @@ def chain_from_urdf(
         rows[i] = _towards(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
         frame = frame @ _ends(Chain('row', 'standard', (rows[i],)))[0]
     rows[-1] = replace(rows[-1], d=_clean(float(frame[:3, 2] @ (tip - frame)[:3, 3])))
-    if convention == 'modified':
-        straight = Joint('straight')
-        rows = [
-            replace(row, a=before.a, alpha=before.alpha, beta=before.beta)
-            for before, row in zip([straight, *rows[:-1]], rows, strict=True)
-        ]
+    if convention == 'modified':  # bends stand in the next row
+        bends = [Joint('straight'), *rows[:-1]]
+        pairs = zip(rows, bends, strict=True)
+        rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
     x, y, z = (_clean(-9.81 * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
     ends = _ends(chain)
@@ -155,7 +151,7 @@ def corrected_urdf(
         origins[joint.name] = se3.invert(parent) @ pose
     edited = with_origins(text, origins)
     found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
-    q = arm.random_joints(POSES, np.random.default_rng(0))
+    q = arm.random_joints(1000, np.random.default_rng(0))
     if np.abs(found.forward(q) - arm.forward(q)).max() > EXACT:
         raise ConfigError(
             f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '

@@ -11,7 +11,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from xml.parsers import expat
 
@@ -139,21 +139,7 @@ def parse_urdf(text: str) -> Description:
         When it is no URDF.
 
     """
-    if _DOCTYPE.search(text):
-        raise ConfigError(
-            'the URDF has a <!DOCTYPE>, in which entities can stand for anything: remove it, no '
-            'URDF needs one'
-        )
-    if len(text) > LARGEST_TEXT:
-        raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
-    try:
-        root = ET.fromstring(text)
-    except (ET.ParseError, ValueError) as err:  # the latter for what UTF-8 cannot hold
-        raise ConfigError(f'the URDF is not valid XML: {err}') from err
-    if any('xacro' in element.tag.rpartition('}')[0] for element in root.iter()):
-        raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
-    if root.tag != 'robot':
-        raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>')
+    root = _robot(text)
     masses = [(element.get('name', ''), _inertial(element)) for element in root.findall('link')]
     links = dict(masses)
     described = root.findall('joint')
@@ -173,18 +159,43 @@ def parse_urdf(text: str) -> Description:
     if len(roots) != 1:
         found = ', '.join(roots) or 'none'
         raise ConfigError(f'the links of a URDF are a tree with one root; roots here: {found}')
+    name = parse_name(root.get('name') or 'robot', 'the name of the robot')
+    return Description(name, roots[0], links, _outwards(joints, roots[0]))
+
+
+def _robot(text: str) -> ET.Element:
+    """Return the root of the text of a URDF."""
+    if _DOCTYPE.search(text):
+        raise ConfigError(
+            'the URDF has a <!DOCTYPE>, in which entities can stand for anything: remove it, no '
+            'URDF needs one'
+        )
+    if len(text) > LARGEST_TEXT:
+        raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
+    try:
+        root = ET.fromstring(text)
+    except (ET.ParseError, ValueError) as err:  # the latter for what UTF-8 cannot hold
+        raise ConfigError(f'the URDF is not valid XML: {err}') from err
+    if any('xacro' in element.tag.rpartition('}')[0] for element in root.iter()):
+        raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
+    if root.tag != 'robot':
+        raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>')
+    return root
+
+
+def _outwards(joints: Sequence[DescribedJoint], root: str) -> tuple[DescribedJoint, ...]:
+    """Return joints in an order in which what carries them is before them."""
     behind: dict[str, list[DescribedJoint]] = {}
     for joint in joints:
         behind.setdefault(joint.parent, []).append(joint)
-    outwards = list(behind.get(roots[0], ()))
+    outwards = list(behind.get(root, ()))
     for joint in outwards:  # grows
         outwards += behind.get(joint.child, ())
     if len(outwards) < len(joints):
         reached = {joint.child for joint in outwards}
         loop = ', '.join(joint.name for joint in joints if joint.child not in reached)
         raise ConfigError(f'the links of a URDF are a tree; there is a loop among joints {loop}')
-    name = parse_name(root.get('name') or 'robot', 'the name of the robot')
-    return Description(name, roots[0], links, tuple(outwards))
+    return tuple(outwards)
 
 
 def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:

@@ -18,15 +18,13 @@ from calib_ros.report.figures import numbers, unit_of
 from calib_ros.report.poses import FITTED, JUDGED, REPEATED, Poses
 
 MOST = 20_000
-"""Poses that are shown one by one."""
+"""Poses that are shown one by one; of more so many, evenly spread, give the quantiles."""
 LARGEST = 300
 """Poses of the largest errors, and outliers, that are listed of more."""
 BINS = 60
 """Parts of the session, and of each joint's values, whose quantiles are shown."""
 CELLS = 24
 """Cells along the longest edge of the workspace."""
-DRAWN = 20_000
-"""Poses from which quantiles are taken, evenly spread over the session."""
 SHARES = (0.05, 0.5, 0.95)
 ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
 
@@ -100,7 +98,7 @@ def _values(poses: Poses, kind: str, when: str) -> FloatArray:
 def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     """Return quantiles of each kind of error over the session and over each joint's values."""
     good = np.flatnonzero(~poses.outlier)
-    good = good[:: 1 + len(good) // DRAWN]
+    good = good[:: 1 + len(good) // MOST]
     axes = {'session': good + 1.0}
     for k, joint in enumerate(chain.joints):
         axes[f'joint{k}'] = unit_of(joint)[0] * poses.joints[good, k]

@@ -30,7 +30,6 @@ MISSING_PDF = (
     'report.pdf is not written: it needs weasyprint and jinja2 (pip install "calib_ros[pdf]", or '
     'apt install weasyprint)'
 )
-BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -211,7 +210,7 @@ def input_of(path: Path) -> tuple[Input, ...]:
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with path.open('rb') as file:
-        while block := file.read(BLOCK):
+        while block := file.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
 

@@ -12,6 +12,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.validation import CONFIDENCE
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
 from calib_ros.report.advice import SPREAD, advice
@@ -30,9 +31,7 @@ from calib_ros.report.sections import (
     row_of,
 )
 
-ONE_SIDED = 0.95
-"""One-sided confidence of a verdict."""
-MOST_OUTLIERS = 50
+LISTED = 50
 """Outliers that have a row of their own table."""
 SURVEYED = 4000
 """Random poses of the error map."""
@@ -48,7 +47,7 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
-    limits = limits_of(judged, 1, ONE_SIDED)
+    limits = limits_of(judged, 1, CONFIDENCE)
     accuracy = [
         row
         for label, which in (('fitted', result.fitted), ('not fitted', result.validation))
@@ -218,7 +217,7 @@ def _outliers(result: Identification, poses: Poses) -> Section:
     rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
     rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
-    more = f' The {MOST_OUTLIERS} largest are shown.' if len(rows) > MOST_OUTLIERS else ''
+    more = f' The {LISTED} largest are shown.' if len(rows) > LISTED else ''
     return Section(
         'outliers',
         f'Outliers: {len(rows)} poses carry no or little weight',
@@ -229,7 +228,7 @@ def _outliers(result: Identification, poses: Poses) -> Section:
         head=('where', 'pose', 'size [usual errors]', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
-            for k in rows[:MOST_OUTLIERS].tolist()
+            for k in rows[:LISTED].tolist()
         ),
     )
 

@@ -43,9 +43,13 @@ BESIDE_SETTINGS = (
     Parameter(
         'tip_link', '', 'of a URDF: where the arm ends; default: tool0, flange or its only end'
     ),
-    Parameter('executor', 'events', 'events or single_threaded: how messages are taken'),
     Parameter('serial', '', 'serial number of the robot, for the record'),
     Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
+    Parameter(
+        'history',
+        '',
+        'folder in which results of ~/identify and ~/validate are filed by serial; default: none',
+    ),
     Parameter('resume', False, 'go on with the newest journal of this robot'),
     Parameter(
         'allowed_folders',
@@ -65,6 +69,14 @@ BESIDE_SETTINGS = (
         'newest, by autoload or ~/load',
         False,
     ),
+    Parameter(
+        'socket',
+        '',
+        'LOCATION/SOCKET, such as A/1, in which the ball on the flange sits when ~/capture is '
+        'called; default: none, a measurement is taken',
+        False,
+    ),
+    Parameter('socket_distance', 0.05, 'of the two sockets of a location [m]'),
     Parameter('marker_scale', 200.0, 'residual vectors are drawn so many times as long', False),
     Parameter(
         'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
@@ -16,7 +14,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.ros.parameters import FrameNames
+from calib_ros.ros.parameters import FrameNames, Links
 
 
 class Broadcast:
@@ -45,7 +43,7 @@ class Broadcast:
         names: FrameNames,
         in_hand: bool,
         urdf: str,
-        links: Mapping[str, str | None],
+        links: Links,
         latched: QoSProfile,
     ) -> None:
         self._node, self._names, self._in_hand = node, names, in_hand

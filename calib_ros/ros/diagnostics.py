@@ -66,7 +66,8 @@ class Diagnostics:
         """Publish how it goes, with the status in words, and what failed since the last time."""
         self.tried('the rates', self._inputs.look)
         account = self.tried('the account', self._session.account)
-        level, words, figures = DiagnosticStatus.OK, '', {}
+        level, words = DiagnosticStatus.OK, ''
+        figures: dict[str, Any] = {}
         if account is not None:
             judged = self.tried('judging', lambda: self._judged(account))
             level, words = judged or (level, words)

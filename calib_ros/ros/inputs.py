@@ -79,8 +79,9 @@ class Hearing:
     @property
     def silent(self) -> bool:
         """Tell whether it has been heard before and is not any more."""
-        heard = self.last is not None and not self.latched
-        return heard and time.monotonic() - self.last > SILENCE
+        if self.last is None or self.latched:
+            return False
+        return time.monotonic() - self.last > SILENCE
 
 
 class Inputs:
@@ -156,13 +157,14 @@ class Inputs:
     def figures(self) -> dict[str, Any]:
         """Return for the diagnostics what was heard on each topic."""
         now = time.monotonic()
-        heard = {topic: heard for topic, heard in self._heard.items() if heard.last is not None}
-        return {
-            **{f'rate of {topic} [Hz]': f'{each.rate:.1f}' for topic, each in heard.items()},
-            **{f'age of {topic} [s]': f'{now - each.last:.1f}' for topic, each in heard.items()},
-            **{f'lost on {topic}': each.lost for topic, each in heard.items()},
-            **{f'queue of {topic} full': each.full for topic, each in heard.items()},
-        }
+        found: dict[str, Any] = {}
+        for topic, each in self._heard.items():
+            if each.last is not None:
+                found[f'rate of {topic} [Hz]'] = f'{each.rate:.1f}'
+                found[f'age of {topic} [s]'] = f'{now - each.last:.1f}'
+                found[f'lost on {topic}'] = each.lost
+                found[f'queue of {topic} full'] = each.full
+        return found
 
     def _subscribe(self, stream: Stream) -> tuple[Subscription, tuple[Stream, Hearing]]:
         overriding = QoSOverridingOptions(

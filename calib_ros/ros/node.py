@@ -25,15 +25,10 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import rclpy
 from rcl_interfaces.msg import SetParametersResult
-from rclpy._rclpy_pybind11 import (  # these have no public names in Jazzy
-    InvalidHandle,
-    RCLError,
-    RCLInvalidROSArgsError,
-    UnknownROSArgsError,
-)
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
-from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.exceptions import InvalidHandle, ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -44,13 +39,14 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.errors import CalibrationError, advice_on
 from calib_ros.files.archive import Archive
 from calib_ros.files.waypoints import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.progress import Progress
 from calib_ros.report import words
 from calib_ros.ros import to_ros
@@ -58,19 +54,16 @@ from calib_ros.ros.advisor import Guide
 from calib_ros.ros.arguments import NODE, typed, usage
 from calib_ros.ros.deferred import DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
+from calib_ros.ros.filer import Filer
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import Exportable, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.problems import check_settings
 from calib_ros.sampling.sample import Sample, named
-from calib_ros.sampling.session import CalibrationSession, check_settings
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD, parse_sources
-
-try:
-    from rclpy.experimental import EventsExecutor
-except ImportError:  # an rclpy from before it had one
-    EventsExecutor = None
 
 TAKING_PERIOD = 0.1
 """Time [s] between two times at which the messages that have come are taken, all at once: one at
@@ -103,7 +96,7 @@ class Snapshot(NamedTuple):
         }
 
 
-class CalibrationNode(Node):
+class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     """Calibrates one robot from its joint states and measurements."""
 
     def __init__(self, **node_options: Any) -> None:
@@ -121,6 +114,8 @@ class CalibrationNode(Node):
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove
         )
+        self.session.socket_distance = given.socket_distance
+        self._filer = Filer(given.history, given.serial, chain)
         self._last = 'nothing identified yet'
         self._progress = Progress('identifying')
         self._observability = ''
@@ -159,6 +154,9 @@ class CalibrationNode(Node):
             self, '~/export', self._answer, self._to_export, self._keeper.export
         )
         self._save = DeferredTrigger(self, '~/save', self._answer, self._to_save, self._on_save)
+        self._check = DeferredTrigger(
+            self, '~/check', self._answer, self._to_check, self._on_check
+        )
         for kind, name, callback in (
             (Trigger, '~/cancel', self._on_cancel),
             (Trigger, '~/capture', self._on_capture),
@@ -186,7 +184,7 @@ class CalibrationNode(Node):
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        working = (self._identify, self._save, self._export, self._guide)
+        working = (self._identify, self._save, self._export, self._check, self._guide)
         ended = [each.join(JOIN_TIMEOUT) for each in working]
         self._take_messages()
         self.session.finish()
@@ -202,7 +200,7 @@ class CalibrationNode(Node):
     def _configuration(self) -> str:
         """Return what this node is set to as a parameter file."""
         given = self._given
-        more = {name: link for name, link in given.links.items() if link}
+        more = {name: str(link) for name, link in given.links.items() if link}
         if given.serial:
             more['serial'] = given.serial
         return words.configuration_yaml(given.chain, self.session.settings, **more)
@@ -344,6 +342,7 @@ class CalibrationNode(Node):
             self._guide.show(found)
         elif self.session.calibration is not None:
             self._last += '; the last good calibration stays'
+        self._last += self._filer.identified(given.problem, result, self.session.settings)
         return result.accepted, self._last
 
     def _page(self, given: Snapshot, result: Identification) -> str | None:
@@ -362,9 +361,12 @@ class CalibrationNode(Node):
         return self._progress.cancel()
 
     def _on_capture(self, request: Any) -> tuple[bool, str]:
-        count, why = self.session.capture()
+        socket = self.get_parameter('socket').value
+        count, why = self.session.capture(socket)
         if not count:
             return False, f'no sample taken: {why}'
+        if socket:
+            return True, f'sample {len(self.session.samples)} taken: ball in socket {socket}'
         taken = self.session.samples[-count:]
         words = ', '.join(
             f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken
@@ -376,8 +378,19 @@ class CalibrationNode(Node):
         return True, f'sample {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> tuple[bool, str]:
-        now, nominal = self.session.validate()
-        return words.verdict(self.session.calibration, now, nominal)
+        figures = self.session.validate()
+        calibration = self.session.calibration
+        assert calibration is not None  # else there was nothing to judge
+        holds, text = words.verdict(calibration, *figures)
+        return holds, text + self._filer.validated(self.session, figures, holds)
+
+    def _to_check(self) -> tuple[Calibration, Problem]:
+        self._take_messages()
+        return self.session.recent()
+
+    def _on_check(self, found: tuple[Calibration, Problem]) -> tuple[bool, str]:
+        calibration, problem = found
+        return words.checked(recalibrate(calibration, problem, years_since(calibration.record)))
 
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)
@@ -399,7 +412,8 @@ class CalibrationNode(Node):
 
     def _on_load(self, request: Any) -> tuple[bool, str]:
         self._last = f'loaded {self._keeper.load()}'
-        self._guide.show(self.session.calibration)
+        if self.session.calibration is not None:
+            self._guide.show(self.session.calibration)
         return True, self._last
 
     def _to_export(self) -> Exportable:
@@ -469,8 +483,10 @@ class CalibrationNode(Node):
         """Run the work of a service; an error is its answer. Who reads the log sees it, too."""
         try:
             success, text = work()
-        except (CalibrationError, OSError) as err:
+        except CalibrationError as err:
             success, text = False, str(err)
+        except OSError as err:
+            success, text = False, '; '.join(filter(None, (str(err), advice_on(err))))
         except Exception as err:
             self.get_logger().error(f'internal error: {traceback.format_exc()}')
             success, text = False, f'internal error, see the log: {err!r}'
@@ -479,15 +495,6 @@ class CalibrationNode(Node):
         elif text:
             self.get_logger().info(f'{name}: {text}')
         return bool(success), str(text)
-
-
-def _executor(kind: str) -> Executor:
-    kinds = {'events': EventsExecutor or SingleThreadedExecutor}
-    kinds['single_threaded'] = SingleThreadedExecutor
-    if kind not in kinds:
-        raise ConfigError(f'parameter "executor" must be one of {", ".join(kinds)}, not "{kind}"')
-    executor: Executor = kinds[kind]()
-    return executor
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -499,9 +506,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = usage(NODE)
     try:
         parser.parse_args(remove_ros_args(command)[1:])
-    except UnknownROSArgsError as err:
+    except rclpy_implementation.UnknownROSArgsError as err:
         parser.error(f'unknown ROS arguments: {err}')
-    except RCLInvalidROSArgsError as err:
+    except rclpy_implementation.RCLInvalidROSArgsError as err:
         parser.error(str(err))
     stop = threading.Event()
 
@@ -514,20 +521,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     handle_signals(on_signal)
     node: CalibrationNode | None = None
-    executor: Executor | None = None
+    executor: Any = None
     status, finished = 0, True
     try:
         rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
         node = CalibrationNode()
-        executor = _executor(node.get_parameter('executor').value)
-        handle_signals(on_signal)  # the events executor takes them when it is made
+        executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.announce()
         while not stop.is_set() and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
     except ExternalShutdownException:
         pass
-    except (CalibrationError, ParameterException, RCLError) as err:
+    except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
         print(f'calibration_node: {err}', file=sys.stderr)
         status = 1
     finally:

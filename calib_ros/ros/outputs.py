@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -50,7 +51,7 @@ class Exportable(NamedTuple):
     """The calibration, and the joint values of the samples."""
 
     calibration: Calibration
-    joints: Sequence[FloatArray] | None
+    joints: FloatArray | None
 
 
 class Keeper:
@@ -170,16 +171,17 @@ class Keeper:
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
-        joints = [sample.joints for sample in session.samples]
+        joints = np.array([sample.joints for sample in session.samples])
         with self._lock:
-            return Exportable(session.calibration, joints or None)
+            return Exportable(session.calibration, joints if len(joints) else None)
 
     def export(self, found: Exportable) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
         chain, record = found.calibration.chain, found.calibration.record
         nominal, links = self._session.chain, self._given.links
         forms = exports(chain, nominal, found.joints, record)
-        forms += vendor_files(chain, nominal, record, self._urdf, links)
+        ends = {'base_link': links['base_link'], 'tip_link': links['tip_link']}
+        forms += vendor_files(chain, nominal, record, self._urdf, ends)
         files = {each.name: each.content for each in forms}
         if self._urdf:
             text = corrected_urdf(self._urdf, chain, **links)

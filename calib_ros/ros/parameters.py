@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -31,6 +31,13 @@ DESCRIPTION_WAIT = 10.0
 """Time [s] for which the node waits for the robot's description."""
 
 
+class Links(TypedDict):
+    """The links of a URDF between which the arm is; None for those that are found."""
+
+    base_link: str | None
+    tip_link: str | None
+
+
 class FrameNames(NamedTuple):
     """What the frames are called on /tf_static; nothing is published of one without a name."""
 
@@ -44,14 +51,16 @@ class Given:
     """What a node was started with; what else may change is read where it is used."""
 
     chain: str
-    links: dict[str, str | None]
+    links: Links
     serial: str
+    history: str
     data_dir: Path | None
     allowed_folders: tuple[Path, ...]
     resume: bool
     autoload: bool
     candidates: Path | None
     frames: FrameNames
+    socket_distance: float
     settings: Settings
 
 
@@ -77,14 +86,16 @@ def declare_all(node: Node) -> Given:
         )
     return Given(
         chain=own['chain'],
-        links={name: own[name] or None for name in ('base_link', 'tip_link')},
+        links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
         serial=own['serial'],
+        history=own['history'],
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
         resume=own['resume'],
         autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
+        socket_distance=own['socket_distance'],
         settings=settings,
     )
 
@@ -92,7 +103,7 @@ def declare_all(node: Node) -> Given:
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
     """Return settings with what changes of parameters make of them."""
     known = {item.name: item.default for item in fields(Settings)}
-    values = {
+    values: dict[str, Any] = {
         each.name: _names(each.value) if isinstance(known[each.name], tuple) else each.value
         for each in changes
         if each.name in known

@@ -11,7 +11,6 @@ must be decoded by itself.
 
 from __future__ import annotations
 
-import itertools
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,18 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.messages import (
-    JOINT_STATE,
-    LARGEST,
-    JointReadings,
-    MessageError,
-    Readings,
-    frame_name,
-    measured_covariance,
-)
-from calib_ros.sampling.track import Stamps
-from calib_ros.values import QUATERNION_TOLERANCE
+from calib_ros.sampling.messages import JOINT_STATE, Readings, frame_name
+from calib_ros.sampling.rows import Stamps
 
 LITTLE_ENDIAN = b'\x00\x01'
 MOST_NAMES = 10_000
@@ -50,16 +39,7 @@ _LAYOUTS: dict[str, tuple[int, int, str, int]] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Stamps (N,), the strings that all messages share, and their numbers (N, k)."""
-
-    stamps_ns: Stamps
-    strings: tuple[str, ...]
-    numbers: FloatArray
-
-
-def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
+def decode(kind: str, blobs: Sequence[bytes]) -> Readings | None:
     """Return messages of one topic as arrays; None where their layouts differ.
 
     Parameters
@@ -68,12 +48,6 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
         Message type: JointState or a type of measurement.
     blobs : sequence of bytes
         Serialised messages, each with its encapsulation.
-
-    Notes
-    -----
-    Strings are the frame and child frame of a measurement, or the frame and the joint names.
-    Numbers are position and quaternion (7), position (3), those and the covariance (43), field of
-    view, least, greatest and measured range (4), or the joint positions.
 
     """
     first = blobs[0]
@@ -85,57 +59,16 @@ def decode(kind: str, blobs: Sequence[bytes]) -> Batch | None:
     except (struct.error, UnicodeDecodeError):
         return None
     size = np.dtype(dtype).itemsize
-    if begin + count * size > length:
+    if begin + count * size > length or (kind == JOINT_STATE and len(strings) != count + 1):
         return None
     rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
     names = rows[:, _HEAD + _STAMP : begin]
     if (rows[:, :2] != rows[0, :2]).any() or (names != names[0]).any():
         return None
     numbers = _numbers(rows, begin, dtype, count)
-    return Batch(_stamps(_numbers(rows, _HEAD, '<u4', 2)), strings, numbers.astype(np.float64))
-
-
-def readings(
-    kind: str, blobs: Sequence[bytes]
-) -> tuple[JointReadings | Readings, NDArray[np.bool_]] | None:
-    """Return what the decoders of `messages` make of messages; None where their layouts differ.
-
-    Returns
-    -------
-    found : JointReadings or Readings
-        Those of the messages that the decoders would take.
-    good : (N,) bool
-        Which these are.
-
-    """
-    batch = decode(kind, blobs)
-    if batch is None:
-        return None
-    numbers = batch.numbers
-    frame_id, *names = batch.strings
-    good = batch.stamps_ns > 0
-    if kind == JOINT_STATE:
-        if len(names) != numbers.shape[1]:
-            return None
-        return JointReadings(batch.stamps_ns[good], tuple(names), numbers[good]), good
-    child = names[0] if names else ''
-    if not child.isprintable():
-        return None
-    good &= np.isfinite(numbers).all(axis=1)
-    distance = kind.endswith('/Range')
-    if distance:
+    if kind.endswith('/Range'):  # after field of view, least and greatest range
         numbers = numbers[:, 3:]
-        good &= (numbers[:, 0] > 0.0) & (numbers[:, 0] <= LARGEST)
-    else:
-        good &= (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
-    if numbers.shape[1] >= 7:
-        with np.errstate(over='ignore'):  # of what is not good
-            length = np.linalg.norm(numbers[:, 3:7], axis=1)
-        good &= np.abs(length - 1.0) <= QUATERNION_TOLERANCE
-    if numbers.shape[1] > 7:
-        good &= _usable_covariances(numbers[:, 7:])
-        numbers[~numbers[:, 7:].any(axis=1), 7:] = np.nan
-    return Readings(batch.stamps_ns[good], frame_id, child, distance, numbers[good]), good
+    return Readings(_stamps(_numbers(rows, _HEAD, '<u4', 2)), strings, numbers.astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,25 +101,16 @@ class Alike:
         """Return which frames their transforms link."""
         return self.layout.links
 
-    def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
-        """Return stamps (N,) and numbers (N, 7) of one transform of each, and which are usable."""
+    def of(self, k: int) -> Readings:
+        """Return stamps (N,) and numbers (N, 7) of one transform of each."""
         numbers = _numbers(self.rows, self.layout.numbers[k], '<f8', 7).astype(np.float64)
         stamps = _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2))
-        return stamps, numbers, usable(numbers)
+        return Readings(stamps, self.links[k], numbers)
 
     def span(self, k: int) -> tuple[int, int]:
         """Return the first and the last stamp of one transform of each."""
         (s, ns), (t, nt) = (struct.unpack_from('<iI', x, self.layout.stamps[k]) for x in self.ends)
         return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
-
-
-def usable(numbers: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which positions and quaternions (N, 7) the decoders would take."""
-    good = np.isfinite(numbers).all(axis=1) & (np.abs(numbers[:, :3]) <= LARGEST).all(axis=1)
-    with np.errstate(over='ignore'):  # of what is not good
-        length = np.linalg.norm(numbers[:, 3:], axis=1)
-    found: NDArray[np.bool_] = good & (np.abs(length - 1.0) <= QUATERNION_TOLERANCE)
-    return found
 
 
 def transforms(blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:
@@ -255,18 +179,6 @@ def _transform_layout(blob: bytes) -> Layout:
     text = np.frombuffer(blob, dtype=np.uint8)[places]
     last = int(names[-1][0]), int(names[-1][-1]) + 1
     return Layout(tuple(links), tuple(stamps), tuple(numbers), places, last, text)
-
-
-def _usable_covariances(rows: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which covariances (N, 36) are none or usable; mostly all are the same."""
-    usable = np.ones(len(rows), dtype=bool)
-    changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
-    for begin, end in itertools.pairwise((0, *changes.tolist(), len(rows))):
-        try:
-            measured_covariance(rows[begin])
-        except MessageError:
-            usable[begin:end] = False
-    return usable
 
 
 def _stamps(times: NDArray[np.generic]) -> Stamps:

@@ -13,53 +13,29 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.delay import Delay, find_delay
-from calib_ros.sampling.messages import Reading
+from calib_ros.sampling.interpolation import unwrapped
+from calib_ros.sampling.making import WIDTH, Maker
+from calib_ros.sampling.rests import Rests
+from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.stops import Mean, RestlessError, average
+from calib_ros.sampling.slices import JOINTS, Slice, StreamKey
 from calib_ros.sampling.strays import JUMP
-from calib_ros.sampling.track import CAUSES, Motion, Rows, Stamps, Track, unwrapped
+from calib_ros.sampling.track import CAUSES, Track
 from calib_ros.settings import Settings
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
-STILL = 6.0
-"""What `still` must be at least [noise of the joints] for a stop to show as one."""
-MOST_RESTS = 1000
-"""Rests in which no stop shows that are counted."""
 MOST_STREAMS = 50
 """Streams of measurements that are told apart: a tracker may number its markers without end."""
-_DISTANCE, _POSITION, _QUAT, _COVARIANCE = slice(0, 1), slice(0, 3), slice(3, 7), slice(7, 43)
-_WIDTH = 43
 TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
-VIBRATING = 'poses: still vibrating, or a spike'
-RESTLESS = 'poses: a stop that spreads more than the noise'
-_ONE = np.ones(1, dtype=bool)
-_FOREVER = np.iinfo(np.int64).max
-
-
-class StreamKey(NamedTuple):
-    """What one stream of measurements is of: device, target, and whether it only judges.
-
-    What is measured in another frame is another stream.
-    """
-
-    device: str
-    target: str
-    validation: bool
-    distance: bool
-    eye_in_hand: bool
-    frame_id: str = ''
 
 
 class Collector:
@@ -76,114 +52,96 @@ class Collector:
     def __init__(self, revolute: Sequence[bool], settings: Settings) -> None:
         self.settings = settings
         self._revolute = np.array(revolute, dtype=bool)
-        self._track = Track(revolute, settings.max_gap, settings.joint_buffer)
+        self.track = Track(revolute, settings.max_gap, settings.joint_buffer)
         self._waiting: dict[StreamKey, Rows] = {}
-        self._taken: dict[StreamKey, set[int]] = {}
         self._stops = Rows(1 + len(revolute), settings.pose_buffer)  # how long, and where
         self._lateness_ns = round(settings.lateness * 1e9)
-        self._advanced_ns = 0  # the newest joint sample at the last round
+        self._newest_ns = 0  # the last joint sample
+        self._advanced_ns = 0  # that at the last round
         self._settled_ns = 0  # measurements before have been dealt with
         self._sampled_ns = 0  # a stop that stands at this moment has been sampled
-        self._stopped = 0  # how many stops were sampled
-        self._unseen: list[float] = []  # noise of the joints at rests in which no stop shows
-        self._rests = False
+        self.rests = Rests()
         self._backwards = 0
-        self._fresh: list[Sample] = []
         self.delay_ns = round(settings.delay * 1e9)
         """How much later than the joints' the stamps of measurements are."""
         self.holding = False
         """True while nothing may be taken because the delay is being looked for."""
-        self.dropped: Counter[str] = Counter()
+        self.maker = Maker(self._revolute, settings.pose_buffer)
+        self.dropped = self.maker.dropped
         self.unused: Counter[str] = Counter()
         """What no sample is made of in the ordinary course of things, by cause."""
         self.notes: Counter[str] = Counter()
-
-    @property
-    def track(self) -> Track:
-        """Return the recent joint samples."""
-        return self._track
 
     @property
     def waiting(self) -> int:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
 
-    def find_delay(self, chain: Chain, now_ns: int | None) -> Delay | None:
-        """Return how late the waiting measurements are, and take it into account from now on.
+    def known(self, now_ns: int | None) -> tuple[Stamps, FloatArray, list[Any]]:
+        """Return stamps and joint values, and stamps and rows (N, WIDTH) of waiting positions.
 
-        One that has rivals is not taken into account.
-        Only what is older by `lateness` than the stamp `now_ns` counts, of which all has come;
-        None: everything counts.
+        Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
         """
         self._sort()
-        stamps, joints = self._track.samples()
-        until = _FOREVER if now_ns is None else now_ns - self._lateness_ns
+        until = np.iinfo(np.int64).max if now_ns is None else now_ns - self._lateness_ns
+        stamps, joints = self.track.samples()
         complete = stamps <= until
-        found = []
-        for key, rows in self._waiting.items():
-            if key.distance or key.eye_in_hand:
-                continue
-            known = rows.stamps <= until
-            values = rows.values[known]
-            oriented = not np.isnan(values[:, _QUAT]).any()
-            rotations = se3.from_quat(values[:, _QUAT]) if oriented and len(values) else None
-            found.append(
-                find_delay(
-                    chain,
-                    stamps[complete],
-                    joints[complete],
-                    rows.stamps[known],
-                    values[:, _POSITION],
-                    rotations,
-                )
-            )
-        convincing = [delay for delay in found if delay is not None]
-        if not convincing:
-            return None
-        best = max(convincing, key=lambda delay: (not delay.rivals, delay.correlation))
-        if not best.rivals:
-            self.delay_ns = round(best.seconds * 1e9)
-        return best
+        positions = [
+            (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
+            for key, rows in self._waiting.items()
+            if not (key.distance or key.eye_in_hand)
+        ]
+        return stamps[complete], joints[complete], positions
 
-    def take(self) -> list[Sample]:
-        """Return the samples made since the last call."""
-        fresh, self._fresh = self._fresh, []
-        return fresh
+    def reach(self, given: Slice) -> int:
+        """Return how many of the first messages come up to one that gives something to do."""
+        if self.track.full:
+            self._make_room()
+        count = len(given)
+        joints = given.where(JOINTS)
+        stamps = given.times[joints]
+        late = joints[stamps < self.track.horizon_ns]
+        if len(late):  # one by one
+            count = max(int(late[0]), 1)
+        due = joints[stamps >= self._advanced_ns + ADVANCE_NS]
+        if len(due):
+            count = min(count, int(due[0]) + 1)
+        for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
+            room = self.track.room(columns)
+            if room <= len(joints):
+                places = [each.places for each in given.pieces if each.key == columns]
+                full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
+                count = min([count, *(full + 1).tolist()])
+        return count
 
-    def add_joints(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
-        """Take the values of some joints, given by their numbers in the chain."""
-        if stamp_ns < self._track.horizon_ns:
-            self._backwards += 1
-            if self._backwards < JUMP:
-                self.dropped['joints: later than lateness allows'] += 1
-                return
-            self.start_anew()
-        self._backwards = 0
-        if not self._track.room(columns):
-            self._make_room(columns)
-        self._track.add(columns, stamp_ns, values)
-        if stamp_ns - self._advanced_ns >= ADVANCE_NS:
-            self._advanced_ns = stamp_ns
-            if not self.holding:
-                self._round(self._complete_ns)
+    def take(self, given: Slice) -> bool:
+        """Take messages up to one that gives something to do; return whether it is a round."""
+        joints = given.where(JOINTS)
+        if len(joints):
+            newest = int(given.times[joints[-1]])
+            if newest < self.track.horizon_ns:
+                self._backwards += 1
+                if self._backwards < JUMP:
+                    self.dropped['joints: later than lateness allows'] += 1
+                    return False
+                self.start_anew()
+            self._backwards = 0
+            self._newest_ns = newest
+        for key, _, stamps, numbers in given.pieces:
+            if isinstance(key, StreamKey):
+                self._extend(key, stamps, numbers)
+            else:
+                self.track.extend(key, stamps, numbers)
+        return self._newest_ns - self._advanced_ns >= ADVANCE_NS
 
-    def uneventful(
-        self, columns: tuple[int, ...], stamps: Stamps, among: int
-    ) -> NDArray[np.bool_]:
-        """Return (M,) which joint samples would only be added, whatever the others do.
+    def round(self) -> None:
+        """Make samples of what is complete."""
+        self._advanced_ns = self._newest_ns
+        if not self.holding:
+            self._round(self._complete_ns)
 
-        The others may be of the same joints: there must be room for as many as come `among` them.
-        """
-        quiet = (stamps >= self._track.horizon_ns) & (stamps - self._advanced_ns < ADVANCE_NS)
-        return quiet & (self._track.room(columns) >= among)
-
-    def extend_joints(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
-        """Take uneventful joint samples: values (M, k) at stamps (M,)."""
-        self._backwards = 0
-        self._track.extend(columns, stamps, values)
-
-    def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray) -> None:
-        """Take measurements with nothing eventful between them: numbers (M, w) at stamps (M,)."""
+    def _extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray) -> None:
+        """Take measurements: numbers (M, w) at stamps (M,)."""
         rows = self._stream(key)
         if rows is None:
             self.dropped[TOO_MANY] += len(stamps)
@@ -200,88 +158,60 @@ class Collector:
         """Return the buffer of a stream; None when too many others are in use."""
         rows = self._waiting.get(key)
         if rows is None:
-            if len(self._waiting) >= MOST_STREAMS:
-                self._forget_idle()
+            if len(self._waiting) >= MOST_STREAMS:  # forget those without any use
+                idle = [key for key, rows in self._waiting.items() if not rows.count]
+                for each in idle:
+                    if not self.maker.has(each):
+                        del self._waiting[each]
             if len(self._waiting) >= MOST_STREAMS:
                 return None
-            rows = self._waiting[key] = Rows(_WIDTH, self.settings.pose_buffer)
+            rows = self._waiting[key] = Rows(WIDTH, self.settings.pose_buffer)
         return rows
-
-    def _forget_idle(self) -> None:
-        """Forget the streams of which nothing waits and no sample was made."""
-        for key in [key for key, rows in self._waiting.items() if not rows.count]:
-            if not self._taken.get(key):
-                del self._waiting[key]
-                self._taken.pop(key, None)
-
-    def add(self, key: StreamKey, reading: Reading) -> None:
-        """Take a measurement."""
-        rows = self._stream(key)
-        if rows is None:
-            self.dropped[TOO_MANY] += 1
-            return
-        if reading.stamp_ns - self.delay_ns <= self._settled_ns:
-            self.dropped['poses: later than lateness allows'] += 1
-            return
-        if rows.full:
-            self.dropped['poses: pose buffer full'] += 1
-            return
-        rows.append(reading.stamp_ns, reading.numbers)
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
         newest = [int(rows.stamps.max()) for rows in self._waiting.values() if rows.count]
         if newest:
-            self._round(min(self._track.newest_ns, min(newest) - self.delay_ns), ends_here=True)
+            self._round(min(self.track.newest_ns, min(newest) - self.delay_ns), ends_here=True)
 
     def finish(self) -> None:
         """Deal with everything; nothing more will come."""
-        self._round(self._track.newest_ns, ends_here=True)
+        self._round(self.track.newest_ns, ends_here=True)
         for rows in self._waiting.values():
             if rows.count:
-                self._count_causes(self._track.causes(rows.stamps - self.delay_ns))
+                self._count_causes(self.track.causes(rows.stamps - self.delay_ns))
                 rows.keep(np.zeros(rows.count, dtype=bool))
 
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
         self._sort()
-        newest = self._track.newest_ns
-        if not newest or self._track.missing:
+        newest = self.track.newest_ns
+        if not newest or self.track.missing:
             return 'waiting for joint states'
         if self.holding:
             return 'looking for the delay of the measurements: keep the arm moving'
         if self.settings.mode == 'continuous':
             return 'every measurement is taken'
-        stands = self._track.standing(self.settings.still, WINDOW)
+        stands = self.track.standing(self.settings.still, WINDOW)
         if not len(stands) or stands[-1, 1] < newest:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
             return 'the arm stands and is sampled: move on'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
-    @property
-    def still_needed(self) -> float | None:
-        """Return what `still` must be at least where more rests passed unseen than not."""
-        if len(self._unseen) <= self._stopped:
-            return None
-        needed = STILL * float(np.median(self._unseen))
-        return needed if needed > self.settings.still else None
+    def capture(self, place: str = '') -> tuple[int, str]:
+        """Take one sample of each stream now; return how many, and why not more in words.
 
-    @property
-    def unrest(self) -> int:
-        """Return how many measurements at stops were not at rest."""
-        return self.dropped[VIBRATING] + self.dropped[RESTLESS]
-
-    def capture(self) -> tuple[int, str]:
-        """Take one sample of each stream now; return how many, and why not more in words."""
+        With a place the target sits in a socket there, and nothing needs to be measured.
+        """
         if self.settings.mode == 'continuous':
             return 0, 'every measurement is taken in mode continuous'
         self._sort()
-        stands = self._track.standing(self.settings.still, WINDOW)
-        newest = self._track.newest_ns
+        stands = self.track.standing(self.settings.still, WINDOW)
+        newest = self.track.newest_ns
         if not newest:
             return 0, 'no joint states have come'
-        if not self.waiting:
+        if not (self.waiting or place):
             return 0, 'no measurements have come since the last sample'
         shortest = round(self.settings.shortest_stop * 1e9)
         if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
@@ -290,22 +220,25 @@ class Collector:
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
         begin = int(stands[-1, 0])
+        if place:
+            stamps = self.track.samples()[0]
+            stamps = stamps[stamps >= begin]
+            self.maker.in_socket(place, stamps, self.track.at(stamps, standing=True))
+            return 1, ''
         self._round(begin)  # a stop before is not waited for any longer
-        before, dropped = len(self._fresh), self.dropped.copy()
+        before, dropped = len(self.maker.fresh), self.dropped.copy()
         self._average(begin, newest)
-        count = len(self._fresh) - before
+        count = len(self.maker.fresh) - before
         if count:
             self._sampled_ns = self._settled_ns = newest
         causes = ', '.join(dict.fromkeys(self.dropped - dropped))
         return count, '' if count else causes or 'no measurement within this stop'
 
-    # Rounds
-
     @property
     def _complete_ns(self) -> int:
         """Return the stamp of the joints up to which all has come, and stops can be told."""
         late = self._lateness_ns + max(self.delay_ns, 0)
-        return self._track.newest_ns - max(late, round(WINDOW * 1e9))
+        return self.track.newest_ns - max(late, round(WINDOW * 1e9))
 
     def _round(self, until: int, ends_here: bool = False) -> None:
         """Make samples of everything up to a stamp of the joints.
@@ -321,10 +254,10 @@ class Collector:
             until = self._take_stops(until, ends_here)
         self._settled_ns = max(self._settled_ns, until)
         margin = round((WINDOW + self.settings.max_gap) * 1e9)
-        self._track.release(min(until, self._complete_ns) - margin)
+        self.track.release(min(until, self._complete_ns) - margin)
 
     def _sort(self) -> None:
-        twice = self._track.sort()
+        twice = self.track.sort()
         if twice:
             self.dropped['joints: same stamp twice'] += twice
         for rows in self._waiting.values():
@@ -339,16 +272,11 @@ class Collector:
             due = stamps <= until
             if not due.any():
                 continue
-            motion = self._track.at(stamps[due])
+            motion = self.track.at(stamps[due])
             self._count_causes(motion.cause)
-            known, values = rows.stamps[due], rows.values[due]
-            oriented = ~np.isnan(values[:, _QUAT.start])
-            rotations = np.tile(np.eye(3), (len(values), 1, 1))
-            rotations[oriented] = se3.from_quat(values[oriented, _QUAT])
-            for k in np.flatnonzero(motion.cause == 0).tolist():
-                value = values[k, _DISTANCE if key.distance else _POSITION]
-                mean = Mean(_ONE, value, rotations[k] if oriented[k] else None, 0.0)
-                self._make(key, int(known[k]), mean, values[k : k + 1], motion, k)
+            good = motion.cause == 0
+            stamps, values = rows.stamps[due][good], rows.values[due][good]
+            self.maker.of_each(key, stamps, values, motion.rows(good), self.delay_ns)
             rows.keep(~due)
 
     def _take_stops(self, until: int, ends_here: bool) -> int:
@@ -357,10 +285,11 @@ class Collector:
         shortest, longest = (
             round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)
         )
-        newest = self._track.newest_ns
+        newest = self.track.newest_ns
         done = self._settled_ns
-        stands = self._track.standing(settings.still, WINDOW)
-        self._look_for_rest(bool((np.diff(stands) >= shortest).any()))
+        stands = self.track.standing(settings.still, WINDOW)
+        found = bool((np.diff(stands) >= shortest).any())
+        self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS))
         for begin, end in stands.tolist():
             goes_on = end >= newest
             if ends_here:
@@ -394,20 +323,13 @@ class Collector:
                 self._sampled_ns = done
         return self._drop(done, until, 'the arm was moving')
 
-    def _look_for_rest(self, found: bool) -> None:
-        """Note the noise of the joints where they rest though no stop is `found`."""
-        noise = None if found else self._track.noise_at_rest(ADVANCE_NS)
-        before, self._rests = self._rests, noise is not None
-        if noise is not None and not before and len(self._unseen) < MOST_RESTS:
-            self._unseen.append(noise)
-
     def _drop(self, after: int, until: int, why: str) -> int:
         """Drop what was measured after a stamp and until another; return the latter."""
         for rows in self._waiting.values():
             stamps = rows.stamps - self.delay_ns
             due = stamps <= until
             if due.any():
-                cause = self._track.causes(stamps[due])
+                cause = self.track.causes(stamps[due])
                 self._count_causes(cause)
                 fine = int((cause == 0).sum())
                 if fine:
@@ -417,128 +339,44 @@ class Collector:
 
     def _is_known(self, begin: int, end: int) -> bool:
         """Tell whether a stop was sampled before the clock jumped back; if not, remember it."""
-        where = self._track.at(np.array([(begin + end) // 2]), standing=True).joints[0]
+        where = self.track.at(np.array([(begin + end) // 2]), standing=True).joints[0]
         begins, lengths = self._stops.stamps, self._stops.values[:, 0]
         meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)
         steps = unwrapped(self._stops.values[meets, 1:] - where, self._revolute)
         if (np.abs(steps).max(axis=1) <= 2.0 * self.settings.still).any():
             return True
         if not self._stops.full:
-            self._stops.append(begin, [end - begin, *where])
+            self._stops.extend(np.array([begin]), np.array([[end - begin, *where]]))
         return False
 
     def _average(self, begin: int, end: int) -> None:
         """Make one sample of each stream from what was measured in a stop."""
-        self._stopped += 1
+        self.rests.sampled += 1
         calm = begin + round(self.settings.settle * 1e9)
         for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= end
             inside = due & (stamps >= calm)
-            motion = self._track.at(stamps[inside], standing=True)
+            motion = self.track.at(stamps[inside], standing=True)
             good = np.flatnonzero(inside)[motion.cause == 0]
             early = int((due & ~inside).sum())
             if early:
                 self.unused['poses: the arm had just stopped'] += early
             self._count_causes(motion.cause)
             if len(good):
-                self._average_one(key, rows, good, self._chosen(motion))
+                self.maker.of_stop(
+                    key,
+                    rows.stamps[good],
+                    rows.values[good],
+                    motion.rows(motion.cause == 0),
+                    self.delay_ns,
+                    self.settings.sigma_position,
+                )
             rows.keep(~due)
-
-    def _average_one(
-        self, key: StreamKey, rows: Rows, good: NDArray[np.intp], motion: Motion
-    ) -> None:
-        values = rows.values[good]
-        measured = values[:, _DISTANCE if key.distance else _POSITION]
-        oriented = not np.isnan(values[:, _QUAT]).any()
-        rotations = se3.from_quat(values[:, _QUAT]) if oriented else None
-        sigma = self.settings.sigma_position
-        if not np.isnan(values[:, _COVARIANCE]).any():
-            own = values[:, _COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)]
-            sigma = float(np.sqrt(own.mean()))
-        try:
-            mean = average(measured, rotations, sigma)
-        except RestlessError:
-            self.dropped[RESTLESS] += len(good)
-            return
-        left_out = int((~mean.used).sum())
-        if left_out:
-            self.dropped[VIBRATING] += left_out
-        stamp = round(float((rows.stamps[good][mean.used] - rows.stamps[good][0]).mean()))
-        self._make(key, int(rows.stamps[good][0]) + stamp, mean, values[mean.used], motion, None)
-
-    @staticmethod
-    def _chosen(motion: Motion) -> Motion:
-        good = motion.cause == 0
-        return Motion(
-            motion.joints[good],
-            motion.velocity[good],
-            motion.acceleration[good],
-            motion.approach[good],
-            motion.cause[good],
-        )
-
-    def _make(
-        self,
-        key: StreamKey,
-        stamp_ns: int,
-        mean: Mean,
-        rows: FloatArray,
-        motion: Motion,
-        which: int | None,
-    ) -> None:
-        """Add a sample, from one measurement (`which`) or from the mean of a stop."""
-        known = self._taken.setdefault(key, set())
-        if stamp_ns in known:
-            self.dropped['poses: a sample with this stamp is there already'] += len(rows)
-            return
-        if len(known) >= self.settings.pose_buffer:
-            self.dropped['poses: the memory for samples is full'] += len(rows)
-            return
-        known.add(stamp_ns)
-        covariance = None
-        if not np.isnan(rows[:, _COVARIANCE]).any():
-            covariance = rows[:, _COVARIANCE].mean(axis=0).reshape(6, 6)
-        if which is None:
-            steps = unwrapped(motion.joints[mean.used] - motion.joints[0], self._revolute)
-            joints = motion.joints[0] + steps.mean(axis=0)
-            velocity = acceleration = None
-            approach = motion.approach[0].copy()  # a view would keep the whole stop
-        else:
-            joints, approach, velocity, acceleration = (
-                each[which].copy()
-                for each in (motion.joints, motion.approach, motion.velocity, motion.acceleration)
-            )
-        self._fresh.append(
-            Sample(
-                stamp_ns=stamp_ns,
-                joints=joints,
-                approach=approach,
-                position=None if key.distance else mean.value,
-                rotation=mean.rotation,
-                distance=float(mean.value[0]) if key.distance else None,
-                covariance=covariance,
-                velocity=velocity,
-                acceleration=acceleration,
-                device=key.device,
-                target=key.target,
-                frame_id=key.frame_id,
-                validation=key.validation,
-                eye_in_hand=key.eye_in_hand,
-                delay=1e-9 * self.delay_ns,
-                count=len(rows),
-                spread=mean.spread,
-            )
-        )
-
-    def remember(self, samples: Sequence[Sample]) -> None:
-        """Allow no other samples of the stamps of these."""
-        for sample in samples:
-            self._taken.setdefault(_key(sample), set()).add(sample.stamp_ns)
 
     def forget(self, sample: Sample) -> None:
         """Allow a sample of the same stamp again."""
-        self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
+        self.maker.forget(sample)
         since = sample.stamp_ns - round(1e9 * sample.delay) - self._stops.stamps
         self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
 
@@ -548,28 +386,15 @@ class Collector:
             if count:
                 self.dropped[f'poses: {text}'] += count
 
-    # Buffers
-
-    def _make_room(self, columns: tuple[int, ...]) -> None:
+    def _make_room(self) -> None:
         """Let go the older half of the samples of some joints; nothing may be held any longer."""
         self._round(self._complete_ns)
-        if not self._track.room(columns):
-            self.notes['joint samples let go, the joint buffer was full'] += self._track.halve()
+        if self.track.full:
+            self.notes['joint samples let go, the joint buffer was full'] += self.track.halve()
 
     def start_anew(self) -> None:
         """Go on after the clock jumped back: finish what came before, keep the samples."""
         self.finish()
         self.notes['the clock jumped back'] += 1
-        self._track.clear()
-        self._advanced_ns = self._settled_ns = self._sampled_ns = 0
-
-
-def _key(sample: Sample) -> StreamKey:
-    return StreamKey(
-        sample.device,
-        sample.target,
-        sample.validation,
-        sample.distance is not None,
-        sample.eye_in_hand,
-        sample.frame_id,
-    )
+        self.track.clear()
+        self._newest_ns = self._advanced_ns = self._settled_ns = self._sampled_ns = 0

@@ -10,8 +10,6 @@ parabola; the identification then fits the rest as a parameter (`base.delay`).
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +19,7 @@ from scipy.signal import find_peaks
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.track import Rows, Stamps
+from calib_ros.sampling.rows import Stamps
 
 STEP = 5e-3
 """Time between two values of the speeds [s]."""
@@ -41,18 +39,8 @@ FEWEST = 10
 """Fewest samples of joints, and measurements, that are looked at."""
 MOST_TIME = 300.0
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
-WATCH_NS = 15_000_000_000
-"""Time over which a watch looks."""
-WATCHED = 20_000
-"""Samples that it keeps at most."""
-DENSE_NS = 4_000_000
-"""Time between two samples that it keeps; nearer ones tell no more."""
 SMOOTHING = 0.05
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
-CLOCKS_MOVED = 0.05
-"""Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
-MOST_MOVES = 5
-"""Moves of the clocks that are remembered."""
 
 
 @dataclass(frozen=True)
@@ -65,125 +53,6 @@ class Delay:
     seconds: float
     correlation: float
     rivals: tuple[float, ...] = ()
-
-
-class Watch:
-    """Joint values and poses while the arm moves, to see whether the clocks agree.
-
-    Once that is seen it sleeps until measurements at stops show unrest: where a clock was moved
-    they do, and are left out or refused.
-
-    Parameters
-    ----------
-    chain : Chain
-    sleepless : bool
-        Watch all the time, as there are no stops.
-
-    """
-
-    def __init__(self, chain: Chain, sleepless: bool) -> None:
-        self._chain = chain
-        self._sleepless = sleepless
-        self._joints = Rows(len(chain.joints), WATCHED)
-        self._poses = Rows(7, WATCHED)
-        self._begun_ns = 0
-        self._last_ns = [0, 0]
-        self._unrest = 0
-        self._taken = self._agreed = 0
-        self.awake = True
-        self.delay: Delay | None = None
-        """The last one seen."""
-        self.unclear: Delay | None = None
-        """One with rivals, while no other was seen."""
-        self.moves: deque[tuple[float, int]] = deque(maxlen=MOST_MOVES)
-        """By how much [s] it changed, and after how many samples at least."""
-
-    def wake(self, unrest: int, taken: int) -> None:
-        """Watch again if more measurements at stops were not at rest, with so many samples."""
-        if unrest > self._unrest and not self.awake:
-            self.awake, self._agreed = True, self._taken
-        self._unrest, self._taken = unrest, taken
-
-    def add_joints(self, stamp_ns: int, values: Sequence[float]) -> None:
-        """Take joint values, and look if it is time to."""
-        if not self.awake:
-            return
-        if not self._begun_ns:
-            self._begun_ns = stamp_ns
-        if abs(stamp_ns - self._last_ns[0]) >= DENSE_NS and not self._joints.full:
-            self._last_ns[0] = stamp_ns
-            self._joints.append(stamp_ns, values)
-        if abs(stamp_ns - self._begun_ns) > WATCH_NS:
-            self._look()
-
-    def add_pose(
-        self, stamp_ns: int, position: Sequence[float], quat_xyzw: Sequence[float] | None
-    ) -> None:
-        """Take a measured pose or position."""
-        if not self.awake:
-            return
-        if abs(stamp_ns - self._last_ns[1]) >= DENSE_NS and not self._poses.full:
-            self._last_ns[1] = stamp_ns
-            self._poses.append(stamp_ns, (*position, *(quat_xyzw or ())))
-
-    def uneventful(self, stamps: Stamps) -> NDArray[np.bool_]:
-        """Return (M,) at which stamps of joint values it is not yet time to look."""
-        if not self.awake:
-            return np.ones(len(stamps), dtype=bool)
-        quiet = np.abs(stamps - self._begun_ns) <= WATCH_NS
-        return quiet if self._begun_ns else np.zeros(len(stamps), dtype=bool)
-
-    def extend_joints(self, stamps: Stamps, values: FloatArray) -> None:
-        """Take joint values (M, n) at uneventful stamps (M,)."""
-        self._extend(0, self._joints, stamps, values)
-
-    def extend_poses(self, stamps: Stamps, numbers: FloatArray) -> None:
-        """Take poses (M, 7), with NaN for a rotation that was not measured."""
-        self._extend(1, self._poses, stamps, numbers)
-
-    def _extend(self, which: int, rows: Rows, stamps: Stamps, values: FloatArray) -> None:
-        if not self.awake:
-            return
-        chosen: list[int] = []
-        last = self._last_ns[which]
-        room = rows.capacity - rows.count
-        for k, stamp_ns in enumerate(stamps.tolist() if room else ()):
-            if abs(stamp_ns - last) >= DENSE_NS and len(chosen) < room:
-                last = stamp_ns
-                chosen.append(k)
-        self._last_ns[which] = last
-        rows.extend(stamps[chosen], values[chosen])
-
-    def _look(self) -> None:
-        """Look what the motion shows, and begin anew."""
-        self._joints.sort()
-        self._poses.sort()
-        values = self._poses.values
-        oriented = len(values) > 0 and not np.isnan(values).any()
-        found = find_delay(
-            self._chain,
-            self._joints.stamps,
-            self._joints.values,
-            self._poses.stamps,
-            values[:, :3],
-            se3.from_quat(values[:, 3:]) if oriented else None,
-        )
-        for rows in (self._joints, self._poses):
-            rows.keep(np.zeros(rows.count, dtype=bool))
-        self._begun_ns = 0
-        if found is None:
-            return
-        known = self.delay
-        every = (found.seconds, *found.rivals)
-        if known is None or min(abs(each - known.seconds) for each in every) > CLOCKS_MOVED:
-            if found.rivals:
-                self.unclear = found if known is None else None
-                return
-            if known is not None:
-                self.moves.append((found.seconds - known.seconds, self._agreed))
-            self.delay, self.unclear = found, None
-        self._agreed = self._taken
-        self.awake = self._sleepless
 
 
 def find_delay(

@@ -1,10 +1,16 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serialised messages into the session, by the batch: of live topics and of recordings."""
+"""Messages into the session, by the batch: of live topics and of recordings.
+
+Serialised messages of one stream that are laid out alike are decoded at once; others are decoded
+each by itself, and those that name the same things are put together. Both ways end in the same
+arrays, with the place of each message in the batch.
+"""
 
 from __future__ import annotations
 
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -12,30 +18,31 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.cdr import Alike, readings, transforms, usable
+from calib_ros.sampling.cdr import Alike, decode, transforms
+from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
-    DECODERS,
     LINKS,
     TRANSFORM,
     TRANSFORMS,
-    JointReading,
-    JointReadings,
     MessageError,
     Readings,
     frame_name,
+    reading,
     transforms_in,
+    usable,
 )
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.sources import Source
-from calib_ros.sampling.track import Stamps
 from calib_ros.sampling.transforms import STATIC, Links, Pair
 
-Deserialise: TypeAlias = Callable[[bytes, str], Any]
+Deserialise: TypeAlias = Callable[[Any, str], Any]
 """Makes a message of its bytes and type."""
-
-WINDOW = 1024
-"""Messages that are looked at at once."""
+Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
+"""Streams and what came on them, serialised or not, in the order in which it came."""
+Places: TypeAlias = NDArray[np.intp]
+Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
+"""Place, stamp [ns] and numbers of one message."""
 
 
 @dataclass(frozen=True)
@@ -78,38 +85,10 @@ def links_of(streams: Iterable[Stream]) -> list[Links]:
     return list(dict.fromkeys(each.links for each in streams if each.links is not None))
 
 
-@dataclass(frozen=True, eq=False)
-class Group:
-    """Decoded messages of one stream, and their places (N,) in the batch."""
-
-    stream: Stream
-    places: NDArray[np.intp]
-    readings: JointReadings | Readings
-
-    def between(self, begin: int, end: int) -> Group:
-        """Return what has its place from `begin` on and before `end`."""
-        part = slice(*np.searchsorted(self.places, (begin, end)).tolist())
-        if isinstance(self.readings, JointReadings):
-            stamps, names, values = self.readings
-            cut: JointReadings | Readings = JointReadings(stamps[part], names, values[part])
-        else:
-            cut = self.readings._replace(
-                stamps_ns=self.readings.stamps_ns[part], numbers=self.readings.numbers[part]
-            )
-        return Group(self.stream, self.places[part], cut)
-
-
-def feed(
-    session: CalibrationSession,
-    batch: Sequence[tuple[Stream, bytes]],
-    deserialise: Deserialise,
-) -> list[str]:
+def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) -> list[str]:
     """Let a session take messages in their order; return what went wrong with some, in words.
 
-    Messages of one stream that are laid out alike are decoded at once, and kept at once up to the
-    next joint state after which there is more to do. That one is taken by itself, and so are
-    messages that differ from the others. The outcome is that of taking each by itself. An error
-    costs the messages that are taken with the one that makes it, and none after them.
+    How they are divided into batches makes no difference.
 
     Parameters
     ----------
@@ -121,239 +100,160 @@ def feed(
         For those that are not decoded at once.
 
     """
-    groups = decoded(batch)
-    alone = np.ones(len(batch), dtype=bool)
-    for group in groups:
-        alone[group.places] = False
-    more, known = linked(batch, deserialise)
-    groups += more
-    alone[known] = False
-    problems = []
-    begin = 0
-    while begin < len(batch):
-        stop = min(begin + WINDOW, len(batch))
-        window = [group.between(begin, stop) for group in groups]
-        window = [group for group in window if len(group.places)]
-        eventful = (begin + np.flatnonzero(alone[begin:stop])[:1]).tolist()
-        for group in window:
-            if isinstance(group.readings, JointReadings):
-                quiet = session.uneventful(group.readings, among=stop - begin)
-            elif group.stream.source is not None:
-                quiet = session.uneventful_poses(group.stream.source, group.readings.stamps_ns)
-            eventful += group.places[~quiet][:1].tolist()
-        end = min(eventful, default=stop)
-        try:
-            _keep(session, [group.between(begin, end) for group in window])
-            if end < stop:
-                _take_decoded(session, [group.between(end, end + 1) for group in window])
-                if alone[end]:
-                    _take(session, *batch[end], deserialise)
-        except DecodingError as err:
-            problems.append(str(err))
-        except Exception:
-            problems.append(f'internal error: {traceback.format_exc()}')
-        begin = min(end + 1, stop)
-    for links in links_of(stream for stream, _ in batch):
-        count = links.let_go()
-        if count:
-            session.miss(count, 'buffer full before their frames were linked')
-    return problems
+    found = Intake(batch, deserialise)
+    for kind, causes in found.faults.items():
+        for cause, count in causes.items():
+            session.miss(kind, count, cause)
+    try:
+        session.take(found.parts)
+    except Exception:
+        found.problems.append(f'internal error: {traceback.format_exc()}')
+    return found.problems
 
 
-class DecodingError(Exception):
-    """A message that cannot be decoded."""
+class Intake:
+    """What a batch of messages holds.
 
+    Attributes
+    ----------
+    parts : list of Part
+        What can be used.
+    faults : dict of str to Counter
+        How many messages cannot be used, by kind and cause.
+    problems : list of str
+        What cannot be decoded, in words.
 
-def decoded(batch: Sequence[tuple[Stream, bytes]]) -> list[Group]:
-    """Return the messages that are laid out like others of their stream and length."""
-    alike: dict[tuple[str, int], list[int]] = {}
-    for place, (stream, data) in enumerate(batch):
-        if stream.links is None:
-            alike.setdefault((stream.topic, len(data)), []).append(place)
-    groups = []
-    for places in alike.values():
-        stream = batch[places[0]][0]
-        found = readings(stream.type, [batch[place][1] for place in places])
-        if found is not None:
-            groups.append(Group(stream, np.array(places)[found[1]], found[0]))
-    return groups
+    """
+
+    def __init__(self, batch: Batch, deserialise: Deserialise) -> None:
+        self._batch, self._deserialise = batch, deserialise
+        self.parts: list[Part] = []
+        self.faults: dict[str, Counter[str]] = {JOINTS: Counter(), POSES: Counter()}
+        self.problems: list[str] = []
+        lengths: dict[tuple[str, int], list[int]] = {}
+        for place, (stream, data) in enumerate(batch):
+            size = len(data) if isinstance(data, bytes) else 0
+            lengths.setdefault((stream.topic, size), []).append(place)
+        linked: list[tuple[Stream, Places, Alike | OneLink]] = []
+        single: list[int] = []
+        for (_, size), places in lengths.items():
+            stream = batch[places[0]][0]
+            blobs = [batch[place][1] for place in places] if size else []
+            if stream.links is None:
+                found = decode(stream.type, blobs) if size else None
+                if found is None:
+                    single += places
+                else:
+                    self._add(stream.source, stream.type, np.array(places), found)
+                continue
+            left = set(places)
+            if size and stream.type == TRANSFORMS:
+                for alike in transforms(blobs, stream.links.layouts):
+                    where = np.array(places)[alike.which]
+                    linked.append((stream, where, alike))
+                    left.difference_update(where.tolist())
+            single += left
+        self._add_links([*linked, *self._decode(sorted(single))])
+
+    def _add(self, source: Source | None, kind: str, places: Places, found: Readings) -> None:
+        """Add what can be used, and count the rest."""
+        good, causes = usable(kind, found)
+        self.faults[JOINTS if source is None else POSES] += causes
+        if not good.all():
+            places, found = places[good], found.rows(good)
+        if len(places):
+            self.parts.append(Part(places, source, found))
+
+    def _decode(self, places: Sequence[int]) -> list[tuple[Stream, Places, OneLink]]:
+        """Add messages one after the other; return those of links between frames."""
+        alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
+        links: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
+        for place in places:
+            stream, data = self._batch[place]
+            try:
+                message = self._deserialise(data, stream.type)
+                if stream.links is None:
+                    into, found = alike, [reading(stream.type, message)]
+                else:
+                    into = links
+                    found = [reading(TRANSFORM, e) for e in transforms_in(message, stream.type)]
+                rows = [(t, (place, s, np.array(n, dtype=np.float64))) for s, t, n in found]
+            except MessageError as err:
+                self.faults[JOINTS][str(err)] += 1
+                continue
+            except Exception as err:  # damaged bytes fail in many ways
+                words = f'a message on {stream.topic} cannot be decoded: {err!r}'
+                self.problems.append(words)
+                continue
+            for strings, row in rows:
+                into.setdefault((stream, strings, len(row[2])), []).append(row)
+        for (stream, strings, _), some in alike.items():
+            self._add(stream.source, stream.type, *_stacked(some, strings))
+        return [
+            (stream, where, OneLink((frame_name(strings[0]), frame_name(strings[1])), each))
+            for (stream, strings, _), some in links.items()
+            for where, each in [_stacked(some, strings)]
+        ]
+
+    def _add_links(self, come: Sequence[tuple[Stream, Places, Alike | OneLink]]) -> None:
+        """Add what is measured by links between frames.
+
+        Frames that are named anywhere in the batch are known for all of it.
+        """
+        for stream, where, alike in come:
+            assert stream.links is not None
+            for k, link in enumerate(alike.links):
+                if not stream.still:
+                    stream.links.move(link, len(where), *alike.span(k))
+                    continue
+                found = alike.of(k)  # what stands still may have no stamp
+                good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(where)))
+                for row in found.numbers[good]:
+                    stream.links.fix(link, row)
+        for links in links_of(stream for stream, *_ in come):
+            first = min(int(where[0]) for stream, where, _ in come if stream.links is links)
+            for source, found in links.released():
+                self._add(source, TRANSFORM, np.full(len(found.stamps_ns), first), found)
+        for stream, where, alike in come:
+            assert stream.links is not None
+            for k, link in enumerate(alike.links):
+                if stream.still or not stream.links.wanted(link):
+                    continue
+                found = alike.of(k)
+                good, causes = usable(TRANSFORM, found)
+                sources = stream.links.measured_by(link)
+                self.faults[POSES] += Counter({c: n * len(sources) for c, n in causes.items()})
+                found = found.rows(good)
+                for source, each in stream.links.readings(link, found.stamps_ns, found.numbers):
+                    self._add(source, TRANSFORM, where[good], each)
+        for links in links_of(stream for stream, _ in self._batch):
+            cause = 'buffer full before their frames were linked'
+            self.faults[POSES] += Counter({cause: links.let_go()})
 
 
 @dataclass(frozen=True, eq=False)
-class Bodies:
-    """Messages that link the same frames: which of a batch they are, their stamps and numbers.
+class OneLink:
+    """Transforms that link the same frames, out of messages that were decoded one by one."""
 
-    Stamps (N,) are in ns, numbers (N, links, 7) are positions [m] and quaternions.
-    """
+    link: Pair
+    found: Readings
 
-    links: tuple[Pair, ...]
-    which: NDArray[np.intp]
-    stamps: Stamps
-    numbers: FloatArray
+    @property
+    def links(self) -> tuple[Pair, ...]:
+        """Return which frames are linked."""
+        return (self.link,)
 
-    def of(self, k: int) -> tuple[Stamps, FloatArray, NDArray[np.bool_]]:
-        """Return stamps (N,) and numbers (N, 7) of one body in each, and which are usable."""
-        return self.stamps, self.numbers[:, k], usable(self.numbers[:, k])
+    def of(self, k: int) -> Readings:
+        """Return stamps (N,) and numbers (N, 7)."""
+        return self.found
 
     def span(self, k: int) -> tuple[int, int]:
         """Return the first and the last stamp."""
-        return int(self.stamps[0]), int(self.stamps[-1])
+        return int(self.found.stamps_ns[0]), int(self.found.stamps_ns[-1])
 
 
-def bodies(
-    batch: Sequence[tuple[Stream, bytes]], places: Sequence[int], deserialise: Deserialise
-) -> list[Bodies]:
-    """Return what is in messages of bodies; those that cannot be decoded are in none."""
-    alike: dict[tuple[Pair, ...], list[tuple[int, np.int64, list[list[float]]]]] = {}
-    for k, place in enumerate(places):
-        stream, data = batch[place]
-        try:
-            message = deserialise(data, stream.type)
-            come = transforms_in(message, stream.type)
-            head = message.header
-            frame_id = frame_name(head.frame_id)
-            links = tuple((frame_id, frame_name(each.child_frame_id)) for each in come)
-            stamp_ns = np.int64(head.stamp.sec * 1_000_000_000 + head.stamp.nanosec)
-            numbers = [_pose_numbers(each.transform) for each in come]
-        except Exception:  # told when it is taken by itself
-            continue
-        alike.setdefault(links, []).append((k, stamp_ns, numbers))
-    found = []
-    for links, some in alike.items():
-        which = np.array([k for k, _, _ in some])
-        stamps = np.array([stamp_ns for _, stamp_ns, _ in some], dtype=np.int64)
-        rows = np.array([row for _, _, row in some], dtype=np.float64)
-        found.append(Bodies(links, which, stamps, rows.reshape(len(some), len(links), 7)))
-    return found
-
-
-def _pose_numbers(transform: Any) -> list[float]:
-    """Return position and quaternion (7)."""
-    at, turn = transform.translation, transform.rotation
-    return [float(each) for each in (at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w)]
-
-
-def linked(
-    batch: Sequence[tuple[Stream, bytes]], deserialise: Deserialise
-) -> tuple[list[Group], list[int]]:
-    """Return what is measured by transforms between frames, and the places of all that are known.
-
-    Frames that are named anywhere in the batch are known for all of it.
-    """
-    lengths: dict[tuple[str, int], list[int]] = {}
-    for place, (stream, data) in enumerate(batch):
-        if stream.links is not None:
-            length = len(data) if stream.type == TRANSFORMS else 0
-            lengths.setdefault((stream.topic, length), []).append(place)
-    parts: list[tuple[Stream, NDArray[np.intp], Alike | Bodies]] = []
-    for places in lengths.values():
-        stream = batch[places[0]][0]
-        assert stream.links is not None
-        found: Sequence[Alike | Bodies] = (
-            transforms([batch[place][1] for place in places], stream.links.layouts)
-            if stream.type == TRANSFORMS
-            else bodies(batch, places, deserialise)
-        )
-        parts += [(stream, np.array(places)[alike.which], alike) for alike in found]
-    for stream, _, alike in parts:
-        assert stream.links is not None
-        for k, link in enumerate(alike.links):
-            if stream.still:
-                _, numbers, good = alike.of(k)
-                for row in numbers[good]:
-                    stream.links.fix(link, row)
-            else:
-                stream.links.move(link, len(alike.which), *alike.span(k))
-    groups, known = [], []
-    for links in links_of(stream for stream, _, _ in parts):
-        first = min(int(places[0]) for stream, places, _ in parts if stream.links is links)
-        for source, released in links.released():
-            where = np.full(len(released.stamps_ns), first)
-            groups.append(Group(Stream(links.topic, links.kind, source), where, released))
-    for stream, where, alike in parts:
-        assert stream.links is not None
-        values = [
-            (link, *alike.of(k))
-            for k, link in enumerate(alike.links)
-            if not stream.still and stream.links.wanted(link)
-        ]
-        kept = np.ones(len(where), dtype=bool)
-        for _, stamps, _, good in values:
-            kept &= good & (stamps > 0)
-        known += where[kept].tolist()
-        if not kept.all():  # they are learned of again when they are taken by themselves
-            for k, link in enumerate(alike.links):
-                stream.links.move(link, -int((~kept).sum()), *alike.span(k))
-        for link, stamps, numbers, _ in values:
-            for source, measured_by in stream.links.readings(link, stamps[kept], numbers[kept]):
-                one = Stream(stream.topic, stream.type, source)
-                groups.append(Group(one, where[kept], measured_by))
-    return groups, known
-
-
-def _keep(session: CalibrationSession, groups: Sequence[Group]) -> None:
-    joints, measured = [], []
-    present = [group for group in groups if len(group.places)]
-    for group in sorted(present, key=lambda group: int(group.places[0])):  # who comes first counts
-        if isinstance(group.readings, JointReadings):
-            joints.append((group.places, group.readings))
-        elif group.stream.source is not None:
-            measured.append((group.places, group.stream.source, group.readings))
-    session.keep(joints, measured)
-
-
-def _take_decoded(session: CalibrationSession, groups: Sequence[Group]) -> None:
-    """Let a session take what is decoded, one after the other."""
-    for group in groups:
-        for k in range(len(group.places)):
-            reading = group.readings.row(k)
-            if isinstance(reading, JointReading):
-                session.take_joint_reading(reading)
-            elif group.stream.source is not None:
-                session.take_reading(group.stream.source, reading)
-
-
-def _take(
-    session: CalibrationSession,
-    stream: Stream,
-    data: bytes,
-    deserialise: Deserialise,
-) -> None:
-    """Let a session take one message that is not decoded yet."""
-    try:
-        message = deserialise(data, stream.type)
-        come = transforms_in(message, stream.type) if stream.links is not None else ()
-    except Exception as err:  # damaged bytes fail in many ways
-        raise DecodingError(f'a message on {stream.topic} cannot be decoded: {err!r}') from err
-    if stream.links is not None:
-        _take_transforms(session, stream, stream.links, come)
-    elif stream.source is None:
-        session.take_joints(message)
-    else:
-        session.take(stream.source, stream.type, message)
-
-
-def _take_transforms(
-    session: CalibrationSession, stream: Stream, links: Links, come: Sequence[Any]
-) -> None:
-    """Let a session take what is measured by some transforms, one after the other."""
-    for each in come:
-        link = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
-        still = stream.still
-        try:
-            reading = DECODERS[TRANSFORM](each)
-        except MessageError:
-            for source in () if still else links.measured_by(link):
-                session.take(source, TRANSFORM, each)  # counted by what is wrong with it
-            continue
-        stamps, numbers = np.array([reading.stamp_ns]), np.array([reading.numbers])
-        if still:
-            links.fix(link, numbers[0])
-        else:
-            links.move(link, 1, reading.stamp_ns, reading.stamp_ns)
-        found = links.released()
-        if not still:
-            found += links.readings(link, stamps, numbers)
-        for source, some in found:
-            for k in range(len(some.stamps_ns)):
-                session.take_reading(source, some.row(k))
+def _stacked(rows: Sequence[Row], strings: tuple[str, ...]) -> tuple[Places, Readings]:
+    """Return the places of single messages, and what they say."""
+    places, stamps, numbers = zip(*rows, strict=True)
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    return np.array(places), Readings(stamps_ns, strings, np.array(numbers))

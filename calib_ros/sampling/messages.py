@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS messages to numbers, by their attributes only: rclpy's and rosbags' messages alike.
 
-Each decoder raises `MessageError` for a message that cannot be used; its text is the cause under
-which the message is counted.
+What cannot be used is told by its cause, under which it is counted.
 """
 
 from __future__ import annotations
 
 import functools
-import math
+import itertools
+from collections import Counter
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -38,134 +38,115 @@ class MessageError(InputError):
     """A message that cannot be used."""
 
 
-class JointReading(NamedTuple):
-    """Joint values of one JointState, in the message's own order [rad or m]."""
-
-    stamp_ns: int
-    names: Sequence[str]
-    values: Sequence[float]
-
-
-class JointReadings(NamedTuple):
-    """Joint values (N, k) of N JointStates that name the same joints, at stamps (N,)."""
-
-    stamps_ns: NDArray[np.int64]
-    names: tuple[str, ...]
-    values: FloatArray
-
-    def row(self, k: int) -> JointReading:
-        """Return one of them."""
-        return JointReading(int(self.stamps_ns[k]), self.names, self.values[k].tolist())
-
-
-class Reading(NamedTuple):
-    """One measurement: position [m], quaternion and covariance (36) as far as they were measured.
-
-    A measured distance [m] comes without a position. `child` names the target where the message
-    does.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    position: tuple[float, float, float] | None = None
-    quat_xyzw: tuple[float, float, float, float] | None = None
-    covariance: tuple[float, ...] | None = None
-    distance: float | None = None
-    child: str = ''
-
-    @property
-    def numbers(self) -> tuple[float, ...]:
-        """Return what was measured in one row; what comes last may be missing."""
-        if self.distance is not None:
-            return (self.distance,)
-        return (self.position or ()) + (self.quat_xyzw or ()) + (self.covariance or ())
-
-
 class Readings(NamedTuple):
-    """Measurements at stamps (N,) in one frame and of one target.
+    """What N messages say that name the same things; N may be one.
 
-    `numbers` (N, w) are those of `Reading`, NaN for a covariance that was not measured.
+    `strings` are the frame and the child frame of a measurement if it has one, or the frame and
+    the names of the joints. `numbers` (N, w) are joint values [rad or m]; or a distance [m]
+    (w = 1), a position [m] (3), a pose with its quaternion x y z w (7), or that and a covariance
+    row by row (43).
     """
 
     stamps_ns: NDArray[np.int64]
-    frame_id: str
-    child: str
-    distance: bool
+    strings: tuple[str, ...]
     numbers: FloatArray
 
-    def row(self, k: int) -> Reading:
-        """Return one of them."""
-        stamp_ns, numbers = int(self.stamps_ns[k]), tuple(self.numbers[k].tolist())
-        if self.distance:
-            return Reading(stamp_ns, self.frame_id, distance=numbers[0], child=self.child)
-        x, y, z, *rest = numbers
-        known = len(rest) > 4 and not math.isnan(rest[4])
-        return Reading(
-            stamp_ns,
-            self.frame_id,
-            (x, y, z),
-            (rest[0], rest[1], rest[2], rest[3]) if rest else None,
-            tuple(rest[4:]) if known else None,
-            child=self.child,
-        )
+    @property
+    def child(self) -> str:
+        """Return the child frame of a measurement; empty if it has none."""
+        return self.strings[1] if len(self.strings) > 1 else ''
+
+    def rows(self, which: slice | NDArray[np.generic]) -> Readings:
+        """Return some of them."""
+        return Readings(self.stamps_ns[which], self.strings, self.numbers[which])
 
 
-def joint_state(message: Any) -> JointReading:
-    """Decode a sensor_msgs/JointState."""
-    names, values = message.name, message.position
-    if len(names) != len(values):
-        raise MessageError('names and positions differ in number')
-    return JointReading(stamp(message.header.stamp), names, values)
+def _pose(at: Any, turn: Any) -> Sequence[float]:
+    return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
-def pose_stamped(message: Any) -> Reading:
-    """Decode a geometry_msgs/PoseStamped."""
-    return _pose(message.header, message.pose.position, message.pose.orientation)
-
-
-def pose_with_covariance(message: Any) -> Reading:
-    """Decode a geometry_msgs/PoseWithCovarianceStamped; a covariance of zeros means none."""
+def _pose_with_covariance(message: Any) -> Sequence[float]:
     pose = message.pose.pose
-    reading = _pose(message.header, pose.position, pose.orientation)
-    return reading._replace(covariance=measured_covariance(message.pose.covariance))
+    return *_pose(pose.position, pose.orientation), *message.pose.covariance
 
 
-def point_stamped(message: Any) -> Reading:
-    """Decode a geometry_msgs/PointStamped."""
-    return _pose(message.header, message.point, None)
-
-
-def transform_stamped(message: Any) -> Reading:
-    """Decode a geometry_msgs/TransformStamped; each child frame is a target."""
-    transform = message.transform
-    reading = _pose(message.header, transform.translation, transform.rotation)
-    return reading._replace(child=_name(message.child_frame_id))
-
-
-def odometry(message: Any) -> Reading:
-    """Decode a nav_msgs/Odometry, of which only the pose counts."""
-    return pose_with_covariance(message)._replace(child=_name(message.child_frame_id))
-
-
-def distance(message: Any) -> Reading:
-    """Decode a sensor_msgs/Range: the distance of a draw-wire or ball-bar."""
-    value = float(message.range)
-    if not (np.isfinite(value) and value > 0.0):
-        raise MessageError('distance not a positive number')
-    if value > LARGEST:
-        raise MessageError('distance beyond 1000 km')
-    return Reading(stamp(message.header.stamp), message.header.frame_id, distance=value)
-
-
-DECODERS: dict[str, Callable[[Any], Reading]] = {
-    'geometry_msgs/msg/PoseStamped': pose_stamped,
-    'geometry_msgs/msg/PoseWithCovarianceStamped': pose_with_covariance,
-    'geometry_msgs/msg/PointStamped': point_stamped,
-    TRANSFORM: transform_stamped,
-    'nav_msgs/msg/Odometry': odometry,
-    'sensor_msgs/msg/Range': distance,
+DECODERS: dict[str, Callable[[Any], Sequence[float]]] = {
+    'geometry_msgs/msg/PoseStamped': lambda m: _pose(m.pose.position, m.pose.orientation),
+    'geometry_msgs/msg/PoseWithCovarianceStamped': _pose_with_covariance,
+    'geometry_msgs/msg/PointStamped': lambda m: (m.point.x, m.point.y, m.point.z),
+    TRANSFORM: lambda m: _pose(m.transform.translation, m.transform.rotation),
+    'nav_msgs/msg/Odometry': _pose_with_covariance,
+    'sensor_msgs/msg/Range': lambda m: (m.range,),
 }
-"""Types of measurements."""
+"""Types of measurements, and what finds the numbers in a message."""
+
+
+def reading(kind: str, message: Any) -> tuple[int, tuple[str, ...], Sequence[float]]:
+    """Return stamp [ns], strings and numbers of a message, as `Readings` hold them.
+
+    Raises
+    ------
+    MessageError
+        When a JointState has not as many names as positions.
+
+    """
+    head = message.header
+    stamp_ns = head.stamp.sec * 1_000_000_000 + head.stamp.nanosec
+    if kind == JOINT_STATE:
+        if len(message.name) != len(message.position):
+            raise MessageError('names and positions differ in number')
+        return stamp_ns, (head.frame_id, *message.name), message.position
+    child = getattr(message, 'child_frame_id', None)
+    strings = (head.frame_id,) if child is None else (head.frame_id, child)
+    return stamp_ns, strings, DECODERS[kind](message)
+
+
+def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]:
+    """Return which readings (N,) can be used, and the causes why others cannot.
+
+    The values of joints are not looked at: some may be those of another robot.
+    """
+    numbers, causes = found.numbers, Counter[str]()
+    good = np.ones(len(numbers), dtype=bool)
+
+    def refuse(wrong: np.bool_ | NDArray[np.bool_], cause: str) -> None:
+        count = int((good & wrong).sum())
+        if count:
+            causes[cause] += count
+            good[wrong] = False
+
+    refuse(found.stamps_ns <= 0, 'zero stamp')
+    if kind == JOINT_STATE:
+        return good, causes
+    width = numbers.shape[1]
+    if width == 1:
+        far = numbers[:, 0]
+        refuse(~((far > 0.0) & (far < np.inf)), 'distance not a positive number')
+        refuse(far > LARGEST, 'distance beyond 1000 km')
+    else:
+        at = numbers[:, :3]
+        refuse(~np.isfinite(at).all(axis=1), 'NaN or infinite position')
+        refuse((np.abs(at) > LARGEST).any(axis=1), 'position beyond 1000 km')
+    if width >= 7:
+        with np.errstate(over='ignore'):  # of numbers that are refused
+            length = np.sqrt((numbers[:, 3:7] ** 2).sum(axis=1))
+        refuse(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE), 'quaternion not of length 1')
+    if width > 7:  # mostly all have the same
+        rows = numbers[:, 7:]
+        changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
+        for begin, end in itertools.pairwise((0, *changes.tolist(), len(rows))):
+            if fault := _fault(rows[begin].tobytes()):
+                here = np.zeros(len(rows), dtype=bool)
+                here[begin:end] = True
+                refuse(here, fault)
+    if not found.child.isprintable():  # it shall be a cell of a table
+        refuse(good.copy(), 'child frame whose name cannot be printed')
+    return good, causes
+
+
+@functools.lru_cache(maxsize=16)  # most devices send the same one for ever
+def _fault(covariance: bytes) -> str:
+    return covariance_fault(np.frombuffer(covariance).reshape(6, 6))
 
 
 def transforms_in(message: Any, kind: str) -> Sequence[Any]:
@@ -189,49 +170,3 @@ def transforms_in(message: Any, kind: str) -> Sequence[Any]:
 def frame_name(name: str) -> str:
     """Return the name of a frame without the slash that older programs write before it."""
     return name.removeprefix('/')
-
-
-def stamp(time: Any) -> int:
-    """Turn a builtin_interfaces/Time into nanoseconds."""
-    stamp_ns: int = time.sec * 1_000_000_000 + time.nanosec
-    if stamp_ns <= 0:
-        raise MessageError('zero stamp')
-    return stamp_ns
-
-
-def _pose(header: Any, point: Any, quaternion: Any) -> Reading:
-    stamp_ns = stamp(header.stamp)
-    position = x, y, z = point.x, point.y, point.z
-    if not math.isfinite(x + y + z):
-        raise MessageError('NaN or infinite position')
-    if max(abs(x), abs(y), abs(z)) > LARGEST:
-        raise MessageError('position beyond 1000 km')
-    quat = None
-    if quaternion is not None:
-        quat = qx, qy, qz, qw = quaternion.x, quaternion.y, quaternion.z, quaternion.w
-        length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
-        if not abs(length - 1.0) <= QUATERNION_TOLERANCE:
-            raise MessageError('quaternion not of length 1')
-    return Reading(stamp_ns, header.frame_id, position, quat)
-
-
-def _name(child: str) -> str:
-    if not child.isprintable():  # it shall be a cell of a table
-        raise MessageError('child frame whose name cannot be printed')
-    return child
-
-
-def measured_covariance(numbers: Any) -> tuple[float, ...] | None:
-    """Return a covariance (36) row by row; one of zeros means none."""
-    return _checked_covariance(np.asarray(numbers, dtype=np.float64).tobytes())
-
-
-@functools.lru_cache(maxsize=16)  # most devices send the same one for ever
-def _checked_covariance(data: bytes) -> tuple[float, ...] | None:
-    covariance = np.frombuffer(data).reshape(6, 6)
-    if not covariance.any():
-        return None
-    fault = covariance_fault(covariance)
-    if fault:
-        raise MessageError(fault)
-    return tuple(covariance.ravel().tolist())

@@ -5,17 +5,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from operator import itemgetter
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.messages import JointReadings, MessageError
+from calib_ros.sampling.messages import MessageError
+from calib_ros.sampling.slices import Columns
 
-Picker: TypeAlias = Callable[[Sequence[float]], Sequence[float]]
-Layout: TypeAlias = tuple[tuple[int, ...], Picker]
+Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
 
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
@@ -41,8 +40,8 @@ class JointNames:
         self.foreign: tuple[str, ...] = ()
         """Names that come while some of the chain's joints are never named."""
 
-    def layout(self, names: Sequence[str]) -> Layout:
-        """Return which joints of the chain a message names, and how to pick their values.
+    def layout(self, key: tuple[str, ...]) -> Layout:
+        """Return which joints of the chain messages name, and the columns of their values.
 
         Raises
         ------
@@ -50,12 +49,12 @@ class JointNames:
             When it names none of them.
 
         """
-        key = tuple(names)
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
             known = [(k, key.index(n)) for k, n in enumerate(self._names) if n in key]
-            self._layouts[key] = (tuple(k for k, _ in known), _picker([i for _, i in known]))
+            index = np.array([i for _, i in known], dtype=np.intp)
+            self._layouts[key] = tuple(k for k, _ in known), index
             named = {name for names in self._layouts for name in names}
             missing = [name for name in self._names if name not in named]
             self.foreign = tuple(sorted(named)) if missing else ()
@@ -63,12 +62,6 @@ class JointNames:
         if not layout[0]:
             raise MessageError('none of the joints in the message')
         return layout
-
-    def values(self, readings: JointReadings) -> tuple[tuple[int, ...], FloatArray]:
-        """Return which joints of the chain messages name, and their values (N, k)."""
-        columns, pick = self.layout(readings.names)
-        index = np.array(pick(range(len(readings.names))), dtype=np.intp)
-        return columns, readings.values[:, index]
 
 
 class FrameNames:
@@ -109,6 +102,11 @@ class FrameNames:
         """Return the usual frame of a device; None while few measurements have come."""
         return self._usual.get(device)
 
+    @property
+    def settled(self) -> int:
+        """Return of how many devices the usual frame is known."""
+        return len(self._usual)
+
     def main(self, device: str) -> str | None:
         """Return the usual frame of a device, or the most frequent one while few have come."""
         known = self._known.get(device)
@@ -134,10 +132,3 @@ class FrameNames:
 def strange(frame_id: str, usual: str) -> str:
     """Return in words that a measurement is not in the frame in which others are."""
     return f'in frame "{frame_id}", not in "{usual}" as others'
-
-
-def _picker(index: Sequence[int]) -> Picker:
-    """Return a function that picks some values of a sequence."""
-    if len(index) > 1:
-        return itemgetter(*index)
-    return lambda values: tuple(values[i] for i in index)

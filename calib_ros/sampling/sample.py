@@ -13,10 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib_ros.errors import ConfigError
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
+
+SOCKETS = 0.05
+"""Distance [m] of the two sockets of a location unless it is given: that of MUKCa's plates."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,6 +149,35 @@ def named(samples: Iterable[Sample]) -> Frames:
     for sample in samples:
         frames.of(sample)
     return frames
+
+
+def socket_place(label: str) -> str:
+    """Return the place of a socket LOCATION/SOCKET, as the device of what is measured there.
+
+    Raises
+    ------
+    ConfigError
+        When it is something else.
+
+    """
+    location, slash, socket = label.rpartition('/')
+    names = location, socket
+    if not (slash and all(names)) or '_' in socket or '/' in location or not label.isprintable():
+        raise ConfigError(
+            f'socket must be LOCATION/SOCKET, such as A/1, SOCKET without _, not "{label}"'
+        )
+    return f'{location}_{socket}'
+
+
+def socket_pairs(samples: Iterable[Sample], frames: Frames) -> list[tuple[str, str]]:
+    """Return the names of the base frames of the two sockets of each location."""
+    ends: dict[tuple[str, str], dict[str, None]] = {}
+    for sample in samples:
+        if sample.socket:
+            location = sample.session, sample.device.rpartition('_')[0]
+            ends.setdefault(location, {})[frames.of(sample)[0]] = None
+    pairs = [tuple(each) for each in ends.values() if len(each) == 2]
+    return [(pair[0], pair[1]) for pair in pairs]
 
 
 def plain(name: str) -> str:

@@ -11,30 +11,18 @@ through in the order in which it came.
 from __future__ import annotations
 
 from collections import Counter
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.sampling.track import Stamps
+from calib_ros.sampling.slices import JOINTS, POSES, Slice
 
 JUMP = 20
 """So many messages of one stream in succession elsewhere mean that the clock was moved."""
-JOINTS, POSES = 'joints', 'poses'
 STRAY = 'stamp far from those before and after'
 
-Item = TypeVar('Item')
 
-
-class Held(NamedTuple, Generic[Item]):
-    """What came at a time of the joints' clock [ns]."""
-
-    kind: str
-    time_ns: int
-    item: Item
-
-
-class Gate(Generic[Item]):
+class Gate:
     """Lets messages through, late if they must be held back first, and drops stray ones.
 
     Parameters
@@ -47,81 +35,94 @@ class Gate(Generic[Item]):
     def __init__(self, far: float) -> None:
         self._far_ns = round(far * 1e9)
         self._last: dict[str, int] = {}
-        self._held: list[Held[Item]] = []
+        self._held: list[tuple[str, int, Slice]] = []
         self.dropped: Counter[str] = Counter()
-        """Messages with stray stamps, by stream."""
+        """Messages with stray stamps, by kind."""
 
     def held(self, kind: str) -> int:
-        """Return how many messages of a stream are held back."""
-        return sum(each.kind == kind for each in self._held)
+        """Return how many messages of a kind are held back."""
+        return sum(each[0] == kind for each in self._held)
 
-    def passes(self, kind: str, time_ns: int) -> bool:
-        """Let a message through if nothing is held back and its stamp is not far from others."""
-        if self._held or not self._is_near(time_ns):
-            return False
-        self._last[kind] = time_ns
-        return True
+    def through(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
+        """Yield what may pass now, and whether the clock of the joints was moved before it.
 
-    def admit(self, kind: str, time_ns: int, item: Item) -> tuple[list[Held[Item]], bool]:
-        """Take a message that does not pass; return what may pass now, in the order it came.
-
-        The second value tells whether the clock of the joints was moved.
+        What is held back comes with a later message, in the order in which it came.
         """
-        given = Held(kind, time_ns, item)
+        begin, end = 0, len(given)
+        while begin < end:
+            left = given.between(begin, end)
+            count = self._plain(left)
+            if count:
+                yield left.between(0, count), False
+            else:
+                count = 1
+                found, moved = self._admitted(left.between(0, 1))
+                yield from ((each, moved) for each in found)
+            begin += count
+
+    def release(self) -> list[Slice]:
+        """Return what is held back: nothing more comes that could tell."""
+        found, self._held = self._held, []
+        return [item for _, _, item in found]
+
+    def _plain(self, given: Slice) -> int:
+        """Let the first messages pass up to one that is to be held back, or frees others."""
+        count, lasts = len(given), {}
+        for kind in (JOINTS, POSES):
+            where = given.where(kind)
+            if not len(where):
+                continue
+            times = given.times[where]
+            stops = np.ones(len(where), dtype=bool)
+            if kind in self._last and not self.held(kind):
+                before = np.concatenate([[self._last[kind]], times[:-1]])
+                stops = np.abs(times - before) > self._far_ns
+                for _, time_ns, _ in self._held:
+                    stops |= np.abs(times - time_ns) <= self._far_ns
+            if stops.any():
+                count = min(count, int(where[np.argmax(stops)]))
+            lasts[kind] = where, times
+        for kind, (where, times) in lasts.items():
+            passed = int(np.searchsorted(where, count))
+            if passed:
+                self._last[kind] = int(times[passed - 1])
+        return count
+
+    def _admitted(self, given: Slice) -> tuple[list[Slice], bool]:
+        """Take one message; return what passes, and whether the clock of the joints was moved."""
+        kind, time_ns = JOINTS if given.joints[0] else POSES, int(given.times[0])
         if self._is_near(time_ns):
             self._last[kind] = time_ns
             found = [*self._now_near(), given]
             self._last[kind] = time_ns
             if strays := self.held(kind):
                 self.dropped[kind] += strays
-                self._held = [each for each in self._held if each.kind != kind]
+                self._held = [each for each in self._held if each[0] != kind]
             return found, False
-        self._held.append(given)
+        self._held.append((kind, time_ns, given))
         if self.held(kind) < JUMP:
             return [], False
-        moved = [each.time_ns for each in self._held if each.kind == kind]
-        found = [
-            each
-            for each in self._held
-            if each.kind == kind or min(abs(each.time_ns - time) for time in moved) <= self._far_ns
+        moved = [time for other, time, _ in self._held if other == kind]
+        passing = [
+            other == kind or min(abs(time - each) for each in moved) <= self._far_ns
+            for other, time, _ in self._held
         ]
-        self._held = [each for each in self._held if each not in found]
-        self._last.update((each.kind, each.time_ns) for each in found)
-        return found, any(each.kind == JOINTS for each in found)
-
-    def quiet(self, kind: str, times: Stamps) -> NDArray[np.bool_]:
-        """Return (M,) which messages of a stream would pass, and free none that is held back."""
-        if kind not in self._last or self.held(kind):
-            return np.zeros(len(times), dtype=bool)
-        before = np.empty_like(times)
-        before[:1], before[1:] = self._last[kind], times[:-1]
-        found = np.abs(times - before) <= self._far_ns
-        for each in self._held:
-            found &= np.abs(times - each.time_ns) > self._far_ns
-        return np.asarray(found)
-
-    def passed(self, kind: str, time_ns: int) -> None:
-        """Note that quiet messages passed, the last of them at a time."""
-        self._last[kind] = time_ns
-
-    def release(self) -> list[Held[Item]]:
-        """Return what is held back: nothing more comes that could tell."""
-        found, self._held = self._held, []
-        return found
+        freed = [each for each, free in zip(self._held, passing, strict=True) if free]
+        self._held = [each for each, free in zip(self._held, passing, strict=True) if not free]
+        self._last.update((other, time) for other, time, _ in freed)
+        return [item for *_, item in freed], any(other == JOINTS for other, *_ in freed)
 
     def _is_near(self, time_ns: int) -> bool:
         """Tell whether a time is near the last one of any stream."""
-        for last in self._last.values():
-            if abs(time_ns - last) <= self._far_ns:
-                return True
-        return not self._last
+        lasts = self._last.values()
+        return not lasts or any(abs(time_ns - last) <= self._far_ns for last in lasts)
 
-    def _now_near(self) -> list[Held[Item]]:
+    def _now_near(self) -> list[Slice]:
         """Let through what is held back and not far from others any more."""
         found = []
         for each in tuple(self._held):
-            if self._is_near(each.time_ns):
-                self._last[each.kind] = each.time_ns
+            if self._is_near(each[1]):
+                self._last[each[0]] = each[1]
                 self._held.remove(each)
-                found.append(each)
+                found.append(each[2])
         return found

@@ -13,8 +13,9 @@ import numpy as np
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.intake import Deserialise, Stream, decoded, linked, measured
-from calib_ros.sampling.messages import DECODERS, JOINT_STATE, LINKS, JointReadings, joint_state
+from calib_ros.sampling.intake import Deserialise, Intake, Stream, measured
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE, LINKS
+from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import (
     MARKERS,
     TYPES,
@@ -23,7 +24,6 @@ from calib_ros.sampling.sources import (
     parse_sources,
     short_type,
 )
-from calib_ros.sampling.track import Stamps
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
 
@@ -96,7 +96,7 @@ def _links(
 def _learn(messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise) -> None:
     """Let the links of streams learn of all that comes on them."""
     for batch in _batches(messages):
-        linked(batch, deserialise)
+        Intake(batch, deserialise)
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
@@ -163,21 +163,11 @@ def _joint_values(
     """Return stamps and values by topic and joint."""
     found = defaultdict(list)
     for batch in _batches(messages):
-        groups = decoded(batch)
-        for k in sorted(set(range(len(batch))).difference(*(each.places for each in groups))):
-            stream, data = batch[k]
-            try:
-                reading = joint_state(deserialise(data, stream.type))
-            except Exception:  # it is counted when it is replayed
-                continue
-            for name, value in zip(reading.names, reading.values, strict=True):
-                part = np.array([reading.stamp_ns]), np.array([value], dtype=np.float64)
-                found[stream.topic, name].append(part)
-        for group in groups:
-            assert isinstance(group.readings, JointReadings)
-            stamps, names, values = group.readings
-            for name, column in zip(names, values.T, strict=True):
-                found[group.stream.topic, name].append((stamps, column))
+        for topic in dict.fromkeys(stream.topic for stream, _ in batch):
+            of_topic = [each for each in batch if each[0].topic == topic]
+            for _, _, (stamps, (_, *names), values) in Intake(of_topic, deserialise).parts:
+                for name, column in zip(names, values.T, strict=True):
+                    found[topic, name].append((stamps, column))
     return found
 
 

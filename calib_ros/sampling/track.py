@@ -10,19 +10,16 @@ interpolated on its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
+from calib_ros.sampling.intervals import intersection, standing, unheard, union
+from calib_ros.sampling.rows import Rows, Stamps
 
-Stamps = NDArray[np.int64]
-
-MOVED = 1e-3
-"""A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
-LAGS = 4
-"""Samples within the window with which the present one is compared."""
 FEWEST = 8
 """Fewest samples that tell the noise of joints."""
 MOST_SPREAD = 2.0
@@ -31,74 +28,6 @@ MOST_SPREAD = 2.0
 APART = 'joint samples too far apart'
 CAUSES = ('', 'no joint sample before', 'no joint sample after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
-
-
-class Rows:
-    """Stamped rows of numbers in one growing block of memory, up to a capacity."""
-
-    def __init__(self, width: int, capacity: int) -> None:
-        self.capacity = capacity
-        self.count = 0
-        self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
-        self._values = np.empty((len(self._stamps), width))
-
-    @property
-    def full(self) -> bool:
-        """Tell whether there is no room for another row."""
-        return self.count == self.capacity
-
-    @property
-    def stamps(self) -> Stamps:
-        """Return the stamps (M,) in the order of arrival."""
-        return self._stamps[: self.count]
-
-    @property
-    def values(self) -> FloatArray:
-        """Return the rows (M, width) in the order of arrival."""
-        return self._values[: self.count]
-
-    def append(self, stamp_ns: int, row: Sequence[float]) -> None:
-        """Add a row, NaN where it is shorter; the caller has seen that there is room."""
-        if self.count == len(self._stamps):
-            size = min(2 * self.count, self.capacity)
-            self._stamps = np.resize(self._stamps, size)
-            self._values = np.resize(self._values, (size, self._values.shape[1]))
-        self._stamps[self.count] = stamp_ns
-        self._values[self.count, : len(row)] = row
-        self._values[self.count, len(row) :] = np.nan
-        self.count += 1
-
-    def extend(self, stamps: Stamps, rows: FloatArray) -> None:
-        """Add rows (M, at most width), NaN where they are shorter; there is room for them."""
-        end = self.count + len(stamps)
-        if end > len(self._stamps):
-            size = min(max(2 * self.count, end), self.capacity)
-            self._stamps = np.resize(self._stamps, size)
-            self._values = np.resize(self._values, (size, self._values.shape[1]))
-        width = rows.shape[1]
-        self._stamps[self.count : end] = stamps
-        self._values[self.count : end, :width] = rows
-        self._values[self.count : end, width:] = np.nan
-        self.count = end
-
-    def keep(self, index: NDArray[np.generic]) -> None:
-        """Keep only the rows of a mask or an index, in its order."""
-        stamps = self.stamps[index]
-        self._values[: len(stamps)] = self.values[index]
-        self._stamps[: len(stamps)] = stamps
-        self.count = len(stamps)
-
-    def sort(self) -> int:
-        """Put the rows in the order of their stamps, one row a stamp; return how many went.
-
-        Of equal stamps the smallest values win, so that the order of arrival does not choose.
-        """
-        before = self.count
-        if before > 1 and not (np.diff(self.stamps) > 0).all():
-            order = np.lexsort((*self.values.T[::-1], self.stamps))
-            stamps = self.stamps[order]
-            self.keep(order[np.concatenate([[True], np.diff(stamps) > 0])])
-        return before - self.count
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +43,10 @@ class Motion:
     acceleration: FloatArray
     approach: FloatArray
     cause: NDArray[np.intp]
+
+    def rows(self, which: NDArray[np.bool_]) -> Motion:
+        """Return the motion at some of the stamps."""
+        return Motion(*(getattr(self, item.name)[which] for item in fields(self)))
 
 
 class Track:
@@ -160,6 +93,11 @@ class Track:
         return self._capacity if rows is None else self._capacity - rows.count
 
     @property
+    def full(self) -> bool:
+        """Tell whether there is no room for more of a publisher's samples."""
+        return any(rows.full for rows in self._parts.values())
+
+    @property
     def missing(self) -> tuple[int, ...]:
         """Return the joints that no publisher has named."""
         named = {column for part in self._parts for column in part}
@@ -170,19 +108,12 @@ class Track:
         heard = self._heard()
         return tuple(np.flatnonzero((heard > 0) & (heard < heard.max() - time_ns)).tolist())
 
-    def add(self, columns: tuple[int, ...], stamp_ns: int, values: Sequence[float]) -> None:
-        """Take the values of some joints, given by their numbers in the chain."""
-        self._rows(columns).append(stamp_ns, values)
-
     def extend(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
         """Take values (M, k) of some joints at stamps (M,)."""
-        self._rows(columns).extend(stamps, values)
-
-    def _rows(self, columns: tuple[int, ...]) -> Rows:
         rows = self._parts.get(columns)
         if rows is None:
             rows = self._parts[columns] = Rows(len(columns), self._capacity)
-        return rows
+        rows.extend(stamps, values)
 
     def sort(self) -> int:
         """Put all samples in order; return how many had the stamp of another one."""
@@ -200,8 +131,8 @@ class Track:
             index = list(columns)
             revolute = self._revolute[index]
             why, first, last = self._brackets(rows.stamps, stamps)
-            found = _interpolated(rows, stamps, first, last, revolute, standing)
-            came = _approach(rows.values, first, found[0], self._came[index], revolute)
+            found = interpolated(rows, stamps, first, last, revolute, standing)
+            came = last_moves(rows.values, first, found[0], self._came[index], revolute)
             good = np.ix_(why == 0, index)
             for whole, part in zip(
                 (joints, velocity, acceleration, approach), (*found, came), strict=True
@@ -248,9 +179,9 @@ class Track:
         several publishers that name it one must show that, and none that is heard the contrary.
         """
         stands = {
-            columns: _standing(
+            columns: standing(
                 rows.stamps,
-                _continuous(rows.values, self._revolute[list(columns)]),
+                continuous(rows.values, self._revolute[list(columns)]),
                 still,
                 round(window * 1e9),
                 self._max_gap_ns,
@@ -260,11 +191,11 @@ class Track:
         common: Stamps | None = None
         named = [tuple(c for c in stands if k in c) for k in range(len(self._revolute))]
         for several in dict.fromkeys(filter(None, named)):
-            found = _union([stands[columns] for columns in several])
+            found = union([stands[columns] for columns in several])
             for columns in several if len(several) > 1 else ():
-                unheard = _unheard(self._parts[columns].stamps, self._max_gap_ns)
-                found = _intersection(found, _union([stands[columns], unheard]))
-            common = found if common is None else _intersection(common, found)
+                silence = unheard(self._parts[columns].stamps, self._max_gap_ns)
+                found = intersection(found, union([stands[columns], silence]))
+            common = found if common is None else intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
 
     def noise_at_rest(self, time_ns: int) -> float | None:
@@ -279,7 +210,7 @@ class Track:
             values = rows.values[max(0, min(first, rows.count - FEWEST)) :]
             if len(values) < FEWEST:
                 return None
-            values = _continuous(values, self._revolute[list(columns)])
+            values = continuous(values, self._revolute[list(columns)])
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)
             if (values.std(axis=0) > MOST_SPREAD * noise).any():
                 return None
@@ -304,7 +235,7 @@ class Track:
             if cut <= 0:
                 continue
             here = np.array([cut])
-            came = _approach(
+            came = last_moves(
                 rows.values, here, rows.values[here], self._came[index], self._revolute[index]
             )
             self._came[index] = came[0]
@@ -332,181 +263,3 @@ class Track:
         motion = self.at(main.stamps)
         good = motion.cause == 0
         return main.stamps[good], motion.joints[good]
-
-
-def _interpolated(
-    rows: Rows,
-    stamps: Stamps,
-    first: NDArray[np.intp],
-    last: NDArray[np.intp],
-    revolute: NDArray[np.bool_],
-    straight: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return values, velocities and accelerations (N, n) of the cubic through four samples.
-
-    Two before and two after the stamp (Lagrange). At the ends of the recording and beside equal
-    stamps, where there are fewer, values are interpolated linearly; with `straight` everywhere.
-    """
-    known, values = rows.stamps, rows.values
-    nothing = np.zeros((len(stamps), values.shape[1]))
-    if rows.count == 0:
-        return nothing, nothing, nothing
-    origin = values[first]
-    span = (known[last] - known[first]) * 1e-9
-    share = (stamps - known[first]) * 1e-9 / np.maximum(span, 1e-9)
-    step = unwrapped(values[last] - origin, revolute)
-    joints = origin + share[:, np.newaxis] * step
-    velocity = step / np.maximum(span, 1e-9)[:, np.newaxis]
-    if straight:
-        return joints, velocity, nothing
-    before, behind = first - 1, np.maximum(last, first + 1) + 1
-    inner = (before >= 0) & (behind < rows.count)
-    near = np.stack([first - 1, first, np.maximum(last, first + 1), behind])[:, inner]
-    if not near.size:
-        return joints, velocity, nothing
-    times = (known[near] - stamps[inner]) * 1e-9  # (4, N)
-    # A cubic over a pause in the samples would follow nothing that was measured.
-    even = np.diff(times, axis=0).max(axis=0) < 3.0 * np.diff(times, axis=0).min(axis=0)
-    inner[inner] = even
-    near, times = near[:, even], times[:, even]
-    heights = unwrapped(values[near] - origin[inner], revolute)  # (4, N, n)
-    at, slope, bend = _lagrange(times)
-    joints[inner] = origin[inner] + np.einsum('kn,knj->nj', at, heights)
-    velocity[inner] = np.einsum('kn,knj->nj', slope, heights)
-    acceleration = nothing.copy()
-    acceleration[inner] = np.einsum('kn,knj->nj', bend, heights)
-    return joints, velocity, acceleration
-
-
-def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the weights (4, N) of four heights for value, slope and bend at time zero."""
-    at, slope, bend = (np.empty_like(times) for _ in range(3))
-    for k in range(4):
-        a, b, c = (times[i] for i in range(4) if i != k)
-        below = (times[k] - a) * (times[k] - b) * (times[k] - c)
-        at[k] = -a * b * c / below
-        slope[k] = (a * b + b * c + c * a) / below
-        bend[k] = -2.0 * (a + b + c) / below
-    return at, slope, bend
-
-
-def unwrapped(steps: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
-    """Return differences of joint values; a driver may count angles within one turn."""
-    turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
-    return np.asarray(steps - np.where(revolute, turn, 0.0))
-
-
-def _continuous(values: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
-    """Return joint values (M, n) in sequence without jumps of a turn."""
-    steps = unwrapped(np.diff(values, axis=0), revolute)
-    return np.asarray(values[:1] + np.cumsum(np.vstack([0.0 * values[:1], steps]), axis=0))
-
-
-def _approach(
-    values: FloatArray,
-    first: NDArray[np.intp],
-    now: FloatArray,
-    came: FloatArray,
-    revolute: NDArray[np.bool_],
-) -> FloatArray:
-    """Return the signs (N, n) of the last move of each joint before it stood as it does now.
-
-    The last of the samples (M, n) up to index `first` (N,) from which a joint has moved tells;
-    where there is none, `came` (n,) holds the signs from before them.
-    """
-    if len(values) == 0:
-        return np.tile(came, (len(now), 1))
-    path = _continuous(values, revolute)
-    now = path[first] + unwrapped(now - path[first], revolute)
-    there = _last_outside(path, first, now - MOVED, now + MOVED)
-    signs = np.sign(now - np.take_along_axis(path, there, axis=0))
-    return np.asarray(np.where(there >= 0, signs, came))
-
-
-def _last_outside(
-    values: FloatArray, last: NDArray[np.intp], low: FloatArray, high: FloatArray
-) -> NDArray[np.intp]:
-    """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high.
-
-    It is -1 where there is none. By the extremes of blocks of 1, 2, 4, ... values: first over
-    ever larger blocks to the one that holds it, then into the half that does.
-    """
-    lows, highs = [values], [values]
-    while len(lows[-1]) > 1:
-        even = len(lows[-1]) // 2 * 2
-        lows.append(np.minimum(lows[-1][:even:2], lows[-1][1:even:2]))
-        highs.append(np.maximum(highs[-1][:even:2], highs[-1][1:even:2]))
-    shape, low, high = low.shape, low.ravel(), high.ravel()
-    column = np.tile(np.arange(shape[1]), shape[0])
-    end = np.repeat(last + 1, shape[1])  # what comes before is still to be searched
-    found, sizes = np.full(len(end), -1), np.zeros(len(end), dtype=np.intp)
-
-    def outside(level: int, block: NDArray[np.intp], here: NDArray[np.intp]) -> NDArray[np.bool_]:
-        where = (block, column[here])
-        return np.asarray((lows[level][where] < low[here]) | (highs[level][where] > high[here]))
-
-    for level in range(len(lows)):
-        here = np.flatnonzero((found < 0) & (end >> level & 1 == 1))
-        block = (end[here] >> level) - 1
-        hit = outside(level, block, here)
-        found[here[hit]], sizes[here[hit]] = block[hit], level
-        end[here[~hit]] -= 1 << level
-    for level in reversed(range(len(lows) - 1)):
-        here = np.flatnonzero(sizes > level)
-        block = 2 * found[here] + 1
-        found[here] = np.where(outside(level, block, here), block, block - 1)
-    return found.reshape(shape)
-
-
-def _standing(
-    stamps: Stamps, values: FloatArray, still: float, window_ns: int, max_gap_ns: int
-) -> Stamps:
-    """Return (K, 2) from when to when the joints of one publisher stood."""
-    if len(stamps) == 0:
-        return np.zeros((0, 2), dtype=np.int64)
-    index = np.arange(len(stamps))
-    gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
-    begin = index[gap][np.cumsum(gap) - 1]  # where the samples without a gap begin
-    quiet = np.ones(len(stamps), dtype=bool)
-    joints = values.T.copy()  # numpy is slow over a short last axis
-    back = begin
-    for lag in range(1, LAGS + 1):
-        back = np.searchsorted(stamps, stamps - window_ns * lag // LAGS)
-        back = np.maximum(np.minimum(back, index - 1), begin)
-        quiet &= np.abs(joints - np.take(joints, back, axis=1)).max(axis=0) <= still
-    starts = np.flatnonzero(quiet & ~np.concatenate([[False], quiet[:-1]]) | (quiet & gap))
-    ends = np.flatnonzero(quiet & ~(np.concatenate([quiet[1:], [False]])))
-    ends = np.union1d(ends, np.flatnonzero(quiet & np.concatenate([gap[1:], [False]])))
-    found = np.stack([stamps[back[starts]], stamps[ends]], axis=1)
-    found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch parts two stands
-    return np.asarray(found[found[:, 0] < found[:, 1]], dtype=np.int64)
-
-
-def _unheard(stamps: Stamps, max_gap_ns: int) -> Stamps:
-    """Return (K, 2) when a publisher was not heard; what it shows before and after overlaps."""
-    limits = np.iinfo(np.int64)
-    gaps = np.flatnonzero(np.diff(stamps) > max_gap_ns)
-    begins = np.concatenate([[limits.min], stamps[gaps] - 1, stamps[-1:] - 1])
-    ends = np.concatenate([stamps[:1] + 1, stamps[gaps + 1] + 1, [limits.max]])
-    return np.stack([begins, ends], axis=1)
-
-
-def _union(several: Sequence[Stamps]) -> Stamps:
-    """Return (K, 2) the intervals of sorted lists, those that overlap as one."""
-    if len(several) == 1:
-        return several[0]
-    found = np.concatenate(several)
-    found = found[np.argsort(found[:, 0], kind='stable')]
-    ends = np.maximum.accumulate(found[:, 1])
-    apart = found[1:, 0] >= ends[:-1]
-    firsts = np.concatenate([np.ones(len(found[:1]), dtype=bool), apart])
-    lasts = np.concatenate([apart, np.ones(len(found[:1]), dtype=bool)])
-    return np.stack([found[firsts, 0], ends[lasts]], axis=1)
-
-
-def _intersection(first: Stamps, second: Stamps) -> Stamps:
-    """Return (K, 2) what two sorted lists of intervals have in common."""
-    starts = np.maximum(first[:, np.newaxis, 0], second[np.newaxis, :, 0])
-    ends = np.minimum(first[:, np.newaxis, 1], second[np.newaxis, :, 1])
-    chosen = starts < ends
-    return np.stack([starts[chosen], ends[chosen]], axis=1)

@@ -22,8 +22,8 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import Layout
 from calib_ros.sampling.messages import TRANSFORMS, Readings
+from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import Source, short_type
-from calib_ros.sampling.track import Stamps
 
 Pair: TypeAlias = tuple[str, str]
 """Names of the parent and the child frame of a link."""
@@ -303,4 +303,4 @@ class Links:
             links = se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
             found = route.before @ (se3.invert(links) if route.inverse else links) @ route.after
             numbers = np.hstack([found[:, :3, 3], se3.to_quat(found[:, :3, :3])])
-        return Readings(stamps, source.parent, source.child, False, numbers)
+        return Readings(stamps, (source.parent, source.child), numbers)

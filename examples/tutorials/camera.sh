@@ -16,7 +16,10 @@ camera, board = Camera(), read_board(Path('board.yaml'))
 arm = faulty(load_chain('ur10e'), Cell(), rng)
 true = before_camera(arm, camera, board.corners, True, rng)
 seen = photograph(true, camera, board.corners, True, 30, rng, noise=0.1)
-with open('corners.csv', 'w', newline='') as corners, open('places.csv', 'w', newline='') as places:
+with (
+    open('corners.csv', 'w', newline='') as corners,
+    open('places.csv', 'w', newline='') as places,
+):
     found, where = csv.writer(corners), csv.writer(places)
     found.writerow(['image', 'corner', 'u', 'v'])
     where.writerow(['image', *(f'q{k}' for k in range(1, 7))])

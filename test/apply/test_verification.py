@@ -12,13 +12,14 @@ from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.design import Design
 from calib_ros.apply.iso9283 import iso_9283_poses
-from calib_ros.apply.verification import in_words, verify
+from calib_ros.apply.verification import Attained, in_words, verify
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.waypoints import csv_of, joint_columns, joints_csv, read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.validation import Residuals
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert, to_quat
 
@@ -165,6 +166,22 @@ def test_limits_are_those_of_the_chi_squared_distribution():
     squares = rng.chisquare(15.0, 100_000) / 15.0
     assert np.mean(squares < 1.0 / upper[0] ** 2) == pytest.approx(0.1, abs=0.005)
     assert np.mean(squares > 1.0 / lower[0] ** 2) == pytest.approx(0.1, abs=0.005)
+
+
+def test_repeatability_is_that_of_the_standard():
+    """Distances from their mean place, the mean of them and three standard deviations."""
+    after = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 3.0], [1.0, 0.0, -3.0]])
+    found = Attained.of(after + np.array([0.0, 2.0, 0.0]), after)
+    assert (found.cycles, found.after) == (4, 1.0)
+    assert found.before == pytest.approx(np.sqrt(5.0))
+    assert found.repeatability == pytest.approx(2.0 + 3.0 * np.sqrt(4.0 / 3.0))
+    assert Attained.of(after[:1], after[:1]).repeatability is None
+    everything = Residuals(
+        1e-3 * after, np.full((4, 3), np.nan), np.arange(4), np.full((4, 2), np.nan)
+    ).figures(np.ones(4, dtype=bool))
+    lengths = np.array([2.0, 0.0, np.sqrt(10.0), np.sqrt(10.0)])
+    assert everything.mean_mm == pytest.approx(lengths.mean())
+    assert everything.mean_plus_3_sigma_mm == pytest.approx(lengths.mean() + 3.0 * lengths.std())
 
 
 def test_repeats_do_not_count_as_more_configurations(arm):

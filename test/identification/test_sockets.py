@@ -6,77 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 
-from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.observations import Observations
-from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.identification.identification import identify
 from calib_ros.report.words import summary
-
-DISTANCE = 0.05
-PLACES = 4
-IIWA = replace(load_chain('kuka_iiwa14'), base=None, tool=None)
-
-
-def led_to(chain, q, points):
-    """Return joint values near q (N, n) that bring the target to points (N, 3)."""
-    model = ErrorModel(chain, [f'{name}.theta' for name in chain.joint_names])
-    for _ in range(200):
-        columns = model.jacobian(q)[:, :3] * np.array([joint.sign for joint in chain.joints])
-        square = columns @ columns.transpose(0, 2, 1) + 1e-5 * np.eye(3)
-        left = points - chain.forward(q)[:, :3, 3]
-        steps = np.linalg.solve(square, left[:, :, None])
-        q = q + (columns.transpose(0, 2, 1) @ steps)[:, :, 0]
-    assert np.abs(chain.forward(q)[:, :3, 3] - points).max() < 1e-12
-    return q
-
-
-def cell(seed, offset=0.03, noise=0.0, count=30):
-    """Return a true arm with the ball some offset [m] from its last axis, and the problem."""
-    rng = np.random.default_rng(seed)
-    tool = np.eye(4)
-    tool[:3, 3] = [offset, 0.0, 0.14]
-    true = replace(faulty(IIWA, Cell(), rng), base=Frame(), tool=Frame(tool))
-    sets, separations = [], []
-    for place in range(PLACES):
-        reach = true.forward(true.random_joints(5, rng))[:, :3, 3]
-        middle = reach[np.argsort(np.linalg.norm(reach, axis=1))[1]]
-        angle = rng.uniform(0.0, np.pi)
-        half = 0.5 * DISTANCE * np.array([np.cos(angle), np.sin(angle), 0.0])
-        bases = [f'base_{place}_{socket}' for socket in range(2)]
-        for base, centre in zip(bases, (middle - half, middle + half), strict=True):
-            points = centre + rng.normal(scale=noise, size=(count, 3))
-            q = led_to(true, true.random_joints(count, rng), points)
-            seen = Observations.from_arrays(q, np.zeros((count, 3)))
-            sets.append(replace(seen, base=base, socket=True))
-        separations.append((*bases, DISTANCE))
-    return true, Problem(
-        IIWA,
-        sets[0],
-        more=sets[1:],
-        separations=separations,
-        sigma_position=max(noise, 1e-5),
-    )
-
-
-def difference(found, true, seed=0):
-    """Return the RMS distance [m] of positions by two chains, one body laid upon the other."""
-    q = IIWA.random_joints(300, np.random.default_rng(seed))
-    first, second = (chain.forward(q)[:, :3, 3] for chain in (found, true))
-    first, second = first - first.mean(axis=0), second - second.mean(axis=0)
-    turn = se3.nearest_rotation(second.T @ first)
-    return float(np.sqrt(((first @ turn.T - second) ** 2).sum(axis=1).mean()))
 
 
 def gauges(result):
     return {parameter.name for parameter in result.parameters if parameter.status == 'gauge'}
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 def test_sockets_find_the_arm_but_not_where_it_stands(seed):
     true, problem = cell(seed)
     result = identify(problem)
@@ -99,8 +40,7 @@ def test_noise_makes_no_gauge_freedom_look_determined(noise):
     assert max(std) < 30.0 * noise
 
 
-@pytest.mark.parametrize('offset', [0.0, 3e-4])
-@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize(('seed', 'offset'), [(0, 0.0), (1, 3e-4)])
 def test_a_ball_on_the_last_axis_leaves_it_near_nominal(seed, offset):
     true, problem = cell(seed, offset, noise=5e-4)
     result = identify(problem)
@@ -117,8 +57,7 @@ def test_a_ball_on_the_last_axis_leaves_it_near_nominal(seed, offset):
     assert difference(result.chain, true) < 1.5 * difference(far.chain, other) + 1e-4
 
 
-@pytest.mark.parametrize('agree', [False, True])
-@pytest.mark.parametrize('seed', range(2))
+@pytest.mark.parametrize(('seed', 'agree'), [(0, False), (1, True)])
 def test_poses_outside_the_socket_are_named_and_do_no_harm(seed, agree):
     """At 30 % of the poses of every socket the ball sat 5-50 mm beside it."""
     rng = np.random.default_rng(seed)

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.experimental import EventsExecutor
 from ros_cell import (
     STOPS,
     Cell,
@@ -361,8 +359,7 @@ def test_another_calibration_corrects_otherwise(calibrated, corrected):
     assert np.abs(first - second).max() > 1e-4
 
 
-@pytest.mark.parametrize('executor', [SingleThreadedExecutor, EventsExecutor])
-def test_messages_are_taken_while_it_computes(tmp_path, recording, executor, monkeypatch):
+def test_messages_are_taken_while_it_computes(tmp_path, recording, monkeypatch):
     """The work waits for the messages here: it could not if they waited for the work."""
     taken, entered = threading.Event(), threading.Event()
     real = guide_module.compensate_program
@@ -373,7 +370,7 @@ def test_messages_are_taken_while_it_computes(tmp_path, recording, executor, mon
         return real(*arguments)
 
     monkeypatch.setattr(guide_module, 'compensate_program', slow)
-    with Cell(executor, chain='ur10e', data_dir=str(tmp_path)) as cell:
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         cell.node.session.adopt(Calibration(UR.with_frame('base', Frame()), UR))
         heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
         cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)

@@ -7,7 +7,7 @@ import os
 import pytest
 from ros_cell import Cell, true_arm
 
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
@@ -124,3 +124,8 @@ def test_the_list_of_folders_is_the_operators(cell):
 def test_a_file_elsewhere_is_refused_at_the_start(data, tmp_path, name):
     with Cell() as cell, pytest.raises(InputError, match=f'choose {name} in data_dir, or start'):
         cell.start(chain='ur10e', data_dir=str(data), **{name: str(tmp_path / 'x.yaml')})
+
+
+def test_a_history_without_a_serial_number_is_refused_at_the_start(tmp_path):
+    with Cell() as cell, pytest.raises(ConfigError, match='set serial as well'):
+        cell.start(chain='ur10e', data_dir=str(tmp_path), history=str(tmp_path / 'history'))

@@ -13,8 +13,10 @@ from streams import (
     TRANSFORM,
     distance,
     joint_state,
+    of_joints,
     pose,
     stops,
+    take,
     transform,
 )
 
@@ -131,22 +133,27 @@ def happening(seed, parts, dies, joint_period, sources, period, stand, latest, w
     return [what for _, what in events] * (1 + again)
 
 
-@settings(max_examples=50, phases=[Phase.generate])  # to shrink takes minutes
+@settings(max_examples=25, phases=[Phase.generate])  # to shrink takes minutes
 @given(plans, traffic)
 def test_every_measurement_is_accounted_for(plan, traffic):
-    session = CalibrationSession(ARM, Settings(**plan))
+    session, come = CalibrationSession(ARM, Settings(**plan)), []
     for k, (name, *values) in enumerate(happening(**traffic)):
         if name == 'joints':
-            session.take_joints(joint_state(*values))
+            come.append(of_joints(joint_state(*values)))
         elif name == 'measured':
             stamp_ns, number, where = values
             source, kind, make = SOURCES[number]
-            session.take(source, kind, make(stamp_ns, where))
+            come.append((source, kind, make(stamp_ns, where)))
         else:
+            take(session, *come)
+            come = []
             call(session, name)
-        if k % 40 == 0 or name in CALLS:
+        if k % 100 == 0 or name in CALLS:
+            take(session, *come)
+            come = []
             came, found = balance(session)
             assert came == found, f'after {name}, message {k}'
+    take(session, *come)
     session.finish()
     came, found = balance(session)
     assert came == found

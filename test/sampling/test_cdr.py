@@ -6,9 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.sampling import messages
-from calib_ros.sampling.cdr import decode, readings, trajectory_size
-from calib_ros.sampling.messages import DECODERS, JOINT_STATE
+from calib_ros.sampling.cdr import decode, trajectory_size
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Readings, reading, usable
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
@@ -78,7 +77,7 @@ def test_measurements_are_decoded_as_by_rosbags(kind, frame_id, child, rows):
         assert stamp == seconds * 1_000_000_000 + nanoseconds
         found = batch.numbers[k]
         if kind.endswith('Range'):
-            numbers = np.float32(numbers[:4])
+            numbers = np.float32(numbers[3:4])
         np.testing.assert_array_equal(found[:7], numbers[: len(found)])
         if len(found) == 43:
             np.testing.assert_array_equal(found[7:], np.arange(36.0) + numbers[0])
@@ -103,7 +102,7 @@ def test_joint_states_are_decoded_as_by_rosbags(frame_id, names, rows):
         expected = STORE.deserialize_cdr(blob, JOINT_STATE)
         np.testing.assert_array_equal(batch.numbers[k], expected.position)
         if rows[k][0] + rows[k][1]:
-            assert batch.stamps_ns[k] == messages.joint_state(expected).stamp_ns
+            assert batch.stamps_ns[k] == reading(JOINT_STATE, expected)[0]
 
 
 def joint_blob(names, positions, frame_id=''):
@@ -131,12 +130,6 @@ def test_broken_messages_are_left_to_others(cut):
 VALID = [1.0, -2.0, 0.5, 0.6, 0.0, -0.8, 0.0]
 
 
-def read(kind, blobs):
-    given_ = [STORE.deserialize_cdr(blob, kind) for blob in blobs]
-    decoder = messages.joint_state if kind == JOINT_STATE else DECODERS[kind]
-    return [decoder(each) for each in given_]
-
-
 def blob_of(kind, numbers, child='hand', seconds=5):
     head = header(seconds, 7, 'tracker')
     made = message(kind, head, child, numbers)
@@ -145,52 +138,45 @@ def blob_of(kind, numbers, child='hand', seconds=5):
     return bytes(STORE.serialize_cdr(made, kind))
 
 
-@pytest.mark.parametrize('kind', sorted(DECODERS))
+@pytest.mark.parametrize('kind', [*sorted(DECODERS), JOINT_STATE])
 def test_batches_are_read_as_single_messages_are(kind):
-    blobs = [blob_of(kind, VALID, seconds=s) for s in (5, 6, 7)]
-    expected = read(kind, blobs)
-    batch, good = readings(kind, blobs)
-    assert good.all()
-    for k, single in enumerate(expected):
-        found = batch.row(k)
-        assert found[:4] == single[:4]
-        assert found.covariance == single.covariance
-        assert found.distance == pytest.approx(single.distance)
-        assert found.child == single.child
+    if kind == JOINT_STATE:
+        blobs = [joint_blob(['a', 'b'], [value, 2.0]) for value in (0.0, 1.0)]
+    else:
+        blobs = [blob_of(kind, VALID, seconds=s) for s in (5, 6, 7)]
+    batch = decode(kind, blobs)
+    assert usable(kind, batch)[0].all()
+    for k, blob in enumerate(blobs):
+        stamp_ns, strings, numbers = reading(kind, STORE.deserialize_cdr(blob, kind))
+        assert (stamp_ns, strings) == (batch.stamps_ns[k], batch.strings)
+        np.testing.assert_array_equal(numbers, batch.numbers[k])
 
 
-def test_batches_of_joint_states_are_read_as_single_messages_are():
-    blobs = [joint_blob(['a', 'b'], [value, 2.0]) for value in (0.0, 1.0)]
-    batch, good = readings(JOINT_STATE, blobs)
-    assert good.all()
-    for k, single in enumerate(read(JOINT_STATE, blobs)):
-        found = batch.row(k)
-        assert found.stamp_ns == single.stamp_ns
-        assert list(found.names) == list(single.names)
-        assert list(found.values) == list(single.values)
+COVARIANCE = np.diag(np.arange(1.0, 7.0)).ravel()
 
 
 @pytest.mark.parametrize(
-    ('kind', 'numbers', 'child', 'seconds'),
+    ('numbers', 'child', 'cause'),
     [
-        ('geometry_msgs/msg/PoseStamped', [np.nan, *VALID[1:]], 'hand', 5),
-        ('geometry_msgs/msg/PoseStamped', [*VALID[:6], 1.0], 'hand', 5),
-        ('geometry_msgs/msg/PointStamped', [np.inf, *VALID[1:]], 'hand', 5),
-        ('geometry_msgs/msg/TransformStamped', VALID, 'ha\nnd', 5),
-        ('sensor_msgs/msg/Range', [0.0] * 7, 'hand', 5),
+        ([np.nan, *VALID[1:]], '', 'NaN or infinite position'),
+        ([np.inf, 0.0, 0.0], '', 'NaN or infinite position'),
+        ([*VALID[:6], 1.0], '', 'quaternion not of length 1'),
+        ([*VALID[:6], np.nan], '', 'quaternion not of length 1'),
+        ([1.1e6, *VALID[1:]], '', 'position beyond 1000 km'),
+        (VALID, 'ha\nnd', 'child frame whose name cannot be printed'),
+        ([*VALID, *-COVARIANCE], '', 'covariance not positive definite'),
+        ([0.0], '', 'distance not a positive number'),
+        ([np.inf], '', 'distance not a positive number'),
+        ([1.1e6], '', 'distance beyond 1000 km'),
     ],
 )
-def test_what_a_decoder_refuses_is_left_to_it(kind, numbers, child, seconds):
-    blob, bad = blob_of(kind, VALID), blob_of(kind, numbers, child, seconds)
-    found = readings(kind, [blob, bad, blob])
-    if found is None:
-        assert readings(kind, [blob]) is not None
-    else:
-        batch, good = found
-        assert good.tolist() == [True, False, True]
-        assert batch.row(1) == read(kind, [blob])[0]
-    with pytest.raises(messages.MessageError):
-        read(kind, [bad])
+def test_what_cannot_be_used_is_told_by_its_cause(numbers, child, cause):
+    good = {1: [0.5], 3: VALID[:3], 7: VALID, 43: [*VALID, *COVARIANCE]}[len(numbers)]
+    rows = np.array([good, numbers, good])
+    named = not cause.startswith('child')
+    good, causes = usable('', Readings(np.array([5, 6, 0]), ('tracker', child), rows))
+    assert good.tolist() == [named, False, False]
+    assert causes == {cause: 1 if named else 2, 'zero stamp': 1}
 
 
 def trajectory(frame_id, names, points):

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
-from calib_ros.sampling.collector import MOST_STREAMS, TOO_MANY, Collector, StreamKey
-from calib_ros.sampling.messages import Reading
+from calib_ros.sampling.collector import MOST_STREAMS, TOO_MANY, Collector
 from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.slices import Piece, Slice, StreamKey
 from calib_ros.settings import Settings
 
 POSE = StreamKey('', '', False, False, False)
@@ -31,42 +31,58 @@ def place(joints):
 
 
 def joint_events(motion, end, rate=100.0, begin=0.0):
-    """Return (time of arrival [s], function of a collector) for joint samples."""
+    """Return (time of arrival [s], stream, stamp, numbers) of joint samples."""
     times = np.arange(begin, end, 1.0 / rate)
     return [
-        (time, lambda made, stamp=stamp, row=row: made.add_joints((0, 1), stamp, row))
-        for time, stamp, row in zip(
-            times.tolist(), stamps(times).tolist(), motion(times), strict=True
-        )
+        (time, (0, 1), stamp, row)
+        for time, stamp, row in zip(times.tolist(), stamps(times), motion(times), strict=True)
     ]
 
 
 def pose_events(motion, end, rate=50.0, begin=0.0, key=POSE, delay=0.0, noise=NOISE, seed=1):
-    """Return (time of arrival [s], function of a collector) for measurements stamped late."""
+    """Return (time of arrival [s], stream, stamp, numbers) of measurements stamped late."""
     times = np.arange(begin + 0.003, end, 1.0 / rate)
     values = place(motion(times))
     values = values + np.random.default_rng(seed).normal(scale=noise, size=values.shape)
-
-    def reading(stamp, value):
-        if key.distance:
-            return Reading(stamp, 'world', distance=float(np.linalg.norm(value)))
-        return Reading(stamp, 'world', tuple(value.tolist()))
-
+    if key.distance:
+        values = np.linalg.norm(values, axis=1, keepdims=True)
     return [
-        (time + delay, lambda made, stamp=stamp, value=value: made.add(key, reading(stamp, value)))
-        for time, stamp, value in zip(
-            times.tolist(), stamps(times + delay).tolist(), values, strict=True
-        )
+        (time + delay, key, stamp, value)
+        for time, stamp, value in zip(times.tolist(), stamps(times + delay), values, strict=True)
     ]
 
 
 def play(made, *events, finish=True):
     """Play events in the order of their arrival and return the samples."""
-    for _, happens in sorted((e for each in events for e in each), key=lambda event: event[0]):
-        happens(made)
+    come = []
+    for time, *what in sorted((e for each in events for e in each), key=lambda event: event[0]):
+        if len(what) > 1:
+            come.append((time, *what))
+            continue
+        give(made, come)
+        come = []
+        what[0](made)
+    give(made, come)
     if finish:
         made.finish()
-    return made.take()
+    return made.maker.take()
+
+
+def give(made, come):
+    """Let a collector take (time, stream, stamp, numbers), as a session does."""
+    streams = {}
+    for k, (_, key, *what) in enumerate(come):
+        streams.setdefault(key, []).append((k, *what))
+    pieces = [
+        Piece(key, *(np.array(each) for each in zip(*rows, strict=True)))
+        for key, rows in streams.items()
+    ]
+    left = Slice.of(pieces, round(1e9 * made.settings.delay)) if pieces else ()
+    while len(left):
+        count = made.reach(left)
+        if made.take(left.between(0, count)):
+            made.round()
+        left = left.between(count, len(left))
 
 
 def collector(**settings):
@@ -124,6 +140,24 @@ def test_a_stop_is_one_sample_of_each_stream():
     assert set(made.unused) == {MOVING, CALM}
 
 
+def test_the_covariance_of_a_stop_is_the_mean_of_its_measurements():
+    motion = stops(STOPS[:2], MOVE, STAND)
+    spread = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) * 1e-8
+    spread[0, 1] = spread[1, 0] = 5e-9
+    times = np.arange(0.003, 3.5, 0.02)
+    sizes = np.where(np.arange(len(times))[:, np.newaxis] % 2, 3.0, 1.0) * spread.ravel()
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(times), 1))
+    rows = np.concatenate([place(motion(times)), turns, sizes], axis=1)
+    events = [
+        (time, POSE, stamp, row)
+        for time, stamp, row in zip(times.tolist(), stamps(times), rows, strict=True)
+    ]
+    sample = play(collector(), joint_events(motion, 3.5), events)[0]
+    share = 1.0 / sample.count  # an odd count has one more of either
+    np.testing.assert_allclose(sample.covariance, 2.0 * spread, rtol=share)
+    np.testing.assert_array_equal(sample.covariance == 0.0, spread == 0.0)
+
+
 @pytest.mark.parametrize(('settle', 'count'), [(0.0, 50), (0.3, 35), (0.7, 15)])
 def test_measuring_begins_after_the_arm_has_settled(settle, count):
     motion = tour()
@@ -167,9 +201,8 @@ def test_a_measurement_while_the_arm_vibrates_is_left_out():
     for time, more in zip(np.arange(950) * 0.01, noise, strict=True):
         since = time % (MOVE + STAND)
         swing = 2e-3 * np.exp(-since / 0.08) * np.sin(50.0 * since)
-        seen = tuple((place(motion([time]))[0] + swing + more).tolist())
-        reading = Reading(int(stamps(time)), 'world', seen)
-        events.append((time, lambda made, reading=reading: made.add(POSE, reading)))
+        seen = place(motion([time]))[0] + swing + more
+        events.append((time, POSE, int(stamps(time)), seen))
     samples = play(made, joint_events(motion, 9.5), events)
     assert len(samples) == 5
     assert made.dropped['poses: still vibrating, or a spike'] > 20
@@ -181,13 +214,10 @@ def test_a_measurement_while_the_arm_vibrates_is_left_out():
 def test_a_stop_at_which_the_target_moves_is_dropped_and_counted():
     motion = tour()
     made = collector()
-
-    def slipping(time):
-        return lambda made: made.add(
-            POSE, Reading(int(stamps(time)), 'world', (1.0, 2.0, 3.0 + 5e-3 * time))
-        )
-
-    events = [(time, slipping(time)) for time in np.arange(0.0, 9.5, 0.02).tolist()]
+    events = [
+        (time, POSE, int(stamps(time)), np.array([1.0, 2.0, 3.0 + 5e-3 * time]))
+        for time in np.arange(0.0, 9.5, 0.02).tolist()
+    ]
     assert play(made, joint_events(motion, 9.5), events) == []
     assert made.dropped == {
         'poses: a stop that spreads more than the noise': pytest.approx(270, abs=10)
@@ -203,9 +233,7 @@ def test_joints_are_those_of_the_time_of_the_measurements():
     for time in np.arange(0.0, 2.0, 0.01).tolist():
         row = where + rng.normal(scale=1e-5, size=2)
         row = (row + np.pi) % (2.0 * np.pi) - np.pi
-        events.append(
-            (time, lambda made, t=time, row=row: made.add_joints((0, 1), int(stamps(t)), row))
-        )
+        events.append((time, (0, 1), int(stamps(time)), row))
     (sample,) = play(made, events, pose_events(stops(where[np.newaxis]), 1.95))
     error = (sample.joints - where + np.pi) % (2.0 * np.pi) - np.pi
     assert np.abs(error).max() < 5e-6
@@ -310,7 +338,7 @@ def test_a_capture_that_gives_nothing_leaves_the_stop_its_sample():
     motion = stops(STOPS[:2], 1.0, 1.0)
     made = collector()
     asking, answers = ask([2.35])
-    late = [(time + 0.4, happens) for time, happens in pose_events(motion, 8.0)]
+    late = [(time + 0.4, *what) for time, *what in pose_events(motion, 8.0)]
     samples = play(made, joint_events(motion, 8.0), late, asking)
     assert answers == [(0, 'no measurement within this stop')]
     assert len(samples) == 2
@@ -343,7 +371,7 @@ def test_the_order_of_arrival_within_lateness_does_not_matter(seed, mode, latene
     joints = joint_events(motion, 7.0)
     measured = pose_events(motion, 7.0, delay=delay)
     measured += pose_events(motion, 7.0, 17.0, key=WIRE, delay=delay)
-    shaken = [(time + rng.uniform(0.0, 0.95 * lateness), happens) for time, happens in measured]
+    shaken = [(time + rng.uniform(0.0, 0.95 * lateness), *what) for time, *what in measured]
     settings = {'mode': mode, 'lateness': lateness, 'delay': delay}
     orderly, other = (collector(**settings) for _ in range(2))
     expected = play(orderly, joints, measured)
@@ -361,7 +389,7 @@ def test_the_order_of_arrival_within_lateness_does_not_matter(seed, mode, latene
 def test_what_comes_later_than_lateness_is_counted(mode):
     motion = tour()
     made = collector(mode=mode, lateness=0.5)
-    late = [(time + 2.0, happens) for time, happens in pose_events(motion, 7.0)]
+    late = [(time + 2.0, *what) for time, *what in pose_events(motion, 7.0)]
     samples = play(made, joint_events(motion, 9.5), late)
     assert samples == []
     assert made.dropped == {LATE: pytest.approx(350, abs=10)}
@@ -374,7 +402,7 @@ def test_joint_samples_that_come_too_late_are_counted():
     motion = tour()
     made = collector(lateness=0.5)
     play(made, joint_events(motion, 9.5))
-    made.add_joints((0, 1), START, np.zeros(2))
+    play(made, [(0.0, (0, 1), START, np.zeros(2))], finish=False)
     assert made.dropped == {'joints: later than lateness allows': 1}
 
 
@@ -416,7 +444,7 @@ def test_a_bag_in_a_loop_gives_nothing_twice(mode, rate):
     once = collector(mode=mode)
     expected = play(once, events)
     made = collector(mode=mode)
-    again = [(time + 10.0 * k, happens) for k in range(3) for time, happens in events]
+    again = [(time + 10.0 * k, *what) for k in range(3) for time, *what in events]
     samples = play(made, again)
     assert made.notes['the clock jumped back'] == 2
     if mode == 'dwell':  # the last stop is cut off by the jump
@@ -431,7 +459,7 @@ def test_a_stop_that_was_taken_back_is_sampled_when_it_comes_again():
     events = [*joint_events(motion, 9.5), *pose_events(motion, 9.5)]
     samples = play(made, events)
     made.forget(samples[3])
-    again = play(made, [(time + 10.0, happens) for time, happens in events])
+    again = play(made, [(time + 10.0, *what) for time, *what in events])
     assert [each.stamp_ns for each in again] == [samples[3].stamp_ns]
 
 
@@ -441,7 +469,7 @@ def test_after_the_clock_jumped_back_new_stops_are_sampled():
     made = collector()
     events = [*joint_events(motion, 9.5), *pose_events(motion, 9.5)]
     more = [*joint_events(other, 9.5), *pose_events(other, 9.5, begin=0.007)]
-    samples = play(made, events, [(time + 10.0, happens) for time, happens in more])
+    samples = play(made, events, [(time + 10.0, *what) for time, *what in more])
     assert len(samples) == 10
     for sample, where in zip(samples, [*STOPS, *(STOPS[::-1] + 0.1)], strict=True):
         np.testing.assert_allclose(sample.joints, where, atol=1e-3)
@@ -450,7 +478,7 @@ def test_after_the_clock_jumped_back_new_stops_are_sampled():
 def test_one_stamp_from_the_future_does_not_stop_it():
     motion = tour()
     made = collector()
-    wrong = [(3.5, lambda made: made.add_joints((0, 1), START + 10**12, np.zeros(2)))]
+    wrong = [(3.5, (0, 1), START + 10**12, np.zeros(2))]
     samples = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), wrong)
     assert len(samples) >= 4
 
@@ -513,16 +541,14 @@ def marker(number):
 def glimpse(number, time):
     """Return the event of one measurement of a marker."""
     stamp = int(stamps(np.array([time]))[0])
-    reading = Reading(stamp, 'world', (0.0, 0.0, 0.0))
-    return time, lambda made: made.add(marker(number), reading)
+    return time, marker(number), stamp, np.zeros(3)
 
 
 def test_targets_without_end_are_dropped_and_counted():
     """A tracker numbers its markers anew with each measurement; memory stays bounded."""
     made = collector()
     play(made, [glimpse(k, 0.5 + 1e-4 * k) for k in range(200)], finish=False)
-    last = stamps(np.array([0.6, 0.7]))
-    made.extend(marker(200), last, np.zeros((2, 3)))
+    play(made, [glimpse(200, time) for time in (0.6, 0.7)], finish=False)
     assert made.waiting == MOST_STREAMS
     assert made.dropped == {TOO_MANY: 200 - MOST_STREAMS + 2}
 
@@ -550,5 +576,5 @@ def test_a_target_that_was_sampled_makes_no_room(monkeypatch):
     assert [each.target for each in samples] == ['1', '2']
     assert made.dropped == {TOO_MANY: 1}
     made.forget(samples[0])
-    made.add(marker(3), Reading(stamps(np.array([9.6]))[0], 'world', (0.0, 0.0, 0.0)))
+    play(made, [glimpse(3, 9.6)], finish=False)
     assert made.waiting == 1

@@ -6,7 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from streams import POINT, POSE, START, TRACKER, joint_state, point, pose, stamps, stops, sweep
+from streams import START, hear, stamps, stops, sweep
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.kinematics.chain_file import load_chain
@@ -32,25 +32,13 @@ def recorded(lag, seed=0, oriented=True, seconds=SECONDS, motion=None, **setting
     joint_times = np.arange(0.0, seconds, 0.005)
     times = np.arange(0.05, seconds - 0.3, 0.02)
     seen = measure(true, motion(times), rng, *NOISE, oriented)
-    late = stamps(times + lag)
-    events = []
-    for time, stamp, row in zip(
-        joint_times, stamps(joint_times).tolist(), motion(joint_times), strict=True
-    ):
-        message = joint_state(stamp, UR10E.joint_names, row.tolist())
-        events.append((time, lambda message=message: session.take_joints(message)))
-    for k, time in enumerate(times):
-        stamp, where = int(late[k]), seen.positions[k]
-        message = pose(stamp, where, seen.rotations[k]) if oriented else point(stamp, where)
-        kind = POSE if oriented else POINT
-        events.append(
-            (
-                time + max(lag, 0.0) + 0.005,
-                lambda message=message, kind=kind: session.take(TRACKER, kind, message),
-            )
-        )
-    for _, happens in sorted(events, key=lambda event: event[0]):
-        happens()
+    rotations = seen.rotations if oriented else None
+    arrived = times + max(lag, 0.0) + 0.005
+    hear(
+        session,
+        (joint_times, stamps(joint_times), motion(joint_times)),
+        (arrived, stamps(times + lag), seen.positions, rotations),
+    )
     session.finish()
     return session, true, motion
 
@@ -62,8 +50,9 @@ def error(chain, true, motion):
     return np.sqrt((apart**2).sum(axis=1).mean())
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('delay', [0.035, 0.2, -0.05])
+@pytest.mark.parametrize(
+    ('delay', 'oriented'), [(0.035, True), (0.2, False), (-0.05, True), (-0.05, False)]
+)
 def test_a_delay_is_found_and_costs_nothing(delay, oriented):
     session, true, motion = recorded(delay, oriented=oriented)
     # by positions alone the speeds compared are those of two points, the flange and the target

@@ -13,9 +13,11 @@ from streams import (
     TRANSFORM,
     distance,
     joint_state,
+    of_joints,
     pose,
     stamps,
     stops,
+    take,
     transform,
 )
 
@@ -62,10 +64,11 @@ def drive(made, configurations, sources, start=0.0, rate=50.0):
     end = 1.6 * len(configurations)
     times = np.arange(0.0, end, 1.0 / rate)
     rows = motion(times)
+    come = []
     for row, stamp in zip(rows, stamps(times + start).tolist(), strict=True):
-        made.take_joints(joint_state(stamp, UR5E.joint_names, row.tolist()))
-        for source, kind, make in sources:
-            made.take(source, kind, make(stamp, row))
+        come.append(of_joints(joint_state(stamp, UR5E.joint_names, row.tolist())))
+        come += [(source, kind, make(stamp, row)) for source, kind, make in sources]
+    take(made, *come)
     return end
 
 
@@ -218,7 +221,7 @@ def test_frames_without_end_are_not_remembered():
     for k in range(60):
         message = pose(k + 1, np.zeros(3), np.eye(3))
         message.header.frame_id = f'frame {k}' if k else 'line\nbreak'
-        made.take(TRACKER, POSE, message)
+        take(made, (TRACKER, POSE, message))
     dropped = made.account().dropped
     assert dropped['poses: in a frame whose name cannot be printed'] == 1
     assert dropped['poses: in one of more than 50 frames'] == 9
@@ -514,9 +517,9 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
     made = session()
     for k in range(2000):
         stamp = 1_700_000_000_000_000_000 + k * 5_000_000
-        made.take_joints(joint_state(stamp, UR5E.joint_names[:4], [0.0] * 4))
+        take(made, of_joints(joint_state(stamp, UR5E.joint_names[:4], [0.0] * 4)))
         if k < 500:
-            made.take_joints(joint_state(stamp, UR5E.joint_names[4:], [0.0] * 2))
+            take(made, of_joints(joint_state(stamp, UR5E.joint_names[4:], [0.0] * 2)))
         if k == 600:
             assert 'the arm stands' in made.status()
     assert made.status().startswith(

@@ -6,26 +6,41 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from streams import START, TRACKER, S, joint_state, pose, stops
+from streams import POSE, START, TRACKER, S, joint_state, of_joints, pose, stops, take
 
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.strays import JOINTS, JUMP, POSES, Gate
+from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice, StreamKey
+from calib_ros.sampling.strays import JUMP, Gate
 from calib_ros.settings import Settings
 
 ARM = load_chain('ur5e')
+POSE_KEY = StreamKey('', '', False, False, False)
 
 
 def through(messages, far=1.0):
     """Return what passes of messages (kind, time [s]), in its order, and the gate."""
-    gate, passed = Gate(far), []
-    for message in messages:
-        kind, time = message
-        if gate.passes(kind, round(time * S)):
-            passed.append(message)
-        else:
-            passed += [each.item for each in gate.admit(kind, round(time * S), message)[0]]
-    return passed, gate
+    gate = Gate(far)
+    return [m for found, _ in gate.through(sliced(messages)) for m in back(found, messages)], gate
+
+
+def sliced(messages):
+    """Return messages (kind, time [s]) as a slice; each has its number for what it says."""
+    pieces = []
+    for kind, key in ((JOINTS, (0,)), (POSES, POSE_KEY)):
+        places = np.array([k for k, each in enumerate(messages) if each[0] == kind], dtype=int)
+        times = np.array([round(messages[k][1] * S) for k in places], dtype=np.int64)
+        pieces.append(Piece(key, places, times, places[:, np.newaxis].astype(float)))
+    return Slice.of(pieces)
+
+
+def back(found, messages):
+    """Return the messages of a slice in their order."""
+    if not found.pieces:
+        return []
+    places = np.concatenate([each.places for each in found.pieces])
+    numbers = np.concatenate([each.numbers[:, 0] for each in found.pieces])
+    return [messages[int(k)] for k in numbers[np.argsort(places)]]
 
 
 def both(times):
@@ -51,7 +66,8 @@ def test_a_clock_that_was_moved_is_followed(off, rate):
     before = both(100.0 + np.arange(50) * 0.1)
     after = both(100.0 + off + np.arange(50) / rate)
     passed, gate = through([*before, *after])
-    assert passed + [each.item for each in gate.release()] == before + after
+    given = before + after
+    assert passed + [m for held in gate.release() for m in back(held, given)] == given
     assert not gate.dropped
 
 
@@ -96,24 +112,31 @@ def test_every_message_passes_is_held_back_or_is_counted(messages):
 
 
 @given(
-    st.lists(st.sampled_from([0.01, 0.9, 1.1, -0.9, -1.1, 50.0]), max_size=60),
-    st.lists(st.integers(0, 60), max_size=3),
+    st.lists(
+        st.tuples(
+            st.sampled_from([JOINTS, POSES]),
+            st.sampled_from([0.0, 0.3, 0.9, 1.2, 30.0, 30.5, -70.0]),
+        ),
+        max_size=120,
+    ),
+    st.integers(1, 50),
 )
-def test_what_is_quiet_passes(steps, holding):
-    """Messages that are taken by the batch would pass one by one, and free nothing."""
-    gate = Gate(1.0)
-    for kind in (JOINTS, POSES):
-        gate.passes(kind, 100 * S)
-    for where in holding:
-        gate.admit(POSES, (200 + where) * S, None)
-    held = gate.held(POSES)
-    times = 100 * S + np.cumsum(np.array([round(step * S) for step in steps], dtype=np.int64))
-    quiet = gate.quiet(JOINTS, times)
-    until = len(quiet) if quiet.all() else int(np.argmin(quiet))
-    for time in times[:until].tolist():
-        passed = gate.passes(JOINTS, time) or len(gate.admit(JOINTS, time, None)[0]) == 1
-        assert passed
-    assert gate.held(POSES) == held
+def test_slices_pass_as_single_messages_do(messages, size):
+    """Within a second of the one before of its kind a message passes at once, whatever is held."""
+    one, many = Gate(1.0), Gate(1.0)
+    single = [m for each in messages for m in passing(one, [each])]
+    parts = [messages[k : k + size] for k in range(0, len(messages), size)]
+    assert [m for part in parts for m in passing(many, part)] == single
+    assert (one.dropped, one.held(JOINTS)) == (many.dropped, many.held(JOINTS))
+
+
+def passing(gate, messages):
+    return [
+        (each.kind, int(each.stamps[0]))
+        for found, _ in gate.through(sliced(messages))
+        for k in range(len(found))
+        for each in found.between(k, k + 1).pieces
+    ]
 
 
 # In a session
@@ -136,11 +159,10 @@ def messages(rng, count=12):
 
 def session_of(given, **settings):
     session = CalibrationSession(ARM, Settings(**settings))
-    for message in given:
-        if hasattr(message, 'position'):
-            session.take_joints(message)
-        else:
-            session.take(TRACKER, 'geometry_msgs/msg/PoseStamped', message)
+    come = [
+        of_joints(each) if hasattr(each, 'position') else (TRACKER, POSE, each) for each in given
+    ]
+    take(session, *come)
     session.finish()
     return session
 
@@ -201,10 +223,8 @@ def test_a_recording_that_is_played_again_later_or_earlier_gives_its_samples_twi
 def test_what_is_held_back_is_in_the_account(rng):
     given = messages(rng)[:200]
     session = CalibrationSession(ARM, Settings(lateness=0.5))
-    for message in given:
-        if hasattr(message, 'position'):
-            session.take_joints(message)
-    session.take(TRACKER, 'geometry_msgs/msg/PoseStamped', shifted(given[1], 500))
+    take(session, *(of_joints(message) for message in given if hasattr(message, 'position')))
+    take(session, (TRACKER, POSE, shifted(given[1], 500)))
     account = session.account()
     assert (account.poses, account.waiting) == (1, 1)
     assert account.dropped == {}

@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib_ros.sampling.track import CAUSES, LAGS, MOVED, Rows, Track
+from calib_ros.sampling.interpolation import MOVED
+from calib_ros.sampling.intervals import LAGS
+from calib_ros.sampling.rows import Rows
+from calib_ros.sampling.track import CAUSES, Track
 
 MS = 1_000_000
 MAX_GAP = 0.1
@@ -18,11 +21,15 @@ def track(revolute=(True, True), capacity=1000):
     return Track(revolute, MAX_GAP, capacity)
 
 
+def add(made, columns, stamp_ns, values):
+    made.extend(columns, np.array([stamp_ns]), np.array([values], dtype=float))
+
+
 def filled(samples, columns=BOTH, **options):
     """Return a track of samples (stamp [ms], values)."""
     made = track(**options)
     for ms, values in samples:
-        made.add(columns, round(ms * MS), np.array(values, dtype=float))
+        add(made, columns, round(ms * MS), np.array(values, dtype=float))
     made.sort()
     return made
 
@@ -60,7 +67,7 @@ def test_a_cubic_motion_is_met_exactly(seed, even):
 
     made = track(revolute=(False, True))
     for stamp_ns, row in zip(stamps.tolist(), values(stamps), strict=True):
-        made.add(BOTH, stamp_ns, row)
+        add(made, BOTH, stamp_ns, row)
     made.sort()
     wanted = np.sort(rng.integers(stamps[1], stamps[-2], 200))
     motion = made.at(wanted)
@@ -100,7 +107,7 @@ def test_stamps_of_today_are_interpolated_to_the_nanosecond():
     start = 1_717_171_717_000_000_001  # beyond what a float64 holds exactly
     made = track()
     for k in (0, 10):
-        made.add(BOTH, start + k, np.array([0.1 * k, 0.2 * k]))
+        add(made, BOTH, start + k, np.array([0.1 * k, 0.2 * k]))
     made.sort()
     np.testing.assert_allclose(made.at(np.array([start + 3])).joints, [[0.3, 0.6]], atol=1e-15)
 
@@ -124,7 +131,7 @@ def test_an_exact_hit_needs_no_neighbour_and_knows_no_gap():
 def test_samples_further_apart_than_max_gap_are_not_joined(gap_ns, why):
     made = track()
     for stamp_ns in (200 * MS, 200 * MS + gap_ns):
-        made.add(BOTH, stamp_ns, np.zeros(2))
+        add(made, BOTH, stamp_ns, np.zeros(2))
     assert words(at(made, 201)) == [why]
 
 
@@ -191,7 +198,7 @@ instants = st.lists(ticks | st.integers(1, 800), max_size=20)
 def of_parts(events, capacity=1000):
     made = track(capacity=capacity)
     for columns, ms, values in events:
-        made.add(columns, ms * MS, np.array(values))
+        add(made, columns, ms * MS, np.array(values))
     return made
 
 
@@ -236,7 +243,7 @@ def test_of_equal_stamps_one_sample_is_kept_and_not_by_arrival():
     for order in (1, -1):
         made = track()
         for ms, values in both[::order]:
-            made.add(BOTH, ms * MS, np.array(values))
+            add(made, BOTH, ms * MS, np.array(values))
         assert made.sort() == 1
         assert made.sort() == 0
         np.testing.assert_array_equal(at(made, 100).joints, [(0.1, 0.3)])
@@ -249,9 +256,9 @@ def test_publishers_of_parts_make_one_arm():
     """Each is interpolated on its own, at its own rate and stamps."""
     made = track((True, True, False))
     for ms in range(0, 500, 5):
-        made.add((0, 2), ms * MS, np.array([1e-3 * ms, 1.0 - 1e-3 * ms]))
+        add(made, (0, 2), ms * MS, np.array([1e-3 * ms, 1.0 - 1e-3 * ms]))
     for ms in range(3, 500, 20):
-        made.add((1,), ms * MS, np.array([-2e-3 * ms]))
+        add(made, (1,), ms * MS, np.array([-2e-3 * ms]))
     made.sort()
     motion = at(made, 77, 201)
     np.testing.assert_allclose(
@@ -273,8 +280,8 @@ def test_a_joint_that_nobody_names_is_missing():
 def test_of_two_publishers_of_a_joint_the_one_that_names_more_counts():
     made = track()
     for ms in range(0, 100, 10):
-        made.add((1,), ms * MS, np.array([9.0]))
-        made.add(BOTH, ms * MS, np.array([1.0, 2.0]))
+        add(made, (1,), ms * MS, np.array([9.0]))
+        add(made, BOTH, ms * MS, np.array([1.0, 2.0]))
     made.sort()
     np.testing.assert_allclose(at(made, 55).joints, [[1.0, 2.0]])
 
@@ -282,9 +289,9 @@ def test_of_two_publishers_of_a_joint_the_one_that_names_more_counts():
 def test_a_publisher_that_falls_silent_holds_nothing_up_while_others_name_its_joints():
     """As a driver that publishes the gripper's and one joint of the arm once, at the start."""
     made = track()
-    made.add((1,), 10 * MS, np.array([0.0]))
+    add(made, (1,), 10 * MS, np.array([0.0]))
     for ms in range(10, 1000, 10):
-        made.add(BOTH, ms * MS, np.array([0.0, 0.0]))
+        add(made, BOTH, ms * MS, np.array([0.0, 0.0]))
     made.sort()
     assert made.newest_ns == 990 * MS
     made.release(500 * MS)
@@ -294,9 +301,9 @@ def test_a_publisher_that_falls_silent_holds_nothing_up_while_others_name_its_jo
 def test_a_publisher_that_falls_silent_stops_everything_where_nobody_else_names_its_joints():
     made = track()
     for ms in range(0, 1000, 10):
-        made.add((0,), ms * MS, np.array([0.0]))
+        add(made, (0,), ms * MS, np.array([0.0]))
         if ms <= 300:
-            made.add((1,), ms * MS, np.array([0.0]))
+            add(made, (1,), ms * MS, np.array([0.0]))
     made.sort()
     assert made.newest_ns == 300 * MS
     made.release(500 * MS)
@@ -359,8 +366,8 @@ def test_a_stop_begins_when_the_joints_do_not_move_any_longer():
 def test_all_publishers_must_stand():
     made = track()
     for ms in range(0, 1000, 10):
-        made.add((0,), ms * MS, np.array([max(0.0, 0.3 - 1e-3 * ms)]))
-        made.add((1,), ms * MS, np.array([max(0.0, 1e-3 * ms - 0.7)]))
+        add(made, (0,), ms * MS, np.array([max(0.0, 0.3 - 1e-3 * ms)]))
+        add(made, (1,), ms * MS, np.array([max(0.0, 1e-3 * ms - 0.7)]))
     made.sort()
     ((begin, end),) = made.standing(1e-3, 0.1).tolist()
     assert abs(begin - 300 * MS) <= 20 * MS
@@ -371,7 +378,7 @@ def test_all_publishers_must_stand():
 def test_a_publisher_that_is_heard_now_and_then_does_not_part_a_stop(times):
     made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
     for ms in times:
-        made.add((1,), ms * MS, np.array([0.0]))
+        add(made, (1,), ms * MS, np.array([0.0]))
     made.sort()
     assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
 
@@ -380,7 +387,7 @@ def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
     """As one that repeats what others published, some time later."""
     made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
     for ms in range(200, 800, 10):
-        made.add((1,), ms * MS, np.array([max(0.0, 1e-4 * (ms - 500))]))
+        add(made, (1,), ms * MS, np.array([max(0.0, 1e-4 * (ms - 500))]))
     made.sort()
     (begin, first), (second, end) = (np.array(made.standing(5e-4, 0.1)) // MS).tolist()
     assert (begin, end) == (0, 990)
@@ -390,9 +397,9 @@ def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
 
 def test_a_joint_that_nobody_shows_to_stand_does_not():
     made = filled([(0, (0.0, 0.0)), (500, (0.0, 0.0))])
-    made.add((1,), 250 * MS, np.array([0.0]))
+    add(made, (1,), 250 * MS, np.array([0.0]))
     for ms in range(0, 600, 10):
-        made.add((0,), ms * MS, np.array([0.0]))
+        add(made, (0,), ms * MS, np.array([0.0]))
     made.sort()
     assert made.standing(5e-4, 0.1).tolist() == []
 
@@ -475,7 +482,7 @@ def test_a_full_track_is_halved(capacity):
             gone += made.halve()
         assert made.room(BOTH) or capacity == 1
         if made.room(BOTH):
-            made.add(BOTH, k * MS, np.zeros(2))
+            add(made, BOTH, k * MS, np.zeros(2))
             taken += 1
     made.sort()
     held, _ = made.samples()
@@ -490,7 +497,7 @@ def test_clear_forgets_everything():
     made.release(50 * MS)
     made.clear()
     assert (made.newest_ns, made.horizon_ns, made.missing) == (0, 0, (0, 1))
-    made.add(BOTH, 10 * MS, np.zeros(2))
+    add(made, BOTH, 10 * MS, np.zeros(2))
     np.testing.assert_array_equal(at(made, 10).approach, [[0.0, 0.0]])
 
 
@@ -501,7 +508,7 @@ def test_rows_grow_beyond_their_first_block_and_keep_their_order():
     random.Random(1).shuffle(order)
     for k in order:
         assert not rows.full
-        rows.append(k, [0.5 * k])
+        rows.extend(np.array([k]), np.array([[0.5 * k]]))
     assert rows.full
     assert rows.sort() == 0
     np.testing.assert_array_equal(rows.stamps, np.arange(count))

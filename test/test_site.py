@@ -1,14 +1,19 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of docs/tutorials: what they tell to do is done, in a folder of its own."""
+"""The site: what its tutorials tell to do is done, and nothing is missing."""
 
 import importlib.util
+import re
 import shlex
 from pathlib import Path
 
 import pytest
+import yaml
 
+import calib_ros
 from calib_ros.cli.main import main
+from calib_ros.identification.reasons import Rule
+from calib_ros.report.advice import RULES
 
 ROOT = Path(__file__).parents[1]
 _SPEC = importlib.util.spec_from_file_location('extract', ROOT / 'examples/tutorials/extract.py')
@@ -35,3 +40,20 @@ def test_a_tutorial_does_what_it_says(page, tmp_path, monkeypatch, capsys):
 def test_examples_hold_what_the_tutorials_say(page):
     for path, text in extract.examples(page).items():
         assert path.read_text() == text, f'run python {extract.__file__}'
+
+
+def test_every_refusal_and_every_public_name_has_its_place():
+    messages = (ROOT / 'docs/messages.md').read_text()
+    for rule in Rule:
+        assert f'`Rule.{rule.name}`' in messages
+        assert f'### {RULES[rule].heading}' in messages
+    reference = (ROOT / 'docs/reference.md').read_text()
+    for name in calib_ros.__all__:
+        assert f'.{name}\n' in reference
+
+
+def test_every_page_is_in_the_site():
+    site = yaml.safe_load((ROOT / 'mkdocs.yml').read_text())
+    listed = re.findall(r"'([\w/]+\.md)'", str(site['nav']))
+    pages = (ROOT / 'docs').rglob('*.md')
+    assert sorted(listed) == sorted(str(each.relative_to(ROOT / 'docs')) for each in pages)

@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A plant of simulated robots, night by night: what is found, what it costs, what survives.
+
+    python benchmarks/fleet.py [--quick] [--json] [--part PART] [--robots N]
+
+nights: 200 robots x 30 nights x 60 poses (0.05 mm, 0.2 mrad). Five robots are bumped in some night
+but the first three: one parameter of the arm moves by 0.1 mm or 0.2 mrad. Found: the joint named
+within two nights. A second run has nothing to do. workers: throughput of one and two workers on
+tables of 3,000 poses. scheduler: time for each task that does nothing. kills: ten runs in which a
+worker, then the client is killed with SIGKILL; the history must hold each result once.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from datetime import timedelta
+from pathlib import Path
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+sys.path[:0] = [str(ROOT / 'test')]
+
+import plants
+import psutil
+
+from calib_ros.files.history import History
+from calib_ros.fleet import run as running
+from calib_ros.fleet.page import write_report
+from calib_ros.fleet.plant import read_plant
+from calib_ros.fleet.run import Cluster, run
+from calib_ros.fleet.standing import standings
+from calib_ros.fleet.work import Outcome, Task, sources
+from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.kinematics.chain_file import load_chain
+
+POSES, BEFORE = 60, 3
+
+
+def bumps_of(serials, nights, number, rng):
+    """Return the night and the offset of one parameter of some robots."""
+    chain = load_chain('ur10e')
+    names = structurally_independent(chain, chain.parameter_names)
+    own = [name for name in map(str, names) if name.partition('.')[0] in chain.joint_names]
+    found = {}
+    for serial in rng.choice(serials, number, replace=False).tolist():
+        name = str(rng.choice(own))
+        size = rng.choice((-1, 1)) * (1e-4 if name.endswith(('.a', '.d')) else 2e-4)
+        found[serial] = (int(rng.integers(BEFORE, nights - 1)), {name: float(size)})
+    return found
+
+
+def nights_part(folder, robots, nights, number, workers):
+    """Return what two runs over a plant find and take."""
+    serials = [f'R{k:03}' for k in range(robots)]
+    bumps = bumps_of(serials, nights, number, np.random.default_rng(1))
+    plant = read_plant(plants.write_plant(folder, serials, nights, POSES, bumps))
+    history, out, cluster = History(folder / 'history'), folder / 'report', Cluster('', workers)
+    spans, parts = [], {}
+    for name in ('first', 'second'):
+        begin = time.monotonic()
+        done = run(plant, history, cluster, out)
+        middle = time.monotonic()
+        stood = standings(plant, history, done)
+        later = time.monotonic()
+        write_report(out, stood, done)
+        end = time.monotonic()
+        spans.append(end - begin)
+        parts[name] = {
+            'run_s': middle - begin,
+            'alarms_s': later - middle,
+            'report_s': end - later,
+        }
+        if name == 'first':
+            parts['work_s'] = done.seconds / max(1, done.filed)
+            parts['filed'] = done.filed
+    found, false, said = set(), 0, []
+    for each in stood:
+        serial = each.robot.serial
+        for change in each.watched.changes:
+            night, offsets = bumps.get(serial, (-9, {}))
+            (name,) = offsets or ('',)
+            seen = (change.seen - plants.when(0)) / timedelta(days=1)
+            right = change.joint == name.partition('.')[0] and night <= round(seen) <= night + 1
+            said.append(f'{serial} night {round(seen)}: {change}; true: {night} {offsets}')
+            found |= {serial} if right else set()
+            false += not right
+    files = [path.stat().st_size for path in (folder / 'history').rglob('*.parquet')]
+    pages = [path.stat().st_size for path in out.glob('robots/*/*.html')]
+    return {
+        'found_share': len(found) / number,
+        'false_alarms': false,
+        'second_run_share': spans[1] / spans[0],
+        'first_run_s': spans[0],
+        'second_run_s': spans[1],
+        'row_bytes': float(np.mean(files)),
+        'page_bytes': float(np.mean(pages)),
+        'input_bytes': (folder / 'nights/R000/000.csv').stat().st_size,
+        'alarms': said,
+        **parts,
+    }
+
+
+def workers_part(folder, tables, poses):
+    """Return how many large tables one and two workers do in a second."""
+    plant = read_plant(plants.write_plant(folder, ['R'], tables, poses))
+    tasks = [Task(plant[0], source) for source in sources(plant[0])]
+    speed = {}
+    for workers in (1, 2):
+        with running._client(Cluster('', workers)) as client:
+            list(running._done(client, tasks[:workers]))  # they import what they need
+            begin = time.monotonic()
+            outcomes = [outcome for _, outcome in running._done(client, tasks)]
+            speed[workers] = len(tasks) / (time.monotonic() - begin)
+    task = float(np.median([outcome.seconds for outcome in outcomes]))
+    return {
+        'one_per_s': speed[1],
+        'two_per_s': speed[2],
+        'gain': speed[2] / speed[1],
+        'task_s': task,
+    }
+
+
+def nothing(_):
+    """Do a task that does nothing."""
+    return Outcome()
+
+
+def scheduler_part(folder, count):
+    """Return the time of a task that does nothing, from client to worker and back."""
+    plant = read_plant(plants.write_plant(folder, ['R'], 1))
+    tasks = [Task(plant[0], sources(plant[0])[0])] * count
+    with running._client(Cluster('', 2)) as client:
+        list(running._done(client, tasks[:50], nothing))
+        begin = time.monotonic()
+        list(running._done(client, tasks, nothing))
+        return {'task_ms': 1e3 * (time.monotonic() - begin) / count}
+
+
+def kills_part(folder, times, robots, nights):
+    """Return in how many of some runs with kills the history holds all results, each once."""
+    serials = [f'R{k}' for k in range(robots)]
+    plants.write_plant(folder, serials, nights, 30)
+    whole = 0
+    for number in range(times):
+        history = folder / f'history{number}'
+        command = [sys.executable, '-m', 'calib_ros.cli.main', 'fleet', str(folder / 'plant.yaml')]
+        command += ['--history', str(history), '--workers', '2', '--quiet']
+        killed = with_kills(command, history, robots * nights, number)
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        rows = [row for serial in serials for row in History(history).rows(serial)]
+        once = len({row.key for row in rows}) == len({row.source for row in rows}) == len(rows)
+        whole += killed and once and len(rows) == robots * nights
+    return {'kills': times, 'whole': whole}
+
+
+def with_kills(command, history, total, number):
+    """Run a fleet, kill a worker and then the client; return whether work was left."""
+    first, second = np.sort(np.random.default_rng(number).integers(1, total - 3, 2))
+
+    def filed():
+        return len(list(history.glob('robot=*/*.parquet')))
+
+    client = subprocess.Popen(command, start_new_session=True)
+    until(lambda: filed() >= first or client.poll() is not None)
+    children = psutil.Process(client.pid).children(recursive=True)
+    workers = [each for each in children if 'spawn_main' in ' '.join(each.cmdline())]
+    workers[number % len(workers)].kill()
+    until(lambda: filed() >= second or client.poll() is not None)
+    client.kill()
+    client.wait()
+    return filed() < total
+
+
+def until(predicate):
+    """Wait for what other processes do."""
+    while not predicate():
+        time.sleep(0.02)
+
+
+def main():
+    """Print what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('--quick', action='store_true', help='a few robots')
+    parser.add_argument('--json', action='store_true')
+    parser.add_argument('--part', choices=('nights', 'workers', 'scheduler', 'kills'))
+    parser.add_argument('--robots', type=int, help='for the nights')
+    parser.add_argument('--workers', type=int, default=0, help='for the nights')
+    options = parser.parse_args()
+    quick = options.quick
+    robots, nights, bumped = (10, 8, 2) if quick else (200, 30, 5)
+    parts = {
+        'nights': lambda folder: nights_part(
+            folder, options.robots or robots, nights, bumped, options.workers
+        ),
+        'workers': lambda folder: workers_part(folder, 6 if quick else 20, 3000),
+        'scheduler': lambda folder: scheduler_part(folder, 500 if quick else 3000),
+        'kills': lambda folder: kills_part(folder, 1 if quick else 10, 3, 6),
+    }
+    found = {}
+    for name, part in parts.items():
+        if options.part in (None, name):
+            with tempfile.TemporaryDirectory() as folder:
+                found[name] = part(Path(folder))
+    found = {**found.pop('nights', {}), **found}
+    if options.json:
+        print(json.dumps(found, indent=2))
+        return
+    for name, value in found.items():
+        lines = value if isinstance(value, list) else [json.dumps(value)]
+        print(f'{name:18}', '\n                   '.join(lines))
+
+
+if __name__ == '__main__':
+    main()

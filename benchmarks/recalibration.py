@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""After a collision: what a few poses and the earlier calibration tell, against a full one.
+
+A simulated UR10e is calibrated from 60 random poses (noise 0.05 mm, 0.2 mrad). Then a joint's
+zero slips by 0.5 mrad (`zero`), a link is bent (`bent`: a, alpha, d and beta of a joint, some
+tenths of a millimetre and of a milliradian), or nothing happens (`none`), and 8 poses, the same
+for all arms, chosen before by `plan`, are measured.
+
+- `ratio`: RMS error over the joint range, in the best frames, of the arm brought up to date over
+  that of a full calibration from 60 new poses
+- `named`: share of the arms whose joint is among those named
+- `alone`: share of the arms of which only the right joint is named
+- `claimed`: share of the unchanged arms of which a change is claimed
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from dataclasses import replace
+
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import numpy as np
+
+from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.design import Design
+from calib_ros.apply.planning import plan
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import identify
+from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.recalibration import recalibrate
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.parameter import parameters_of
+
+UR = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+BENT = {'a': 3e-4, 'alpha': 5e-4, 'd': 3e-4, 'beta': 5e-4}
+FEW, MANY = 8, 60
+SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
+
+
+def few_poses():
+    """Return poses (8, n) that tell of changes of an arm that is known but for these."""
+    nominal = replace(UR, tool=faulty(UR, Cell(), np.random.default_rng(1)).tool)
+    rng = np.random.default_rng(0)
+    priors = {'*.a': 1e-3, '*.d': 1e-3, '*.theta': 2e-3, '*.alpha': 2e-3, '*.beta': 2e-3}
+    problem = Problem(
+        nominal, measure(nominal, UR.random_joints(1, rng), rng), priors=priors, **SIGMAS
+    )
+    design = Design.of(problem)
+    candidates = draw_candidates(design, 500, rng, Visibility())
+    task = UR.random_joints(100, rng)
+    return plan(design, candidates, task, FEW, criterion='task').joints
+
+
+def changed(true, kind, rng):
+    """Return the arm after what happened, and the joint that it happened to."""
+    joint = UR.joint_names[rng.integers(6 if kind == 'zero' else 5)]
+    if kind == 'zero':
+        return true.with_offsets({f'{joint}.theta': rng.choice([-5e-4, 5e-4])}), joint
+    if kind == 'bent':
+        offsets = {f'{joint}.{key}': rng.normal(scale=size) for key, size in BENT.items()}
+        return true.with_offsets(offsets), joint
+    return true, None
+
+
+def error(chain, true):
+    """Return the RMS error [mm] of positions over the joint range in the best frames."""
+    joints = UR.random_joints(300, np.random.default_rng(99))
+    wanted = measure(true, joints, np.random.default_rng(0))
+    names = [*parameters_of('base'), *parameters_of('tool')]
+    fit = minimise(chain, names, System((Samples(wanted, 1e-4, 1e-3),))).chain
+    left = fit.forward(joints)[:, :3, 3] - wanted.positions
+    return 1e3 * float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def problem_of(true, joints, rng):
+    """Return what is measured of an arm at joint values (N, n)."""
+    return Problem(UR, measure(true, joints, rng, *NOISE), **SIGMAS)
+
+
+def trial(kind, seed, few):
+    """Return what came of one arm."""
+    rng = np.random.default_rng(seed)
+    true = faulty(UR, Cell(), rng)
+    earlier = Calibration.of(identify(problem_of(true, UR.random_joints(MANY, rng), rng)))
+    now, joint = changed(true, kind, rng)
+    found = recalibrate(earlier, problem_of(now, few, rng), 0.1)
+    owners = {each.owner for reasons in found.changed for each in reasons}
+    row = {'named': joint in owners, 'alone': owners == {joint}, 'claimed': bool(owners)}
+    if kind != 'none':
+        full = identify(problem_of(now, UR.random_joints(MANY, rng), rng))
+        row |= {'few': error(found.calibration.chain, now), 'full': error(full.chain, now)}
+        row |= {'accepted': found.accepted, 'before': error(earlier.chain, now)}
+    return row
+
+
+def main():
+    """Print the figures of all arms."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--quick', action='store_true', help='fewer arms')
+    parser.add_argument('--json', action='store_true', help='print the figures as JSON')
+    options = parser.parse_args()
+    counts = (
+        {'zero': 20, 'bent': 20, 'none': 40}
+        if options.quick
+        else {'zero': 200, 'bent': 200, 'none': 500}
+    )
+    few = few_poses()
+    figures = {}
+    for kind, count in counts.items():
+        rows = [trial(kind, seed, few) for seed in range(count)]
+        mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+        if kind == 'none':
+            figures[kind] = {'arms': count, 'claimed': mean['claimed']}
+            continue
+        rms = {
+            key: float(np.sqrt(np.mean([row[key] ** 2 for row in rows])))
+            for key in ('few', 'full', 'before')
+        }
+        figures[kind] = {
+            'arms': count,
+            'named': mean['named'],
+            'alone': mean['alone'],
+            'accepted': mean['accepted'],
+            'ratio': rms['few'] / rms['full'],
+            **{f'{key}_mm': value for key, value in rms.items()},
+        }
+    if options.json:
+        print(json.dumps(figures))
+        return
+    for kind, row in figures.items():
+        print(kind, ', '.join(f'{key} {value:.3g}' for key, value in row.items()))
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros compare`: what is different between two calibrations of one robot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib_ros.cli.command import Command
+from calib_ros.cli.options import NOT_ACCEPTED
+
+if TYPE_CHECKING:
+    from calib_ros.cli.screen import Screen
+
+
+def _add(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group('what to compare')
+    for name, text in (('first', 'the earlier one'), ('second', 'the later one')):
+        group.add_argument(
+            name,
+            type=Path,
+            metavar=name.upper(),
+            help=f'{text}: calibration.yaml, or the folder of identify --out',
+        )
+    group.add_argument('--json', action='store_true', help='print the difference as JSON')
+
+
+def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.identification.calibration import load_calibration
+    from calib_ros.identification.difference import difference
+
+    pair = [load_calibration(path) for path in (options.first, options.second)]
+    with screen.work('comparing'):
+        found = difference(*pair)
+    if options.json:
+        screen.data(json.dumps(found.document(), indent=2))
+    else:
+        screen.title(found.in_words(), found.same)
+        if not found.same:
+            screen.table(found.rows())
+    return 0 if found.same else NOT_ACCEPTED
+
+
+COMMANDS = (
+    Command(
+        'compare',
+        'Use the calibration',
+        'test what has changed between two calibrations of one robot',
+        _add,
+        _run,
+        ('compare monday/ tuesday/', 'compare before.yaml after.yaml --json'),
+    ),
+)

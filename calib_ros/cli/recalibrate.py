@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros identify --previous`: an earlier calibration brought up to date by a few poses."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from typing import TYPE_CHECKING
+
+from calib_ros.atomic import write_files
+from calib_ros.cli.options import NOT_ACCEPTED, results
+from calib_ros.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from calib_ros.cli.inputs import Loaded
+    from calib_ros.cli.screen import Screen
+    from calib_ros.identification.recalibration import Recalibration
+
+FILES = ('calibration.yaml', 'result.json')
+
+
+def add_previous(parser: argparse.ArgumentParser) -> None:
+    """Add the options of an earlier calibration."""
+    from calib_ros.identification.recalibration import GROWTH
+
+    add = parser.add_argument_group('an earlier calibration (docs/history.md)').add_argument
+    add(
+        '--previous',
+        metavar='CALIBRATION',
+        help='bring this one up to date by a few poses, and say what has changed since',
+    )
+    add(
+        '--growth',
+        type=float,
+        default=1e3 * GROWTH,
+        metavar='MM',
+        help='by which lengths wander in a year; angles by twice as many mrad',
+    )
+    add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
+    add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+
+
+def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], screen: Screen) -> int:
+    """Bring the earlier calibration up to date; return the exit status."""
+    if options.out is None:
+        found = _found(options, loaded(), screen)
+    else:
+        with results(options, FILES) as folder:
+            found = _found(options, loaded(), screen)
+            contents: dict[str, str | bytes] = {'result.json': _document(found)}
+            if found.accepted:
+                contents['calibration.yaml'] = found.calibration.dump()
+            write_files(folder, contents)
+    if options.json:
+        screen.data(_document(found))
+    else:
+        screen.title(found.in_words(), found.accepted)
+    return 0 if found.accepted else NOT_ACCEPTED
+
+
+def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
+    from calib_ros.identification.calibration import load_calibration
+    from calib_ros.identification.recalibration import recalibrate, years_since
+
+    if not options.growth >= 0.0:
+        raise InputError(f'--growth must not be negative, not {options.growth}')
+    previous = load_calibration(options.previous, loaded.problem.chain)
+    for warning in loaded.warnings:
+        screen.warn(warning)
+    new = ('base',) * options.new_base + ('tool',) * options.new_tool
+    with screen.work('looking for what has changed'):
+        return recalibrate(
+            previous, loaded.problem, years_since(previous.record), 1e-3 * options.growth, new
+        )
+
+
+def _document(found: Recalibration) -> str:
+    return json.dumps(found.document(), indent=2) + '\n'

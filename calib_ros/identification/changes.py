@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which few parameters of an arm have changed, told by the information about the change.
+
+What is known of the change x of all parameters is a normal likelihood with the information A and
+the vector b = A x^ (A may be singular: some poses tell only a part). Before the question is put,
+changes that need no explanation, x ~ N(0, K), as by the uncertainty of an earlier calibration, are
+marginalised:
+
+    A' = A - A R M R^T A        b' = b - A R M R^T b        M = (1 + R^T A R)^-1,  K = R R^T
+
+An explanation says that x = G z: one parameter has changed, all parameters of a joint (its link is
+bent), or a frame (the device or the target was moved). Its gain of chi-squared,
+
+    (G^T b')^T (G^T A' G)^-1 (G^T b')
+
+has as many degrees of freedom as z. A change is claimed where chance, over all explanations that
+were tried, reaches the gain in FALSE of the cases at most (Bonferroni). How the explanations
+compare is told by their evidence with z ~ N(0, S), S the size of changes: those of several
+parameters pay for them (Occam's razor; MacKay 1992). Explanations whose share of the evidence is
+above DOUBT cannot be told apart from the best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import linalg, special
+
+from calib_ros.identification.region import KNOWN
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+FALSE = 0.005
+"""Probability of claiming a change of an arm that has not changed."""
+DOUBT = 0.05
+"""Share of the evidence from which on an explanation cannot be ruled out."""
+SIZES = {'m': 1e-3, 'rad': 2e-3}
+"""Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
+way costs half a unit of the evidence's logarithm."""
+WIDE = 10.0
+"""Sizes of a change that leave its estimate to the data."""
+MOST = 3
+"""Changes that are looked for; an arm with more is another one."""
+ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
+"""Kinds in the order in which they are named where two of a joint do the same."""
+GAUGE = 1e-6
+"""Share of the motion by a parameter that others leave if it is a gauge freedom beside them."""
+POSES = 100
+"""Random poses that stand for the joint range."""
+REACH = 0.3
+"""Length [m] of motion that counts as much as one radian."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Explanation(Shown):
+    """What may have changed, by how much, and how well that explains what was seen.
+
+    Attributes
+    ----------
+    owner : str
+        Joint or frame.
+    names : tuple of Parameter
+        Its parameters that have changed, (k,) in all.
+    gain : float
+        Of chi-squared, with k degrees of freedom.
+    chance : float
+        Probability of so large a gain for any explanation, if nothing has changed.
+    share : float
+        Of the evidence of all explanations.
+    change, sigma : (k,)
+        By how much each parameter has changed [m, rad], and the standard deviation of that.
+
+    """
+
+    owner: str
+    names: tuple[Parameter, ...]
+    gain: float
+    chance: float
+    share: float
+    change: FloatArray
+    sigma: FloatArray
+
+    def in_words(self) -> str:
+        """Return what has changed, and by how much where it is one parameter."""
+        if len(self.names) > 1:
+            return f'{self.owner} ({", ".join(name.kind for name in self.names)})'
+        unit = {'m': 'mm', 'rad': 'mrad'}.get(self.names[0].unit, self.names[0].unit)
+        scale = 1e3 if unit in ('mm', 'mrad') else 1.0
+        change, sigma = scale * self.change[0], scale * self.sigma[0]
+        return f'{self.names[0]} by {change:+.3f} ± {sigma:.3f} {unit}'
+
+
+def reason_in_words(reasons: Sequence[Explanation]) -> str:
+    """Return what has changed, with what cannot be told apart from it."""
+    first, *others = reasons
+    text = f'changed: {first.in_words()}'
+    if others:
+        named = ' or '.join(each.in_words() for each in others)
+        text += f', which cannot be told apart from {named}'
+    return text
+
+
+def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
+    """Return explanations as plain values."""
+    return [
+        {
+            'owner': each.owner,
+            'parameters': [str(name) for name in each.names],
+            'change': each.change.tolist(),
+            'sigma': each.sigma.tolist(),
+            'chance': each.chance,
+            'share': each.share,
+        }
+        for each in reasons
+    ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Told(Shown):
+    """Information (P, P) and vector (P,) about the change of parameters `names`."""
+
+    names: tuple[Parameter, ...]
+    information: FloatArray
+    vector: FloatArray
+
+    def beside(self, square: FloatArray) -> Told:
+        """Return what is told beside changes that need no explanation, of covariance (P, P)."""
+        root, inverse = self._given(square)
+        shown = self.information @ root
+        left = self.information - shown @ inverse @ shown.T
+        vector = self.vector - shown @ (inverse @ (root.T @ self.vector))
+        return Told(self.names, 0.5 * (left + left.T), vector)
+
+    def mean(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean (P,) and covariance (P, P) of changes that were N(0, square) before."""
+        root, inverse = self._given(square)
+        return root @ (inverse @ (root.T @ self.vector)), root @ inverse @ root.T
+
+    def _given(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return a root R (P, P) of a covariance K, and (1 + R^T A R)^-1."""
+        scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
+        sizes, directions = linalg.eigh(square / np.outer(scale, scale))
+        root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
+        inner = np.eye(len(scale)) + root.T @ self.information @ root
+        factor = linalg.cholesky(inner, lower=True)
+        inverse = linalg.solve_triangular(factor, np.eye(len(scale)), lower=True)
+        return root, inverse.T @ inverse
+
+    def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Return the gain by changes along columns (P, k), these, and their covariance."""
+        inner = columns.T @ self.information @ columns
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
+        covariance = scale[:, np.newaxis] * linalg.pinvh(inner * np.outer(scale, scale), rtol=1e-9)
+        covariance = covariance * scale
+        seen = columns.T @ self.vector
+        values = covariance @ seen
+        return float(seen @ values), values, covariance
+
+    def evidence(self, columns: FloatArray, sizes: FloatArray) -> float:
+        """Return the logarithm of the evidence of changes along columns (P, k), of sizes (k,)."""
+        scaled = columns * sizes
+        inner = np.eye(len(sizes)) + scaled.T @ self.information @ scaled
+        seen = scaled.T @ self.vector
+        factor = linalg.cho_factor(inner)
+        volume = 2.0 * float(np.log(np.diag(factor[0])).sum())
+        return 0.5 * (float(seen @ linalg.cho_solve(factor, seen)) - volume)
+
+
+def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple[Explanation, ...]:
+    """Return what may explain a change, the best first.
+
+    `freedom` are the degrees of freedom from which the size of the noise was estimated.
+    """
+    sets = columns.sets
+    if not sets:
+        return ()
+    logs = []
+    for _, names in sets:
+        sizes = np.array([SIZES.get(name.unit, 1.0) for name in names])
+        logs.append(told.evidence(columns.of(names), sizes))
+    shares = np.exp(logs - special.logsumexp(logs))
+    found = []
+    for (owner, names), share in zip(sets, shares.tolist(), strict=True):
+        matrix = columns.of(names)
+        gain, values, covariance = told.explained(matrix)
+        inner = matrix.T @ told.information @ matrix
+        rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
+        single = special.fdtrc(rank, min(freedom, KNOWN), max(gain, 0.0) / rank)
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        chance = min(1.0, len(sets) * float(single))
+        found.append(Explanation(owner, names, gain, chance, share, values, sigma))
+    return tuple(sorted(found, key=lambda each: -each.share))
+
+
+def reasons_of(told: Told, columns: Columns, freedom: float) -> tuple[Explanation, ...]:
+    """Return the best explanation of a change and those that cannot be told apart from it.
+
+    None where chance explains it as well.
+    """
+    found = explanations(told, columns, freedom)
+    if not found or min(each.chance for each in found) > FALSE:
+        return ()
+    return tuple(each for each in found if each.share > DOUBT) or found[:1]
+
+
+class Columns:
+    """How changes of an arm's parameters show in those that information is about.
+
+    Parameters
+    ----------
+    chain : Chain
+    names : sequence of str
+        P parameters that information is about. Changes of others, which are gauge freedoms beside
+        these, show in them; those that are none do not show at all.
+    frames : sequence of str
+        Frames that may have moved; others are free, and take up whatever they can.
+
+    """
+
+    def __init__(
+        self, chain: Chain, names: Sequence[Parameter], frames: Sequence[str] = ()
+    ) -> None:
+        arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
+        mapped, left = gauged(chain, names, arm, free=not frames)
+        seen = (left < GAUGE) & (np.abs(mapped).max(axis=0, initial=0.0) > GAUGE)
+        self._columns = {n: c for n, c, yes in zip(arm, mapped.T, seen, strict=True) if yes}
+        self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
+        sets: list[tuple[str, tuple[Parameter, ...]]] = []
+        for joint in chain.joint_names:
+            own: list[Parameter] = []
+            for name in parameters_of(joint, ORDER):
+                column = self._columns.get(name)
+                if column is not None and not any(_alike(column, self._columns[n]) for n in own):
+                    own.append(name)
+            sets += [(joint, (name,)) for name in own]
+            sets += [(joint, tuple(own))] if len(own) > 1 else []
+        for frame in frames:
+            own = [name for name in parameters_of(frame) if name in self._columns]
+            sets += [(frame, tuple(own))] if own else []
+        self.sets = tuple(sets)
+
+    def of(self, names: Sequence[Parameter]) -> FloatArray:
+        """Return the columns (P, k) of k parameters."""
+        return np.array([self._columns[name] for name in names]).T
+
+    def spread(self, reasons: Sequence[Explanation]) -> FloatArray:
+        """Return the covariance (P, P) of changes whose sizes are left to the data."""
+        parts = []
+        for reason in reasons:
+            sizes = [WIDE * SIZES.get(name.unit, 1.0) for name in reason.names]
+            parts.append(self.of(reason.names) * np.array(sizes))
+        square = np.hstack(parts)
+        return np.asarray(square @ square.T)
+
+
+def _alike(first: FloatArray, second: FloatArray) -> bool:
+    """Tell whether two parameters do the same."""
+    size = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return bool(abs(first @ second) > (1.0 - GAUGE) * size)
+
+
+def gauged(
+    chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter], free: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return how changes of other parameters show in those named, with `free` frames.
+
+    The first (P, K) are the changes of P parameters that move the arm as a unit of each of the K
+    others does, at poses all over the joint range; the second (K,) the share of it that is left.
+    """
+    rng = np.random.default_rng(0)
+    q = chain.random_joints(POSES, rng)
+    frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
+    columns = list(dict.fromkeys([*frames, *names, *others]))
+    rows = ErrorModel(chain, columns).jacobian(q, rng.choice([-1.0, 1.0], q.shape))
+    rows[:, 3:] *= REACH
+    flat = rows.reshape(-1, len(columns))
+    index = {name: k for k, name in enumerate(columns)}
+    fitted = list(dict.fromkeys([*frames, *names]))
+    known = flat[:, [index[name] for name in fitted]]
+    scale = np.maximum(np.linalg.norm(known, axis=0), 1e-300)
+    wanted = flat[:, [index[name] for name in others]]
+    taken = linalg.lstsq(known / scale, wanted, cond=1e-9)[0]
+    size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
+    left = np.linalg.norm(wanted - known / scale @ taken, axis=0) / size
+    taken /= scale[:, np.newaxis]
+    return taken[[fitted.index(name) for name in names]], left

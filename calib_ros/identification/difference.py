@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is different between two calibrations of one robot, by both covariances.
+
+Frames are free: the device may stand elsewhere, the target may be another. The second arm is
+brought into the parameters of the first by a fit to its poses all over the joint range, so that
+parameters that trade against each other are taken out. The difference d of the parameters is
+tested with C = C_1 + C_2, d^T C^-1 d; the few that may have changed are looked for (`changes.py`).
+The difference of predicted positions, in the best frames, is a quadratic form of d; the limit is
+the quantile of its values for d ~ N(d, C).
+
+What neither model has shows in both calibrations, and differently where other poses were measured.
+The covariances of noise know nothing of it; the expected squares of errors do (`region.py`). A
+difference that is significant by the former only, is told as what it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import linalg, special
+
+from calib_ros.errors import InputError
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import (
+    FALSE,
+    GAUGE,
+    MOST,
+    REACH,
+    Columns,
+    Explanation,
+    Told,
+    gauged,
+    reason_in_words,
+    reasons_document,
+    reasons_of,
+)
+from calib_ros.identification.evidence import TYPICAL, group_of
+from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.identification.leastsquares import System, minimise
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.region import KNOWN
+from calib_ros.identification.samples import Samples
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+POSES = 200
+"""Random poses at which two arms are held against each other."""
+ROWS = 6
+"""Parameters that are shown."""
+DRAWS = 2000
+"""Draws of a difference for the limit of predictions."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Difference(Shown):
+    """The second of two calibrations less the first.
+
+    Attributes
+    ----------
+    names : tuple of Parameter
+        P parameters of the arm.
+    change, sigma : (P,)
+        Their differences [m, rad], and the standard deviations of these.
+    chance : float
+        Probability of so large a difference by the noise of both.
+    beyond : float
+        The same with what the models lack as well.
+    rms, limit : float
+        RMS difference [m] of predicted positions over the joint range in the best frames, and its
+        upper limit (95 %).
+    left : float
+        What of it [m] no parameters of the first model can follow.
+    changed : tuple of tuple of Explanation
+        What has changed, each with what cannot be told apart from it.
+    unexplained : float
+        Probability of what these leave.
+
+    """
+
+    names: tuple[Parameter, ...]
+    change: FloatArray
+    sigma: FloatArray
+    chance: float
+    beyond: float
+    rms: float
+    limit: float
+    left: float
+    changed: tuple[tuple[Explanation, ...], ...]
+    unexplained: float
+
+    @property
+    def same(self) -> bool:
+        """Tell whether nothing has changed as far as is known."""
+        return self.chance > FALSE and not self.changed
+
+    def in_words(self) -> str:
+        """Return what is different."""
+        size = (
+            f'{1e3 * self.rms:.3f} mm RMS over the joint range (below {1e3 * self.limit:.3f} mm)'
+        )
+        if self.same:
+            return f'unchanged within {1e3 * self.limit:.3f} mm'
+        if self.beyond > FALSE:
+            return (
+                f'different by {size}, which noise does not explain, but what the models lack '
+                'does: were other poses measured? Measure the same ones to tell'
+            )
+        if self.changed and self.unexplained > FALSE:
+            reasons = '; '.join(reason_in_words(each) for each in self.changed)
+            return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
+        return f'many parameters are different, by {size}: identify anew, and look at the robot'
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values; lengths of predictions in mm."""
+        changes = zip(self.names, self.change.tolist(), self.sigma.tolist(), strict=True)
+        return {
+            'same': self.same,
+            'words': self.in_words(),
+            'rms_mm': 1e3 * self.rms,
+            'limit_mm': 1e3 * self.limit,
+            'left_mm': 1e3 * self.left,
+            'chance': self.chance,
+            'chance_beyond_models': self.beyond,
+            'changed': [reasons_document(each) for each in self.changed],
+            'unexplained': self.unexplained,
+            'parameters': {str(n): {'change': x, 'sigma': s} for n, x, s in changes},
+        }
+
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """Return the parameters that differ by the most sigmas, in words."""
+        order = np.argsort(-np.abs(self.change) / self.sigma)[:ROWS]
+        return tuple(
+            (
+                self.names[k],
+                f'{1e3 * self.change[k]:+.3f} ± {1e3 * self.sigma[k]:.3f} m{self.names[k].unit}',
+            )
+            for k in order
+        )
+
+
+def difference(first: Calibration, second: Calibration) -> Difference:
+    """Return what is different in the second of two calibrations of one robot.
+
+    Raises
+    ------
+    InputError
+        When they are of other joints, or hold no covariance.
+
+    """
+    arms = first.chain, second.chain
+    if arms[0].joint_names != arms[1].joint_names or arms[0].convention != arms[1].convention:
+        raise InputError(
+            f'the joints {", ".join(arms[0].joint_names)} ({arms[0].convention}) and '
+            f'{", ".join(arms[1].joint_names)} ({arms[1].convention}) are of other robots'
+        )
+    for number, each in enumerate((first, second)):
+        if each.covariance is None:
+            raise InputError(
+                f'calibration {number + 1} does not hold the covariance of its parameters: '
+                'identify it again with this version'
+            )
+    names, chain, change, left = _in_parameters_of(first, second)
+    square, lacking = np.zeros((2, len(names), len(names)))
+    for each in (first, second):
+        assert each.covariance is not None
+        own = _in_names(each.chain, names, each.names, each.covariance)
+        square += own
+        region = each.region
+        if region is None:
+            lacking += own
+        else:
+            lacking += _in_names(region.chain, names, region.names, region.square)
+    freedom = min(first.freedom, second.freedom)
+    columns = Columns(chain, names)
+    told = _told(names, change, lacking)
+    beyond = _chance(told, freedom)
+    told = _told(names, change, square)
+    chance = _chance(told, freedom)
+    changed: list[tuple[Explanation, ...]] = []
+    while len(changed) < MOST and (reasons := reasons_of(told, columns, freedom)):
+        changed.append(reasons)
+        told = told.beside(columns.spread(reasons))
+    predicted = _predicted(chain, names)
+    draws = np.random.default_rng(0).multivariate_normal(change, square, DRAWS, method='eigh')
+    squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)
+    return Difference(
+        names,
+        change,
+        np.sqrt(np.diag(square)),
+        chance,
+        beyond,
+        float(np.sqrt(change @ predicted @ change)),
+        float(np.sqrt(np.quantile(squares, 0.95))),
+        left,
+        tuple(changed),
+        _chance(told, freedom, sum(len(each[0].names) for each in changed)),
+    )
+
+
+def _in_parameters_of(
+    first: Calibration, second: Calibration
+) -> tuple[tuple[Parameter, ...], Chain, FloatArray, float]:
+    """Return the parameters of the arm, the first arm with all of them, by how much the second
+    differs in them, and the RMS distance [m] that is left.
+    """
+    effects = [name for each in (first, second) for name, _ in each.chain.effects]
+    chain = first.chain.with_effects(effects)
+    other = second.chain
+    frames = [name for end in ('base', 'tool') for name in parameters_of(end)]
+    every = [*first.names, *second.names, *effects]
+    arm = [Parameter(n) for n in dict.fromkeys(every) if not chain.owns_frame(n)]
+    independent = structurally_independent(chain, [*frames, *arm])
+    names = tuple(Parameter(name) for name in independent if name in arm)
+    joints = chain.random_joints(POSES, np.random.default_rng(0))
+    poses = other.forward(joints)
+    seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
+    start = replace(chain, base=other.base, tool=other.tool)
+    fit = minimise(start, [*frames, *names], System((Samples(seen, 1e-4, 1e-4 / REACH),)))
+    left = fit.chain.forward(joints)[:, :3, 3] - poses[:, :3, 3]
+    change = np.array([fit.chain.offset(name, chain) for name in names])
+    return names, chain, change, float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def _in_names(
+    chain: Chain, names: Sequence[Parameter], own: Sequence[str], square: FloatArray
+) -> FloatArray:
+    """Return a covariance of the names; those that were not fitted vary as those of arms do."""
+    chain = chain.with_effects([n for n in names if not (n.of_dh or chain.owns_frame(n))])
+    mine = [Parameter(name) for name in own]
+    change = np.array([[float(name == other) for other in mine] for name in names])
+    others = [k for k, name in enumerate(mine) if name.of_dh and name not in names]
+    if others:
+        change[:, others] = gauged(chain, names, [mine[k] for k in others], free=True)[0]
+    whole = change @ square @ change.T
+    unknown = np.abs(change).max(axis=1) < GAUGE
+    sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]
+    return np.asarray(whole + np.diag(unknown * np.square(sizes)))
+
+
+def _told(names: tuple[Parameter, ...], change: FloatArray, square: FloatArray) -> Told:
+    scale = np.sqrt(np.diag(square))
+    inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=1e-12) / np.outer(scale, scale)
+    return Told(names, inverse, inverse @ change)
+
+
+def _chance(told: Told, freedom: float, explained: int = 0) -> float:
+    """Return the probability of so large a change of all parameters but some by noise."""
+    rank = max(1, len(told.names) - explained)
+    squares = max(0.0, told.explained(np.eye(len(told.names)))[0])
+    return float(special.fdtrc(rank, min(freedom, KNOWN), squares / rank))
+
+
+def _predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
+    """Return V (P, P) [m^2]: d^T V d is the mean squared difference of positions by d."""
+    joints = chain.random_joints(POSES, np.random.default_rng(0))
+    frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
+    rows = ErrorModel(chain, [*frames, *names]).jacobian(joints)[:, :3]
+    flat = rows.reshape(-1, rows.shape[2])
+    basis = linalg.orth(flat[:, : len(frames)])
+    left = flat[:, len(frames) :] - basis @ (basis.T @ flat[:, len(frames) :])
+    return np.asarray(left.T @ left) / len(joints)

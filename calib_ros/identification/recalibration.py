@@ -1,0 +1,355 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A few poses bring an earlier calibration up to date: what has changed since, and by how much.
+
+The earlier parameters x are known to C, and each of the arm's has wandered since by a growth g
+per root of a year (a random walk). The residuals r of the new poses at the earlier arm tell of
+the change dx by A = J^T W J and b = J^T W r; dx ~ N(0, C + g^2 t). What is larger than that must
+have a reason: few parameters have changed by a collision, say (`changes.py`). Their sizes are then
+free, and the estimate is the mean of dx given A and b, relinearised until it stands still. Where
+two reasons cannot be told apart, both are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+import calib_ros
+from calib_ros.errors import InputError
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import (
+    FALSE,
+    MOST,
+    SIZES,
+    Columns,
+    Explanation,
+    Told,
+    reason_in_words,
+    reasons_document,
+    reasons_of,
+)
+from calib_ros.identification.leastsquares import System, minimise, normal_equations
+from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.pixels import samples_of
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.records import nominal_document
+from calib_ros.identification.region import KNOWN
+from calib_ros.identification.validation import ErrorFigures, Residuals, compare
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import frames_document, table_hash
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+GROWTH = 2e-5
+"""Growth of a length [m] per root of a year, if nothing else is said."""
+PER_METRE = SIZES['rad'] / SIZES['m']
+"""Angles [rad] grow by so much more than lengths [m]."""
+WORSE = 1.5
+"""Errors of new poses up to this many times those of the earlier calibration do not contradict."""
+FREE = 10.0
+"""Size [m, rad] that is as good as any."""
+MOST_FOLDS = 20
+"""Parts into which the new poses are dealt to judge each by the others."""
+ROUNDS = 4
+"""Linearisations; of changes by millimetres the second moves nothing any more."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recalibration(Shown):
+    """An earlier calibration after some new poses.
+
+    Attributes
+    ----------
+    calibration : Calibration
+        Brought up to date.
+    changed : tuple of tuple of Explanation
+        What has changed, one after the other: the best explanation of each change, and those that
+        cannot be told apart from it.
+    unexplained : float
+        Probability of residuals as large as those that are left.
+    before, after : ErrorFigures
+        Errors of the new poses by the earlier calibration, and by what the other poses tell.
+
+    """
+
+    calibration: Calibration
+    changed: tuple[tuple[Explanation, ...], ...]
+    unexplained: float
+    before: ErrorFigures
+    after: ErrorFigures
+
+    @property
+    def accepted(self) -> bool:
+        """Tell whether the result may be used."""
+        return self.unexplained > FALSE and self.after.rms_mm <= max(
+            self.before.rms_mm, WORSE * 1e3 * (self.calibration.residual or 0.0)
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            'accepted': self.accepted,
+            'changed': [reasons_document(each) for each in self.changed],
+            'unexplained': self.unexplained,
+            'before': asdict(self.before),
+            'after': asdict(self.after),
+        }
+
+    def in_words(self) -> str:
+        """Return what has changed."""
+        text = (
+            f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
+            'new poses (each left out in turn)'
+        )
+        if self.unexplained <= FALSE:
+            return (
+                f'NOT accepted: no few parameters explain what has changed; identify anew. {text}'
+            )
+        if not self.accepted:
+            return f'NOT accepted: the new poses contradict each other; measure more. {text}'
+        if not self.changed:
+            return f'accepted: unchanged within what is known, brought up to date; {text}'
+        return f'accepted: {"; ".join(reason_in_words(each) for each in self.changed)}; {text}'
+
+
+def years_since(record: Mapping[str, Any]) -> float:
+    """Return the age [years] of a calibration by its record; a year where that does not tell."""
+    try:
+        age = datetime.now(timezone.utc) - datetime.fromisoformat(str(record.get('created')))
+    except (ValueError, TypeError):
+        return 1.0
+    return max(0.0, age.days / 365.25)
+
+
+def recalibrate(
+    previous: Calibration,
+    problem: Problem,
+    years: float,
+    growth: float = GROWTH,
+    new: Sequence[str] = (),
+) -> Recalibration:
+    """Bring a calibration up to date by the poses of a problem.
+
+    Parameters
+    ----------
+    previous : Calibration
+        With its covariance.
+    problem : Problem
+        The new poses, between frames that the calibration knows, and their noise.
+    years : float
+        Since then.
+    growth : float
+        Standard deviation [m] by which lengths wander in a year; angles by twice that [rad].
+    new : sequence of str
+        Frames of devices that stand elsewhere, and of targets mounted anew.
+
+    Raises
+    ------
+    InputError
+        When the calibration holds no covariance, or does not know a frame.
+
+    """
+    sets = (*problem.sets, *problem.judging)
+    if previous.covariance is None:
+        raise InputError(
+            'the earlier calibration does not hold the covariance of its parameters: identify it '
+            'again with this version, from the poses of then'
+        )
+    known = previous.chain.frame_names
+    for each in sets:
+        if not {each.base, each.tool} <= set(known):
+            raise InputError(
+                f'the earlier calibration knows the frames {", ".join(known)}, not {each.base} '
+                f'and {each.tool}'
+            )
+    arm = _Arm.of(previous, years, growth)
+    system = _system(problem, sets, previous)
+    names = [name for frame in new for name in parameters_of(frame) if name in arm.names]
+    if names:
+        free = [k for k, name in enumerate(arm.names) if name in names]
+        square = arm.square.copy()
+        square[free], square[:, free] = 0.0, 0.0
+        square[free, free] = FREE**2
+        arm = replace(arm, chain=minimise(arm.chain, names, system).chain, square=square)
+    ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
+    movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
+    columns = Columns(arm.chain, arm.names, movable)
+    changed: list[tuple[Explanation, ...]] = []
+    found = arm.solved(system)
+    while len(changed) < MOST:
+        reasons = reasons_of(found.told.beside(arm.square), columns, previous.freedom)
+        if not reasons:
+            break
+        changed.append(reasons)
+        arm = replace(arm, square=arm.square + columns.spread(reasons))
+        found = arm.solved(system)
+    before, after = _judged(previous, arm, found, problem, sets)
+    return Recalibration(
+        _updated(previous, arm, found, problem, tuple(changed)),
+        tuple(changed),
+        found.unexplained(arm.square, system.rows, previous.freedom),
+        before,
+        after,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The solution at new poses: the change (P,), its covariance, and what was told about it."""
+
+    change: FloatArray
+    covariance: FloatArray
+    told: Told
+    squares: float
+
+    def unexplained(self, square: FloatArray, rows: int, freedom: float) -> float:
+        """Return the probability of squares as large as those that are left."""
+        left = self.squares - float(self.told.vector @ self.told.mean(square)[0])
+        return float(special.fdtrc(rows, min(freedom, KNOWN), max(left, 0.0) / rows))
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """The earlier arm, parameters that are known to a covariance (P, P), effects considered."""
+
+    chain: Chain
+    names: tuple[Parameter, ...]
+    square: FloatArray
+
+    @classmethod
+    def of(cls, previous: Calibration, years: float, growth: float) -> _Arm:
+        region, covariance = previous.region, previous.covariance
+        chain, names = previous.chain, previous.names
+        if region is not None:
+            chain, names, covariance = region.chain, region.names, region.square
+        named = tuple(map(Parameter, names))
+        assert covariance is not None
+        return cls(chain, named, covariance + _wandered(named, years, growth))
+
+    def solved(self, system: System) -> _Found:
+        """Return the mean change given the new poses, relinearised until it stands still."""
+        change = np.zeros(len(self.names))
+        for _ in range(ROUNDS):
+            chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
+            normal = normal_equations(chain, self.names, system)
+            told = Told(self.names, normal.matrix, normal.gradient + normal.matrix @ change)
+            squares = normal.cost + float(change @ (normal.gradient + told.vector))
+            change, covariance = told.mean(self.square)
+        return _Found(change, covariance, told, squares)
+
+
+def _wandered(names: Sequence[Parameter], years: float, growth: float) -> FloatArray:
+    """Return the covariance (P, P) that the arm's geometry has gained by time."""
+    sizes = [(growth if name.is_length else PER_METRE * growth) * name.of_dh for name in names]
+    return np.diag(np.square(sizes)) * max(years, 0.0)
+
+
+def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
+    """Return the new poses with the noise that was found with the earlier ones."""
+    noise, sigmas = previous.noise, (problem.sigma_position, problem.sigma_orientation)
+    if noise is not None and not noise.consistent:
+        scales = (noise.position, noise.orientation or noise.position)
+        sigmas = (sigmas[0] * scales[0], sigmas[1] * scales[1])
+    return System(tuple(samples_of(each, sigmas, problem.sigma_pixel) for each in sets))
+
+
+def _judged(
+    previous: Calibration,
+    arm: _Arm,
+    found: _Found,
+    problem: Problem,
+    sets: Sequence[Observations],
+) -> tuple[ErrorFigures, ErrorFigures]:
+    """Return the errors of the new poses before, and by what the others tell."""
+    groups = numbered(sets)
+    folds = min(MOST_FOLDS, len(np.unique(np.concatenate(groups))))
+    offsets = dict(zip(arm.names, found.change, strict=True))
+    chain = arm.chain.with_offsets(offsets)
+    parts = []
+    for fold in range(folds):
+        out = [
+            each.select(np.flatnonzero(g % folds == fold))
+            for each, g in zip(sets, groups, strict=True)
+        ]
+        out = [each for each in out if len(each)]
+        normal = normal_equations(chain, arm.names, _system(problem, out, previous))
+        rest = Told(
+            arm.names,
+            found.told.information - normal.matrix,
+            found.told.vector - normal.gradient - normal.matrix @ found.change,
+        )
+        change = dict(zip(arm.names, rest.mean(arm.square)[0], strict=True))
+        parts.append(compare(previous.chain, _applied(previous, arm.chain, change), out))
+    whole = [
+        Residuals(
+            *(np.concatenate([getattr(r, each.name) for r in side]) for each in fields(Residuals))
+        )
+        for side in zip(*((part.before, part.after) for part in parts), strict=True)
+    ]
+    every = np.ones(len(whole[0].position), dtype=bool)
+    return whole[0].figures(every), whole[1].figures(every)
+
+
+def _applied(previous: Calibration, start: Chain, change: Mapping[str, float]) -> Chain:
+    """Return a chain with changes of what was fitted; effects that were considered stay zero."""
+    own = {name: x for name, x in change.items() if name in previous.names}
+    return replace(start, effects=previous.chain.effects).with_offsets(own)
+
+
+def _updated(
+    previous: Calibration,
+    arm: _Arm,
+    found: _Found,
+    problem: Problem,
+    changed: Sequence[Sequence[Explanation]],
+) -> Calibration:
+    """Return the calibration with the changes in it."""
+    change = dict(zip(arm.names, found.change, strict=True))
+    chain = _applied(previous, arm.chain, change)
+    before = previous.before
+    for name in before.frame_names:
+        old, new = previous.chain.frame(name), chain.frame(name)
+        here = before.frame(name)
+        motion = new.matrix @ se3.invert(old.matrix)
+        if name.startswith('tool'):
+            moved = here.matrix @ se3.invert(old.matrix) @ new.matrix
+        else:
+            moved = motion @ here.matrix
+        before = before.with_frame(name, replace(here, matrix=moved))
+    own = [arm.names.index(Parameter(name)) for name in previous.names if name in arm.names]
+    names = tuple(arm.names[k] for k in own)
+    region = previous.region
+    if region is not None:
+        left = np.array([0.0 if name in names else x for name, x in change.items()])
+        square = found.covariance + np.outer(left, left)
+        effects = [name for name, _ in region.chain.effects]
+        region = replace(region, chain=chain.with_effects(effects), square=square)
+    count = sum(map(len, (*problem.sets, *problem.judging)))
+    record = {
+        **previous.record,
+        'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
+        'software': f'calib_ros {calib_ros.__version__}',
+        'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
+        'new_samples': count,
+        'changed': [reason_in_words(each) for each in changed],
+        'table_sha256': table_hash(chain),
+        'nominal': nominal_document(before) | frames_document(before),
+        'region': None if region is None else region.document(),
+    }
+    return replace(
+        previous,
+        chain=chain,
+        before=before,
+        names=names,
+        covariance=found.covariance[np.ix_(own, own)],
+        region=region,
+        record=record,
+    )

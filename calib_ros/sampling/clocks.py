@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the clocks of joint states and measurements agree, as far as the motion shows."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.sampling.collector import Collector
+from calib_ros.sampling.delay import Delay, find_delay
+from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
+from calib_ros.sampling.making import POSITION, QUAT
+from calib_ros.sampling.rows import Rows
+from calib_ros.sampling.slices import Piece, Slice, StreamKey, merged
+from calib_ros.settings import Settings
+
+WATCH_NS = 15_000_000_000
+"""Time over which a watch looks."""
+WATCHED = 20_000
+"""Samples that it keeps at most."""
+DENSE_NS = 4_000_000
+"""Time between two samples that it keeps; nearer ones tell no more."""
+CLOCKS_MOVED = 0.05
+"""Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
+MOST_MOVES = 5
+"""Moves of the clocks that are remembered."""
+LOOK_AGAIN_NS = 2_000_000_000
+"""Time between two looks for the delay."""
+EARLY = 0.03
+"""Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
+delay. Of what then shows the arm leaving, most is left out as spikes; the rest moves the mean by
+less than the noise of a measurement."""
+
+
+class Watch:
+    """Joint values and poses while the arm moves, to see whether the clocks agree.
+
+    Once that is seen it sleeps until measurements at stops show unrest: where a clock was moved
+    they do, and are left out or refused.
+
+    Parameters
+    ----------
+    chain : Chain
+    sleepless : bool
+        Watch all the time, as there are no stops.
+
+    """
+
+    def __init__(self, chain: Chain, sleepless: bool) -> None:
+        self._chain = chain
+        self._sleepless = sleepless
+        self._joints = Rows(len(chain.joints), WATCHED)
+        self._poses = Rows(7, WATCHED)
+        self._last_ns = [0, 0]
+        self._unrest = 0
+        self._taken = self._agreed = 0
+        self.awake = True
+        self.delay: Delay | None = None
+        """The last one seen."""
+        self.unclear: Delay | None = None
+        """One with rivals, while no other was seen."""
+        self.moves: deque[tuple[float, int]] = deque(maxlen=MOST_MOVES)
+        """By how much [s] it changed, and after how many samples at least."""
+
+    def wake(self, unrest: int, taken: int) -> None:
+        """Watch again if more measurements at stops were not at rest, with so many samples."""
+        if unrest > self._unrest and not self.awake:
+            self.awake, self._agreed = True, self._taken
+        self._unrest, self._taken = unrest, taken
+
+    def take(self, joints: Sequence[Piece], poses: Sequence[Piece]) -> None:
+        """Take values of all joints, and measured positions, each with the rotation if known."""
+        if not self.awake:
+            return
+        for k, rows, pieces in ((0, self._joints, joints), (1, self._poses, poses)):
+            room = rows.capacity - rows.count
+            if not pieces or not room:
+                continue
+            stamps, numbers = merged(pieces, rows.width)
+            chosen: list[int] = []
+            last = self._last_ns[k]
+            for i, stamp_ns in enumerate(stamps.tolist()):
+                if abs(stamp_ns - last) >= DENSE_NS:
+                    last = stamp_ns
+                    chosen.append(i)
+            self._last_ns[k] = last
+            rows.extend(stamps[chosen[:room]], numbers[chosen[:room]])
+
+    def look(self, now_ns: int) -> None:
+        """Look what the motion shows if it is time to, and begin anew."""
+        begun = self._joints.stamps[:1]
+        if self.awake and len(begun) and abs(now_ns - int(begun[0])) > WATCH_NS:
+            self._look()
+
+    def _look(self) -> None:
+        self._joints.sort()
+        self._poses.sort()
+        values = self._poses.values
+        oriented = len(values) > 0 and not np.isnan(values).any()
+        found = find_delay(
+            self._chain,
+            self._joints.stamps,
+            self._joints.values,
+            self._poses.stamps,
+            values[:, :3],
+            se3.from_quat(values[:, 3:]) if oriented else None,
+        )
+        for rows in (self._joints, self._poses):
+            rows.keep(np.zeros(rows.count, dtype=bool))
+        if found is None:
+            return
+        known = self.delay
+        every = (found.seconds, *found.rivals)
+        if known is None or min(abs(each - known.seconds) for each in every) > CLOCKS_MOVED:
+            if found.rivals:
+                self.unclear = found if known is None else None
+                return
+            if known is not None:
+                self.moves.append((found.seconds - known.seconds, self._agreed))
+            self.delay, self.unclear = found, None
+        self._agreed = self._taken
+        self.awake = self._sleepless
+
+
+class Clocks:
+    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops.
+
+    Parameters
+    ----------
+    chain : Chain
+    settings : Settings
+
+    """
+
+    def __init__(self, chain: Chain, settings: Settings) -> None:
+        self.settings = settings
+        self._chain = chain
+        self._continuous = settings.mode == 'continuous'
+        self._watch = Watch(chain, sleepless=self._continuous)
+        self._found: Delay | None = None  # in the motion that is sampled
+        self._looked_ns = 0
+
+    @property
+    def delay(self) -> Delay | None:
+        """Return how late the measurements are stamped, as far as the motion shows."""
+        if not self._continuous:
+            return self._watch.delay
+        return None if self._found is None or self._found.rivals else self._found
+
+    def take(self, given: Slice) -> None:
+        """Take messages."""
+        if self._watch.awake:
+            joints, poses = [], []
+            for each in given.pieces:
+                if not isinstance(each.key, StreamKey):
+                    if len(each.key) == len(self._chain.joints):
+                        joints.append(each)
+                elif not (each.key.distance or each.key.eye_in_hand):
+                    poses.append(each)
+            self._watch.take(joints, poses)
+
+    def look(self, collector: Collector, now_ns: int | None) -> None:
+        """Look for the delay after some time of motion, until it shows.
+
+        Nothing is sampled before; at the end (None) what has come must do.
+        """
+        if now_ns is not None:
+            self._watch.look(now_ns)
+        if not collector.holding:
+            return
+        if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
+            return
+        self._looked_ns = now_ns or 0
+        self._found = self._find(collector, now_ns)
+        collector.holding = self.delay is None and now_ns is not None
+
+    def _find(self, collector: Collector, now_ns: int | None) -> Delay | None:
+        """Return how late the waiting measurements are; from now on the collector uses it.
+
+        One that has rivals is not used.
+        """
+        stamps, joints, positions = collector.known(now_ns)
+        found = []
+        for measured, rows in positions:
+            quats = rows[:, QUAT]
+            oriented = len(rows) > 0 and not np.isnan(quats).any()
+            rotations = se3.from_quat(quats) if oriented else None
+            delay = find_delay(self._chain, stamps, joints, measured, rows[:, POSITION], rotations)
+            if delay is not None:
+                found.append(delay)
+        if not found:
+            return None
+        best = max(found, key=lambda delay: (not delay.rivals, delay.correlation))
+        if not best.rivals:
+            collector.delay_ns = round(best.seconds * 1e9)
+        return best
+
+    def wake(self, unrest: int, taken: int) -> None:
+        """Watch again if more measurements at stops were not at rest, with so many samples."""
+        self._watch.wake(unrest, taken)
+
+    def hints(self) -> list[Hint]:
+        """Return what looks wrong with the clocks."""
+        found = []
+        delay, known = self.delay, self.settings.delay
+        if self._watch.moves:
+            found.append(moved(self._watch.moves))
+        elif delay is not None and not self._continuous and self._spoils(delay.seconds):
+            found.append(disagreement(delay.seconds, known))  # in motion it is fitted
+        unclear = self._found if self._continuous else self._watch.unclear
+        if unclear is not None and unclear.rivals and not known:
+            delays = (unclear.seconds, *unclear.rivals)
+            if self._continuous or all(map(self._spoils, delays)):
+                found.append(ambiguous(delays))
+        return found
+
+    def _spoils(self, delay: float) -> bool:
+        """Tell whether a delay [s] spoils stops."""
+        return not -EARLY <= delay - self.settings.delay <= self.settings.settle

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Joint values between samples, and from which side each joint came there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.rows import Rows, Stamps
+
+MOVED = 1e-3
+"""A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
+
+
+def interpolated(
+    rows: Rows,
+    stamps: Stamps,
+    first: NDArray[np.intp],
+    last: NDArray[np.intp],
+    revolute: NDArray[np.bool_],
+    straight: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return values, velocities and accelerations (N, n) of the cubic through four samples.
+
+    Two before and two after the stamp (Lagrange). At the ends of the recording and beside equal
+    stamps, where there are fewer, values are interpolated linearly; with `straight` everywhere.
+    """
+    known, values = rows.stamps, rows.values
+    nothing = np.zeros((len(stamps), values.shape[1]))
+    if rows.count == 0:
+        return nothing, nothing, nothing
+    origin = values[first]
+    span = (known[last] - known[first]) * 1e-9
+    share = (stamps - known[first]) * 1e-9 / np.maximum(span, 1e-9)
+    step = unwrapped(values[last] - origin, revolute)
+    joints = origin + share[:, np.newaxis] * step
+    velocity = step / np.maximum(span, 1e-9)[:, np.newaxis]
+    if straight:
+        return joints, velocity, nothing
+    before, behind = first - 1, np.maximum(last, first + 1) + 1
+    inner = (before >= 0) & (behind < rows.count)
+    near = np.stack([first - 1, first, np.maximum(last, first + 1), behind])[:, inner]
+    if not near.size:
+        return joints, velocity, nothing
+    times = (known[near] - stamps[inner]) * 1e-9  # (4, N)
+    # A cubic over a pause in the samples would follow nothing that was measured.
+    even = np.diff(times, axis=0).max(axis=0) < 3.0 * np.diff(times, axis=0).min(axis=0)
+    inner[inner] = even
+    near, times = near[:, even], times[:, even]
+    heights = unwrapped(values[near] - origin[inner], revolute)  # (4, N, n)
+    at, slope, bend = _lagrange(times)
+    joints[inner] = origin[inner] + np.einsum('kn,knj->nj', at, heights)
+    velocity[inner] = np.einsum('kn,knj->nj', slope, heights)
+    acceleration = nothing.copy()
+    acceleration[inner] = np.einsum('kn,knj->nj', bend, heights)
+    return joints, velocity, acceleration
+
+
+def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the weights (4, N) of four heights for value, slope and bend at time zero."""
+    at, slope, bend = (np.empty_like(times) for _ in range(3))
+    for k in range(4):
+        a, b, c = (times[i] for i in range(4) if i != k)
+        below = (times[k] - a) * (times[k] - b) * (times[k] - c)
+        at[k] = -a * b * c / below
+        slope[k] = (a * b + b * c + c * a) / below
+        bend[k] = -2.0 * (a + b + c) / below
+    return at, slope, bend
+
+
+def unwrapped(steps: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+    """Return differences of joint values; a driver may count angles within one turn."""
+    turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
+    return np.asarray(steps - np.where(revolute, turn, 0.0))
+
+
+def continuous(values: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+    """Return joint values (M, n) in sequence without jumps of a turn."""
+    steps = unwrapped(np.diff(values, axis=0), revolute)
+    return np.asarray(values[:1] + np.cumsum(np.vstack([0.0 * values[:1], steps]), axis=0))
+
+
+def last_moves(
+    values: FloatArray,
+    first: NDArray[np.intp],
+    now: FloatArray,
+    came: FloatArray,
+    revolute: NDArray[np.bool_],
+) -> FloatArray:
+    """Return the signs (N, n) of the last move of each joint before it stood as it does now.
+
+    The last of the samples (M, n) up to index `first` (N,) from which a joint has moved tells;
+    where there is none, `came` (n,) holds the signs from before them.
+    """
+    if len(values) == 0:
+        return np.tile(came, (len(now), 1))
+    path = continuous(values, revolute)
+    now = path[first] + unwrapped(now - path[first], revolute)
+    there = _last_outside(path, first, now - MOVED, now + MOVED)
+    signs = np.sign(now - np.take_along_axis(path, there, axis=0))
+    return np.asarray(np.where(there >= 0, signs, came))
+
+
+def _last_outside(
+    values: FloatArray, last: NDArray[np.intp], low: FloatArray, high: FloatArray
+) -> NDArray[np.intp]:
+    """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high.
+
+    It is -1 where there is none. By the extremes of blocks of 1, 2, 4, ... values: first over
+    ever larger blocks to the one that holds it, then into the half that does.
+    """
+    lows, highs = [values], [values]
+    while len(lows[-1]) > 1:
+        even = len(lows[-1]) // 2 * 2
+        lows.append(np.minimum(lows[-1][:even:2], lows[-1][1:even:2]))
+        highs.append(np.maximum(highs[-1][:even:2], highs[-1][1:even:2]))
+    shape, low, high = low.shape, low.ravel(), high.ravel()
+    column = np.tile(np.arange(shape[1]), shape[0])
+    end = np.repeat(last + 1, shape[1])  # what comes before is still to be searched
+    found, sizes = np.full(len(end), -1), np.zeros(len(end), dtype=np.intp)
+
+    def outside(level: int, block: NDArray[np.intp], here: NDArray[np.intp]) -> NDArray[np.bool_]:
+        where = (block, column[here])
+        return np.asarray((lows[level][where] < low[here]) | (highs[level][where] > high[here]))
+
+    for level in range(len(lows)):
+        here = np.flatnonzero((found < 0) & (end >> level & 1 == 1))
+        block = (end[here] >> level) - 1
+        hit = outside(level, block, here)
+        found[here[hit]], sizes[here[hit]] = block[hit], level
+        end[here[~hit]] -= 1 << level
+    for level in reversed(range(len(lows) - 1)):
+        here = np.flatnonzero(sizes > level)
+        block = 2 * found[here] + 1
+        found[here] = np.where(outside(level, block, here), block, block - 1)
+    return found.reshape(shape)

@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import json
+
+import pandas
+import plants
+import pytest
+from distributed import LocalCluster
+
+from calib_ros.cli.fleet import INCOMPLETE
+from calib_ros.cli.main import main
+from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.files.history import History
+from calib_ros.fleet import run as running
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_identify_and_verify_are_filed(folder, capsys):
+    plants.write_plant(folder, ['0042'], 2)
+    measured = ['nights/0042/000.csv', 'nights/0042/001.csv']
+    common = ['--chain', 'ur10e', '--history', 'history']
+    identify = ['identify', measured[0], *common, '--out', 'result']
+    assert main(identify) == 1
+    assert 'give --serial' in capsys.readouterr().err
+    identify += ['--serial', '0042', '--force']
+    assert [main(identify), main(identify)] == [0, 0]
+    verify = ['verify', measured[1], *common, '--serial', '0042', '--calibration', 'result']
+    assert [main([*verify, '--tolerance', '0.5']), main(verify)] == [0, 0]
+    rows = History('history').rows('0042')
+    assert [row.kind for row in rows] == ['identify', 'verify', 'verify']
+    assert {row.verdict for row in rows} == {'accepted', 'PASS', 'JUDGED'}
+    result = json.loads((folder / 'result/result.json').read_text())
+    assert rows[0].rms_mm == result['validation']['after']['rms_mm']
+    assert rows[0].time == plants.when(0)
+
+    capsys.readouterr()
+    assert main(['history', 'history']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    assert [line.split()[3] for line in lines[1:]] == ['identify', 'verify', 'verify']
+    assert main(['history', 'history', '--robot', '42']) == 1
+    assert 'did you mean "0042"' in capsys.readouterr().err
+    assert main(['history', 'nothing']) == 1
+
+
+def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
+    bump = {'B': (3, {'elbow_joint.theta': 2e-4})}
+    plants.write_plant(folder, ['A', 'B', '<C>'], 4, 40, bump)
+    bad = folder / 'nights/<C>/003.csv'
+    bad.write_text(bad.read_text()[:300])
+    command = ['fleet', 'plant.yaml', '--history', 'history', '--out', 'report']
+    with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as local:
+        command += ['--metrics', 'calib.prom', '--scheduler', local.scheduler_address]
+        assert main(command) == NOT_ACCEPTED
+    said = capsys.readouterr()
+    assert '1 changed, 1 unreadable, 1 fine' in said.out
+    assert 'B, 2025-10-12: elbow_joint changed, elbow_joint.theta by +0.' in said.out
+    assert '<C>: ' in said.err
+    assert '003.csv' in said.err
+
+    text = (folder / 'calib.prom').read_text()
+    assert 'calib_ros_fleet_robots{state="changed"} 1\n' in text
+    assert 'calib_ros_fleet_unreadable_inputs 1\n' in text
+    when = plants.FIRST + 3 * plants.DAY + 39
+    assert f'calib_ros_robot_changed_timestamp_seconds{{serial="B"}} {when}\n' in text
+    page = (folder / 'report/index.html').read_text()
+    assert '&lt;C&gt;' in page
+    assert '<C>' not in page
+    own = History('history').rows('<C>')[-1]
+    assert f'href="robots/%253CC%253E/{own.key}.html"' in page
+    assert (folder / f'report/robots/%3CC%3E/{own.key}.html').exists()
+    assert len(pandas.read_parquet('history')) == 11
+
+    plant = json.loads((folder / 'plant.yaml').read_text())
+    plant['robots'][1]['since'] = '2025-10-12'
+    (folder / 'plant.yaml').write_text(json.dumps(plant))
+    command = [*command[:-1], 'tcp://127.0.0.1:1']  # for the damaged one, which is tried again
+    bad.unlink()
+    assert main(command) == 0
+    plant['robots'][1]['measured'] = 'nowhere/*.csv'
+    (folder / 'plant.yaml').write_text(json.dumps(plant))
+    assert main(command) == INCOMPLETE
+
+
+def test_what_cannot_be_asked_for(folder, capsys):
+    plants.write_plant(folder, ['A'], 0)
+    for more, words in (
+        (['--years', '0'], '--years must be positive'),
+        (['--workers', '-1'], '--workers must be'),
+        (['--history', 'nowhere://x'], 'a history cannot be at nowhere'),
+    ):
+        assert main(['fleet', 'plant.yaml', '--history', 'history', *more]) == 1
+        assert words in capsys.readouterr().err
+
+
+def test_a_scheduler_that_is_lost_is_told_of(folder, capsys, monkeypatch):
+    monkeypatch.setattr(running, 'PATIENCE', 0.5)
+    plants.write_plant(folder, ['A'], 1)
+    command = ['fleet', 'plant.yaml', '--history', 'history', '--scheduler', 'tcp://127.0.0.1:1']
+    assert main(command) == 1
+    assert 'tcp://127.0.0.1:1' in capsys.readouterr().err

@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A ball that sits in sockets, captured live as a table tells it."""
+
+import numpy as np
+import pytest
+from in_sockets import DISTANCE, IIWA, cell
+from streams import joint_state, of_joints, take
+
+from calib_ros.errors import ConfigError
+from calib_ros.files.journal import Journal
+from calib_ros.files.tables import columns, read_journal, read_table
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+S = 1_000_000_000
+
+
+def captured(problem, count=4):
+    """Return a session in which the ball was captured in each socket a few times."""
+    session = CalibrationSession(IIWA, Settings(mode='triggered', sigma_position=1e-5))
+    now = 10 * S
+    for number, each in enumerate(problem.sets):
+        for row in each.joints[:count].tolist():
+            stamps = now + np.arange(0, 50) * 10_000_000
+            come = [of_joints(joint_state(t, IIWA.joint_names, row)) for t in stamps.tolist()]
+            take(session, *come)
+            assert session.capture(f'place {number // 2}/{number % 2}') == (1, '')
+            now += S
+    return session
+
+
+def test_sockets_are_identified_from_the_node_as_from_a_table(tmp_path):
+    _, problem = cell(0, count=12)
+    session = captured(problem, 12)
+    live = session.problem()
+    assert session.account().poses == 0
+    for one, other in zip(live.sets, problem.sets, strict=True):
+        np.testing.assert_allclose(one.joints, other.joints, atol=1e-12)
+        assert one.socket
+    assert [each[2] for each in live.separations] == [DISTANCE] * (len(live.sets) // 2)
+    journal = Journal(tmp_path / 'journal.csv', 7)
+    for sample in session.samples:
+        journal.add(sample)
+    journal.close()
+    table = read_table(tmp_path / 'journal.csv', 7)
+    assert table.pairs == tuple(each[:2] for each in live.separations)
+    for one, other in zip(table.fitted, live.sets, strict=True):
+        assert (one.base, one.tool, one.socket) == (other.base, other.tool, True)
+        np.testing.assert_array_equal(one.joints, other.joints)
+    resumed = CalibrationSession(IIWA, session.settings)
+    resumed.restore(read_journal(tmp_path / 'journal.csv', 7)[0])
+    assert resumed.problem().separations == live.separations
+    found = session.identify()
+    assert found.fitted.figures[1].rms_mm < 1e-3
+    assert 'samples' in session.status()
+
+
+def test_a_moving_arm_and_a_wrong_label_are_refused():
+    _, problem = cell(0, count=2)
+    session = captured(problem, 1)
+    later = 1000 * S + np.arange(0, 50) * 10_000_000
+    rows = problem.sets[0].joints[0] + 0.01 * np.arange(50)[:, np.newaxis]
+    moving = [
+        of_joints(joint_state(t, IIWA.joint_names, row.tolist()))
+        for t, row in zip(later.tolist(), rows, strict=True)
+    ]
+    take(session, *moving)
+    count, why = session.capture('A/1')
+    assert (count, 'has not stood' in why) == (0, True)
+    for label in ('A', '/1', 'A/', 'A/1_2', 'A/B/1', 'A/\n'):
+        with pytest.raises(ConfigError, match='LOCATION/SOCKET'):
+            session.capture(label)
+
+
+def test_a_journal_of_before_keeps_its_columns(tmp_path):
+    path = tmp_path / 'journal.csv'
+    path.write_text(','.join(columns(7)[:-2]) + '\n')
+    session = captured(cell(0, count=1)[1], 1)
+    journal = Journal(path, 7)
+    with pytest.raises(OSError, match='call ~/clear'):
+        journal.add(session.samples[0])
+    journal.close()
+    assert read_journal(path, 7)[0] == ()
