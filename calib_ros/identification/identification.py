@@ -271,15 +271,14 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     posterior = fitted.posterior(
         _size(fitted), considered(chain, names), rounding_errors(problem, coarse)
     )
-    step = find_step(problem, names, robust)
     found = Findings(
         converged=before.converged and robust.fit.converged and robust.settled,
         parameters=parameters,
         validation=validation,
         chance=_chance(problem, before.chain, names, robust),
         region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
-        step=step,
-        own_behaviour=arms_own(problem, robust) if step is None else None,
+        step=(step := find_step(problem, names, robust)),
+        own_behaviour=None if step else arms_own(problem, robust),
         may_be_rounding=bool(coarse)
         and may_be_rounding(problem, before.chain, names, coarse, robust.good),
     )
