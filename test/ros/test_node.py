@@ -51,8 +51,9 @@ from calib_ros.apply.simulation import faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError
 from calib_ros.files.archive import Archive
-from calib_ros.files.bags import replay, write_bag
+from calib_ros.files.bags import replay
 from calib_ros.files.history import History
+from calib_ros.files.recording import write_bag
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import calibration_record, dump_chain, load_chain, parse_chain
 from calib_ros.ros import node as node_module
