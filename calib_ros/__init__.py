@@ -20,10 +20,12 @@ if TYPE_CHECKING:
     from calib_ros.files.bags import replay
     from calib_ros.files.tables import read_table
     from calib_ros.identification.calibration import Calibration, load_calibration
+    from calib_ros.identification.difference import Difference, difference
     from calib_ros.identification.identification import Identification, identify
     from calib_ros.identification.model_choice import identify_model
     from calib_ros.identification.observations import Observations
     from calib_ros.identification.problem import Problem
+    from calib_ros.identification.recalibration import Recalibration, recalibrate
     from calib_ros.kinematics.chain import Chain
     from calib_ros.kinematics.chain_file import dump_chain, load_chain
     from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
@@ -38,16 +40,19 @@ __all__ = [
     'CalibrationSession',
     'Chain',
     'Compensator',
+    'Difference',
     'Identification',
     'Observations',
     'Plan',
     'Problem',
     'Program',
+    'Recalibration',
     'Settings',
     'Verification',
     'chain_from_urdf',
     'compensate',
     'corrected_urdf',
+    'difference',
     'dump_chain',
     'identify',
     'identify_model',
@@ -55,6 +60,7 @@ __all__ = [
     'load_chain',
     'plan',
     'read_table',
+    'recalibrate',
     'replay',
     'verify',
 ]
@@ -65,16 +71,19 @@ _HOMES = {
     'CalibrationSession': 'sampling.session',
     'Chain': 'kinematics.chain',
     'Compensator': 'apply.compensation',
+    'Difference': 'identification.difference',
     'Identification': 'identification.identification',
     'Observations': 'identification.observations',
     'Plan': 'apply.planning',
     'Problem': 'identification.problem',
     'Program': 'apply.program',
+    'Recalibration': 'identification.recalibration',
     'Settings': 'settings',
     'Verification': 'apply.verification',
     'chain_from_urdf': 'kinematics.urdf',
     'compensate': 'apply.compensation',
     'corrected_urdf': 'kinematics.urdf',
+    'difference': 'identification.difference',
     'dump_chain': 'kinematics.chain_file',
     'identify': 'identification.identification',
     'identify_model': 'identification.model_choice',
@@ -82,6 +91,7 @@ _HOMES = {
     'load_chain': 'kinematics.chain_file',
     'plan': 'apply.planning',
     'read_table': 'files.tables',
+    'recalibrate': 'identification.recalibration',
     'replay': 'files.bags',
     'verify': 'apply.verification',
 }

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from datetime import datetime, timezone
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from calib_ros.atomic import write_files
 from calib_ros.cli.options import NOT_ACCEPTED, results
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
     from calib_ros.identification.recalibration import Recalibration
 
 FILES = ('calibration.yaml', 'result.json')
-UNKNOWN = 1.0
-"""Age [years] of a calibration that does not tell it."""
 
 
 def add_previous(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +63,7 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
     from calib_ros.identification.calibration import load_calibration
-    from calib_ros.identification.recalibration import recalibrate
+    from calib_ros.identification.recalibration import recalibrate, years_since
 
     if not options.growth >= 0.0:
         raise InputError(f'--growth must not be negative, not {options.growth}')
@@ -76,18 +73,8 @@ def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recal
     new = ('base',) * options.new_base + ('tool',) * options.new_tool
     with screen.work('looking for what has changed'):
         return recalibrate(
-            previous, loaded.problem, _years(previous.record), 1e-3 * options.growth, new
+            previous, loaded.problem, years_since(previous.record), 1e-3 * options.growth, new
         )
-
-
-def _years(record: Any) -> float:
-    """Return the age of a calibration by its record."""
-    try:
-        created = datetime.fromisoformat(str(record.get('created')))
-        age = datetime.now(timezone.utc) - created
-    except (ValueError, TypeError):
-        return UNKNOWN
-    return max(0.0, age.days / 365.25)
 
 
 def _document(found: Recalibration) -> str:

@@ -7,7 +7,7 @@ the vector b = A x^ (A may be singular: some poses tell only a part). Before the
 changes that need no explanation, x ~ N(0, K), as by the uncertainty of an earlier calibration, are
 marginalised:
 
-    A' = (1 + A K)^-1 A        b' = (1 + A K)^-1 b
+    A' = A - A R M R^T A        b' = b - A R M R^T b        M = (1 + R^T A R)^-1,  K = R R^T
 
 An explanation says that x = G z: one parameter has changed, all parameters of a joint (its link is
 bent), or a frame (the device or the target was moved). Its gain of chi-squared,
@@ -132,19 +132,26 @@ class Told(Shown):
 
     def beside(self, square: FloatArray) -> Told:
         """Return what is told beside changes that need no explanation, of covariance (P, P)."""
-        whole = np.eye(len(self.vector)) + self.information @ square
-        left = np.asarray(linalg.solve(whole, self.information))
-        return Told(
-            self.names, 0.5 * (left + left.T), np.asarray(linalg.solve(whole, self.vector))
-        )
+        root, inverse = self._given(square)
+        shown = self.information @ root
+        left = self.information - shown @ inverse @ shown.T
+        vector = self.vector - shown @ (inverse @ (root.T @ self.vector))
+        return Told(self.names, 0.5 * (left + left.T), vector)
 
     def mean(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean (P,) and covariance (P, P) of changes that were N(0, square) before."""
-        whole = np.eye(len(self.vector)) + square @ self.information
-        covariance = np.asarray(linalg.solve(whole, square))
-        return np.asarray(linalg.solve(whole, square @ self.vector)), 0.5 * (
-            covariance + covariance.T
-        )
+        root, inverse = self._given(square)
+        return root @ (inverse @ (root.T @ self.vector)), root @ inverse @ root.T
+
+    def _given(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return a root R (P, P) of a covariance K, and (1 + R^T A R)^-1."""
+        scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
+        sizes, directions = linalg.eigh(square / np.outer(scale, scale))
+        root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
+        inner = np.eye(len(scale)) + root.T @ self.information @ root
+        factor = linalg.cholesky(inner, lower=True)
+        inverse = linalg.solve_triangular(factor, np.eye(len(scale)), lower=True)
+        return root, inverse.T @ inverse
 
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Return the gain by changes along columns (P, k), these, and their covariance."""
@@ -277,7 +284,8 @@ def gauged(
     index = {name: k for k, name in enumerate(columns)}
     fitted = list(dict.fromkeys([*frames, *names]))
     known = flat[:, [index[name] for name in fitted]]
-    scale = np.maximum(np.linalg.norm(known, axis=0), 1e-300)
+    scale = np.linalg.norm(known, axis=0)
+    scale[scale == 0.0] = 1.0  # what moves nothing
     wanted = flat[:, [index[name] for name in others]]
     taken = linalg.lstsq(known / scale, wanted, cond=1e-9)[0]
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)

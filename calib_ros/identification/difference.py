@@ -40,9 +40,10 @@ from calib_ros.identification.changes import (
 )
 from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.region import KNOWN
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of

@@ -120,6 +120,15 @@ class Recalibration(Shown):
         return f'accepted: {"; ".join(reason_in_words(each) for each in self.changed)}; {text}'
 
 
+def years_since(record: Mapping[str, Any]) -> float:
+    """Return the age [years] of a calibration by its record; a year where that does not tell."""
+    try:
+        age = datetime.now(timezone.utc) - datetime.fromisoformat(str(record.get('created')))
+    except (ValueError, TypeError):
+        return 1.0
+    return max(0.0, age.days / 365.25)
+
+
 def recalibrate(
     previous: Calibration,
     problem: Problem,

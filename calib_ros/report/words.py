@@ -13,9 +13,11 @@ import numpy as np
 
 import calib_ros
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import FALSE, reason_in_words
 from calib_ros.identification.identification import Identification, Noise, Outlier
+from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.region import Region
-from calib_ros.identification.validation import Comparison, ErrorFigures
+from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_yaml
@@ -111,6 +113,23 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     return dump_yaml({'/**': {'ros__parameters': parameters}})
 
 
+def checked(found: Recalibration) -> tuple[bool, str]:
+    """Return whether the last stops agree with the calibration in use, and why in words."""
+    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} samples'
+    if found.changed:
+        reasons = '; '.join(reason_in_words(each) for each in found.changed)
+        return False, (
+            f'the calibration in use does not fit any more, {reasons}: was it bumped? {text}; '
+            'measure 8 poses or more and call ~/identify, or calib_ros identify --previous'
+        )
+    if found.unexplained <= FALSE:
+        return False, (
+            f'{text}, more than the calibration in use and noise explain, and no few parameters '
+            'do: measure new poses and call ~/identify'
+        )
+    return True, f'the calibration in use agrees with what was measured: {text}'
+
+
 def verdict(
     calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures
 ) -> tuple[bool, str]:
@@ -155,17 +174,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'not_excited': list(result.not_excited),
         'weakly_determined': list(weakly_determined(result)),
         'held_near_nominal': list(result.weak),
-        'parameters': {
-            p.name: {
-                'value': p.value,
-                'offset': p.offset,
-                'std': p.std,
-                'half_width_95': p.half_width(0.95),
-                'unit': p.name.unit,
-                'status': p.status,
-            }
-            for p in result.parameters
-        },
+        'parameters': {p.name: _parameter(p) for p in result.parameters},
         'fitted': comparison(result.fitted),
         'validation': None if validation is None else {'by': result.validated_by, **validation},
         'before_is': BEFORE,
@@ -190,6 +199,17 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'python': platform.python_version(),
             'numpy': np.__version__,
         },
+    }
+
+
+def _parameter(p: ParameterRow) -> dict[str, Any]:
+    return {
+        'value': p.value,
+        'offset': p.offset,
+        'std': p.std,
+        'half_width_95': p.half_width(0.95),
+        'unit': p.name.unit,
+        'status': p.status,
     }
 
 

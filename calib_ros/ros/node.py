@@ -39,13 +39,14 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, advice_on
 from calib_ros.files.archive import Archive
 from calib_ros.files.waypoints import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.progress import Progress
 from calib_ros.report import words
 from calib_ros.ros import to_ros
@@ -59,8 +60,9 @@ from calib_ros.ros.outputs import Exportable, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.problems import check_settings
 from calib_ros.sampling.sample import Sample, named
-from calib_ros.sampling.session import CalibrationSession, check_settings
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD, parse_sources
 
 TAKING_PERIOD = 0.1
@@ -152,6 +154,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self, '~/export', self._answer, self._to_export, self._keeper.export
         )
         self._save = DeferredTrigger(self, '~/save', self._answer, self._to_save, self._on_save)
+        self._check = DeferredTrigger(
+            self, '~/check', self._answer, self._to_check, self._on_check
+        )
         for kind, name, callback in (
             (Trigger, '~/cancel', self._on_cancel),
             (Trigger, '~/capture', self._on_capture),
@@ -179,7 +184,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        working = (self._identify, self._save, self._export, self._guide)
+        working = (self._identify, self._save, self._export, self._check, self._guide)
         ended = [each.join(JOIN_TIMEOUT) for each in working]
         self._take_messages()
         self.session.finish()
@@ -379,6 +384,14 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         holds, text = words.verdict(calibration, *figures)
         return holds, text + self._filer.validated(self.session, figures, holds)
 
+    def _to_check(self) -> tuple[Calibration, Problem]:
+        self._take_messages()
+        return self.session.recent()
+
+    def _on_check(self, found: tuple[Calibration, Problem]) -> tuple[bool, str]:
+        calibration, problem = found
+        return words.checked(recalibrate(calibration, problem, years_since(calibration.record)))
+
     def _on_clear(self, request: Any) -> tuple[bool, str]:
         count = len(self.session.samples)
         old = self._archive.begin_anew()
@@ -470,8 +483,10 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Run the work of a service; an error is its answer. Who reads the log sees it, too."""
         try:
             success, text = work()
-        except (CalibrationError, OSError) as err:
+        except CalibrationError as err:
             success, text = False, str(err)
+        except OSError as err:
+            success, text = False, '; '.join(filter(None, (str(err), advice_on(err))))
         except Exception as err:
             self.get_logger().error(f'internal error: {traceback.format_exc()}')
             success, text = False, f'internal error, see the log: {err!r}'

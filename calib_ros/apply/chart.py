@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Does an arm get worse from night to night? A chart of verification errors.
+
+A night's RMS error r with nu degrees of freedom is held against the pooled square s^2 of nights
+before: r^2 / s^2 has an F distribution where nothing has changed, with nu and all of their degrees
+of freedom, which makes it a normal variable z, independent of those before. Two cumulative sums
+(CUSUM; Page 1954),
+
+    S_0 = 0        S = max(0, S + z - k)
+
+look for shifts of about 2 k: a small k for what creeps, a large one for what jumps. An alarm is
+S > h. How many nights pass until a false one, on average, follows from the Markov chain of S in
+steps (Brook and Evans 1972), and h from how many years that shall be. A robot with two charts has
+a false alarm twice as often; each is given half. After an alarm all begins anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from scipy import optimize, special
+
+from calib_ros.errors import InputError
+from calib_ros.kinematics.se3 import FloatArray
+
+SLOPES = (0.5, 2.0)
+"""References k: shifts of one and of four standard deviations show soonest."""
+STEPS = 200
+"""Of the Markov chain; more change the run length by less than a hundredth (test_chart.py)."""
+DAYS = 365.25
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What a chart of one robot shows.
+
+    Attributes
+    ----------
+    scores : (N,)
+        How large each night's error is against those before, as a normal variable; NaN in the
+        first night and in the first after an alarm.
+    alarms : tuple of int
+        Nights in which it is too large.
+    since : tuple of int
+        The night from which on it has been, for each alarm.
+
+    """
+
+    scores: FloatArray
+    alarms: tuple[int, ...]
+    since: tuple[int, ...]
+
+
+def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) -> Drift:
+    """Look for nights from which on an arm is worse.
+
+    Parameters
+    ----------
+    rms : (N,)
+        Errors of the nights, in any unit.
+    freedom : (N,)
+        Their degrees of freedom, as of `confidence.freedom_of` times the configurations.
+    years : float
+        Between two false alarms of one robot, on average, with a night each day.
+
+    Raises
+    ------
+    InputError
+        When they are no errors.
+
+    """
+    errors, nus = np.asarray(rms, dtype=float), np.asarray(freedom, dtype=float)
+    if errors.shape != nus.shape or not (np.isfinite(errors) & (errors > 0.0) & (nus > 0.0)).all():
+        raise InputError('errors and degrees of freedom of nights must be as many, and positive')
+    limits = [limit(slope, len(SLOPES) * years * DAYS) for slope in SLOPES]
+    scores = np.full(len(errors), np.nan)
+    alarms, since = [], []
+    squares = known = 0.0
+    sums, starts = np.zeros(len(SLOPES)), np.zeros(len(SLOPES), dtype=int)
+    for night, (error, nu) in enumerate(zip(errors.tolist(), nus.tolist(), strict=True)):
+        if known:
+            ratio = error**2 / (squares / known)
+            chance = max(float(special.fdtrc(nu, known, ratio)), 1e-300)
+            scores[night] = -special.ndtri(chance)
+            starts = np.where(sums > 0.0, starts, night)
+            sums = np.maximum(0.0, sums + scores[night] - np.array(SLOPES))
+            if (sums > limits).any():
+                alarms.append(night)
+                since.append(int(starts[np.argmax(sums / limits)]))
+                squares = known = 0.0
+                sums[:] = 0.0
+        squares, known = squares + nu * error**2, known + nu
+    return Drift(scores, tuple(alarms), tuple(since))
+
+
+def run_length(slope: float, height: float) -> float:
+    """Return after how many normal values a one-sided CUSUM exceeds a height, on average."""
+    width = 2.0 * height / (2 * STEPS - 1)
+    middles = width * np.arange(STEPS)
+    upper = middles[np.newaxis] - middles[:, np.newaxis] + 0.5 * width + slope
+    stays = special.ndtr(upper)
+    stays[:, 1:] -= special.ndtr(upper[:, 1:] - width)
+    return float(np.linalg.solve(np.eye(STEPS) - stays, np.ones(STEPS))[0])
+
+
+@cache
+def limit(slope: float, nights: float) -> float:
+    """Return the height that a CUSUM exceeds after so many nights, on average, by chance."""
+
+    def less(height: float) -> float:
+        return float(np.log(run_length(slope, height) / nights))
+
+    return float(optimize.brentq(less, 1e-3, 60.0, xtol=1e-4))

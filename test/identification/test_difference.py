@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is said to be different between two calibrations of one robot."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.cli.main import main
+from calib_ros.errors import InputError
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.difference import difference
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain_file import load_chain
+
+UR = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+DATA = Path(os.environ.get('CALIB_ROS_DATA', 'nowhere')) / 'ur10_ipa_leica'
+
+
+def calibrated(true, seed, **more):
+    rng = np.random.default_rng(seed)
+    seen = measure(true, UR.random_joints(50, rng), rng, *NOISE)
+    sigmas = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
+    return Calibration.of(identify(Problem(UR, seen, **sigmas, **more)))
+
+
+@pytest.fixture(scope='module')
+def nights():
+    """Return an arm, and its calibration."""
+    true = faulty(UR, Cell(), np.random.default_rng(3))
+    return true, calibrated(true, 0)
+
+
+def elsewhere(true):
+    """Return the arm before a device that stands elsewhere, with another target."""
+    rng = np.random.default_rng(8)
+    return replace(true, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
+
+
+def test_an_arm_that_has_not_changed_is_the_same_wherever_the_device_stands(nights):
+    true, first = nights
+    for there, seed in ((true, 1), (elsewhere(true), 2)):
+        found = difference(first, calibrated(there, seed))
+        assert found.same
+        assert not found.changed
+        assert found.chance > 0.01
+        assert found.limit < 1e-4
+        assert found.left < 1e-7
+        assert found.in_words().startswith('unchanged within 0.0')
+
+
+def test_a_joint_that_was_bumped_is_named(nights):
+    true, first = nights
+    bumped = elsewhere(true).with_offsets({'elbow_joint.theta': 3e-4})
+    found = difference(first, calibrated(bumped, 1))
+    assert not found.same
+    ((reason, *others),) = found.changed
+    assert reason.owner == 'elbow_joint'
+    assert not others
+    assert reason.change[0] == pytest.approx(3e-4, abs=4.0 * reason.sigma[0])
+    assert found.unexplained > 0.01
+    words = found.in_words()
+    assert 'elbow_joint.theta by +0.' in words
+    assert 'nothing else: was it bumped?' in words
+    back = difference(calibrated(bumped, 1), first)
+    assert back.changed[0][0].change[0] == pytest.approx(-reason.change[0], abs=5e-5)
+
+
+def test_gauges_are_taken_out(nights):
+    """What one calls d of the elbow, the other calls d of the wrist: predictions agree.
+
+    Axes that are parallel to a milliradian only: 2 mm of one are 2 um off 2 mm of the other.
+    """
+    _, first = nights
+    for offsets, most in (
+        ({'wrist_1_joint.d': -2e-3, 'elbow_joint.d': 2e-3}, 1e-5),
+        ({'shoulder_pan_joint.theta': 1e-2, 'wrist_3_joint.d': 1e-3}, 1e-8),
+    ):
+        found = difference(first, replace(first, chain=first.chain.with_offsets(offsets)))
+        assert found.same
+        assert found.rms < most
+
+
+def test_an_arm_with_other_links_is_another_one(nights):
+    _, first = nights
+    rng = np.random.default_rng(5)
+    other = replace(faulty(UR, Cell(), rng), base=first.chain.base)
+    found = difference(first, calibrated(other, 1))
+    assert not found.same
+    assert found.unexplained < 1e-6
+    assert 'many parameters are different' in found.in_words()
+
+
+def test_what_cannot_be_compared_is_refused(nights):
+    _, first = nights
+    with pytest.raises(InputError, match='calibration 2 does not hold the covariance'):
+        difference(first, replace(first, covariance=None))
+    panda = load_chain('franka_panda')
+    with pytest.raises(InputError, match='are of other robots'):
+        difference(first, replace(first, chain=panda, before=panda))
+
+
+def test_the_command_says_it_and_ends_accordingly(nights, tmp_path, capsys):
+    true, first = nights
+    later = calibrated(true.with_offsets({'wrist_2_joint.theta': 5e-4}), 1)
+    for name, each in (('first', first), ('second', later)):
+        (tmp_path / f'{name}.yaml').write_text(each.dump())
+    paths = [str(tmp_path / f'{name}.yaml') for name in ('first', 'second')]
+    assert main(['compare', paths[0], paths[0]]) == 0
+    assert 'unchanged within' in capsys.readouterr().out
+    assert main(['compare', *paths]) == 3
+    assert 'wrist_2_joint.theta by +0.' in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not DATA.exists(), reason='no measured robots')
+def test_two_nights_of_a_measured_robot_are_not_known_well_enough_to_differ():
+    """Session A is a grid, B scattered configurations; neighbours share what the model lacks.
+
+    The predictions differ by most of a millimetre over the joint range, and neither session knows
+    them better: nothing is claimed.
+    """
+    from calib_ros.files.tables import read_table
+
+    chain = load_chain(DATA / 'chain.yaml')
+    pair = []
+    for session in ('A', 'B'):
+        (fitted,) = read_table(DATA / 'uniform.csv', 6, (session,)).fitted
+        few = fitted.select(np.arange(0, len(fitted), max(1, len(fitted) // 300)))
+        pair.append(Calibration.of(identify(Problem(chain, few))))
+    found = difference(*pair)
+    assert found.rms > 2e-4
+    assert found.limit > found.rms
+    assert not found.changed
+    assert 'bumped' not in found.in_words()
