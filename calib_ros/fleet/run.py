@@ -176,6 +176,7 @@ def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, foun
 def _client(cluster: Cluster) -> Iterator[Any]:
     """Yield a client of the workers; those of this machine end with it."""
     try:
+        import dask
         from distributed import Client, LocalCluster
     except ImportError:
         raise ConfigError(MISSING) from None
@@ -183,6 +184,7 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         if cluster.address:
             where: Any = cluster.address
         else:
+            stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
             where = stack.enter_context(
                 LocalCluster(
                     n_workers=cluster.workers or None,
