@@ -20,11 +20,14 @@ from measured import measured, rows_of, write_csv
 from rosbags.rosbag2 import Writer
 
 from calib_ros.atomic import confined, whole_folder, write_file, write_files
-from calib_ros.cli import main
+from calib_ros.cli import identify, main
+from calib_ros.cli.inputs import Loaded
+from calib_ros.cli.results import Identified
 from calib_ros.errors import InputError
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import Recording, write_bag
-from calib_ros.identification.identification import identify
+from calib_ros.identification import calibration
+from calib_ros.identification.identification import identify as identified_from
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain
@@ -440,7 +443,7 @@ def test_commands_that_write_bags_say_so_when_the_disk_is_full(tmp_path, command
         check=False,
     )
     assert done.returncode == 1
-    assert done.stderr == 'calib_ros: cannot write bag: [Errno 27] File too large\n'
+    assert 'calib_ros: cannot write bag: [Errno 27] File too large' in done.stderr.splitlines()[-1]
     assert [path.name for path in tmp_path.iterdir()] == ['cell.csv']
 
 
@@ -450,14 +453,17 @@ def identified(monkeypatch):
 
     def found(label, seed):
         problem = Problem(load_chain('ur5e'), measured(seed=seed))
-        result, settings = identify(problem), Settings(folds=seed)
+        result, settings = identified_from(problem), Settings(folds=seed)
         origin = Origin(settings=words.configuration_yaml('ur5e', settings))
-        return main._Identified(problem, result, {'samples': label}, (f'of {label}',), origin)
+        loaded = Loaded(problem, {'samples': label}, (f'of {label}',))
+        return Identified(loaded, result, origin)
 
     monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
     monkeypatch.setattr(reports, 'identification_report', lambda *of: of[1])
     monkeypatch.setattr(page, 'render', lambda result: f'page of {result.names}')
-    monkeypatch.setattr(words, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: '')))
+    monkeypatch.setattr(
+        calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
+    )
     return {'A': found('A', 5), 'B': found('B', 6)}
 
 
@@ -468,11 +474,11 @@ def test_an_identification_that_is_killed_mixes_nothing(
     if not accepted:
         found = identified['B']
         refused = replace(found.result, refusals=(Reason(Rule.GAIN, 'no gain'),))
-        identified['B'] = found._replace(result=refused)
+        identified['B'] = replace(found, result=refused)
     out = tmp_path / 'out'
 
     def run(label):
-        monkeypatch.setattr(main, '_identified', lambda options: identified[label])
+        monkeypatch.setattr(identify, '_identified', lambda *given: identified[label])
         arguments = ['--csv', 'unread', '--chain', 'ur5e', '--out', str(out), '--force']
         main.main(['identify', *arguments])
         return tree(out)
