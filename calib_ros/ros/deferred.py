@@ -20,8 +20,9 @@ class DeferredTrigger:
 
     Jazzy's executors send the answer through the service's `send_response` right after the
     callback, on the same thread. It is replaced here by one that holds the answer of an accepted
-    call back until its work has ended; an async callback would do, but the events executor takes
-    none. A call that comes meanwhile is refused at once.
+    call back until its work has ended. An async callback starves the node's timers in rclpy's
+    single-threaded executor; several threads would need a lock around all that the session holds.
+    A call that comes meanwhile is refused at once.
 
     Parameters
     ----------
