@@ -114,4 +114,7 @@ def limit(slope: float, nights: float) -> float:
     def less(height: float) -> float:
         return float(np.log(run_length(slope, height) / nights))
 
-    return float(optimize.brentq(less, 1e-3, 60.0, xtol=1e-4))
+    high = 1.0
+    while less(high) < 0.0:
+        high *= 2.0
+    return float(optimize.brentq(less, 0.0, high, xtol=1e-4))
