@@ -50,7 +50,7 @@ from geometry_msgs.msg import (
     TransformStamped,
     Vector3,
 )
-from rclpy.experimental import EventsExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import JointState
@@ -180,7 +180,7 @@ def empty(namespace, frames):
     node.create_subscription(JointState, 'joint_states', hear(0), qos)
     kind, topic, _ = measurement(frames)
     node.create_subscription(kind, topic, hear(1), qos)
-    executor = EventsExecutor()
+    executor = SingleThreadedExecutor()
     executor.add_node(node)
     os.set_blocking(0, False)
     while not sys.stdin.buffer.read(1):
@@ -227,7 +227,7 @@ class Process:
 def run(options, seconds, folder):
     """Run the soak; return what was found."""
     watch = Node('watch')
-    executor = EventsExecutor()
+    executor = SingleThreadedExecutor()
     executor.add_node(watch)
     heard, mine = [], str(os.getpid())
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 from collections.abc import Iterable
 
 LONGEST = 400
@@ -23,6 +24,16 @@ def shortened(text: str, longest: int = LONGEST) -> str:
     gap = f' ... ({len(text)} characters) ... '
     end = (longest - len(gap)) // 3
     return text[: longest - len(gap) - end] + gap + text[len(text) - end :]
+
+
+_ADVICE = {
+    errno.ENOSPC: 'the disk is full: make room, or write to another place',
+    errno.EDQUOT: 'your share of the disk is full: make room, or write to another place',
+    errno.EROFS: 'it cannot be written to: choose another place',
+    errno.EACCES: 'you may not do that there: choose another place, or ask its owner',
+    errno.EFBIG: 'the file would be too large for this disk: write to another place',
+    errno.EMFILE: 'too many files are open: close programs, or raise the limit (ulimit -n)',
+}
 
 
 class CalibrationError(Exception):
@@ -65,3 +76,8 @@ class TooFewObservationsError(InputError):
             f'{configurations} measured configurations are too few, at least {needed} are '
             f'needed: {why}; measure more poses or fix parameters'
         )
+
+
+def advice_on(err: OSError) -> str:
+    """Return in words what to do about an error of the system; empty where nobody can tell."""
+    return _ADVICE.get(err.errno or 0, '')

@@ -56,7 +56,13 @@ def read_text(
 
 
 def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: str = '') -> bytes:
-    """Return the content of a file, as `read_text` does."""
+    """Return the content of a file, as `read_text` does.
+
+    Of a pipe only where the shell made it (standard input, process substitution): in a folder it
+    may have nobody at its other end, and would be waited for without end.
+    """
+    if path.is_fifo() and path.parts[:2] not in (('/', 'dev'), ('/', 'proc')):
+        raise error(f'{what}{path} is a pipe: give a file, or /dev/stdin')
     try:
         with path.open('rb') as file:
             data = file.read(largest + 1)

@@ -8,11 +8,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros.apply import simulation
-from calib_ros.files.bags import (
-    STORAGES,
-    Recording,
-    replay,
-)
+from calib_ros.files.bags import replay
+from calib_ros.files.recording import STORAGES, Recording
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession

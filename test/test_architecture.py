@@ -28,7 +28,7 @@ ONLY = {
     'cv2': ('files.images',),
     'pyarrow': ('files.history',),
     'fsspec': ('files.history', 'fleet.'),
-    'distributed': ('fleet.',),
+    **dict.fromkeys(('dask', 'distributed'), ('fleet.',)),
     'rich': ('fleet.', 'cli.screen'),
     'argcomplete': ('cli.main',),
     'yaml': (
@@ -92,7 +92,7 @@ def test_no_two_modules_import_each_other():
 
 def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
     blocked = [*ROS, 'rosbags', 'yaml', 'matplotlib', 'jinja2', 'plotly', 'weasyprint', 'cv2']
-    blocked += ['pyarrow', 'fsspec', 'distributed', 'rich']
+    blocked += ['pyarrow', 'fsspec', 'dask', 'distributed', 'rich']
     apart = ('ros.', 'files.bags', 'report.plots')
     core = [name for name in MODULES if not name.startswith(apart)]
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]

@@ -4,6 +4,7 @@
 
 import itertools
 import json
+import os
 import shutil
 import sqlite3
 import struct
@@ -16,8 +17,9 @@ import yaml
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
-from calib_ros.files.bags import Recording, Replayed, replay, write_bag
+from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.mcap import LARGEST_CHUNK
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.salvage import recorded
 from calib_ros.files.tables import COVARIANCE, read_journal, read_table
 from calib_ros.files.trajectories import read_program
@@ -25,7 +27,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.chain_file import dump_chain, parse_chain
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.sampling.messages import Readings, usable
 from calib_ros.sampling.session import CalibrationSession
@@ -301,6 +303,15 @@ def test_too_many_devices_are_refused(tmp_path):
     path.write_text('q1,q2,x,y,z,device\n' + '\n'.join(f'0,0,1,2,3,d{k}' for k in range(200)))
     with pytest.raises(InputError, match='line 102: more than 100 sessions'):
         read_table(path, 2)
+
+
+def test_a_pipe_with_nobody_at_its_other_end_is_refused(tmp_path):
+    for name in ('table.csv', 'chain.yaml'):
+        os.mkfifo(tmp_path / name)
+    with pytest.raises(InputError, match='is a pipe: give a file, or /dev/stdin'):
+        read_table(tmp_path / 'table.csv', 2)
+    with pytest.raises(ConfigError, match='is a pipe'):
+        load_chain(tmp_path / 'chain.yaml')
 
 
 def test_a_file_larger_than_any_table_is_refused_before_it_is_read(tmp_path):

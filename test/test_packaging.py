@@ -78,7 +78,7 @@ def test_package_xml_names_everything_that_is_imported():
     package = ET.parse(ROOT / 'package.xml').getroot()
     declared = {element.text for element in package.iter('exec_depend')}
     # Extras of pip, imported only where they are used (setup.py).
-    declared |= {'rosbags', 'openpyxl', 'cv2', 'distributed', 'fsspec', 'pyarrow'}
+    declared |= {'rosbags', 'openpyxl', 'cv2', 'dask', 'distributed', 'fsspec', 'pyarrow'}
     declared |= {'argcomplete', 'pandas', 'rich', 'weasyprint'}
     keys = {'yaml': 'python3-yaml'}
     keys |= {

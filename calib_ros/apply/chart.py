@@ -114,7 +114,7 @@ def limit(slope: float, nights: float) -> float:
     def less(height: float) -> float:
         return float(np.log(run_length(slope, height) / nights))
 
-    high = 1.0
-    while less(high) < 0.0:
-        high *= 2.0
-    return float(optimize.brentq(less, 0.0, high, xtol=1e-4))
+    top = 1.0
+    while less(top) < 0.0:  # not far beyond: run lengths grow by powers of the height
+        top *= 2.0
+    return float(optimize.brentq(less, 1e-3, top, xtol=1e-4))

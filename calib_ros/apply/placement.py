@@ -104,18 +104,9 @@ def place(
         When the region is empty, or the arm reaches all poses of the task nowhere in it.
 
     """
-    if aim not in AIMS:
-        raise UnknownNameError('aim', aim, AIMS)
-    if region is not None and not (region[0] <= region[1]).all():
-        raise InputError(
-            f'the region from {region[0].tolist()} to {region[1].tolist()} is empty: give the '
-            'lower corner first'
-        )
     search = _Search(arm, task, aim, model)
-    corners = search.reach if region is None else region
-    axes = [np.linspace(low, high, cells) for low, high in corners.T]
-    angles = 2.0 * np.pi * np.arange(turns) / turns
-    grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
+    corners = search.within(region)
+    grid = _grid(corners, cells, turns)
     errors, joints = search.errors(grid)
     reached = ~np.isnan(errors)
     if not reached.any():
@@ -123,9 +114,7 @@ def place(
             f'the arm reaches all {len(task)} poses of the task at none of {len(grid)} '
             'placements: check the unit (m), the orientation and the region, or use more cells'
         )
-    middle = grid[reached, :3].mean(axis=0)
-    distance = np.linalg.norm(grid[:, :3] - middle, axis=1)
-    centre = int(np.where(reached, distance, np.inf).argmin())
+    centre = _central(grid[:, :3], reached)
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
     for _ in range(REFINEMENTS):
         step = 0.5 * step
@@ -139,6 +128,19 @@ def place(
     return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
 
 
+def _grid(corners: FloatArray, cells: int, turns: int) -> FloatArray:
+    """Return placements (M, 4), evenly spread between corners (2, 3)."""
+    axes = [np.linspace(low, high, cells) for low, high in corners.T]
+    angles = 2.0 * np.pi * np.arange(turns) / turns
+    return np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
+
+
+def _central(positions: FloatArray, reached: NDArray[np.bool_]) -> int:
+    """Return which of positions (M, 3) is nearest to the middle of those that are reached (M,)."""
+    distance = np.linalg.norm(positions - positions[reached].mean(axis=0), axis=1)
+    return int(np.where(reached, distance, np.inf).argmin())
+
+
 def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:
     """Return the placements (26, 4) a step (3,) away from the best (4,), within corners (2, 3)."""
     steps = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
@@ -150,13 +152,26 @@ class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad]."""
 
     def __init__(self, arm: Calibration, task: FloatArray, aim: Aim, model: Model) -> None:
+        if aim not in AIMS:
+            raise UnknownNameError('aim', aim, AIMS)
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
         self._chain = arm.commanded_by(model)
         self._base = self._chain.frame('base').matrix
         self._known = self._chain.random_joints(KNOWN_POSES, np.random.default_rng(0))
         poses = in_base(self._chain, self._known)
         self._tree = cKDTree(_features(poses))
-        self.reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
+        self._reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
+
+    def within(self, region: FloatArray | None) -> FloatArray:
+        """Return the corners (2, 3) [m] of the region, or of all that the arm reaches."""
+        if region is None:
+            return self._reach
+        if not (region[0] <= region[1]).all():
+            raise InputError(
+                f'the region from {region[0].tolist()} to {region[1].tolist()} is empty: give the '
+                'lower corner first'
+            )
+        return region
 
     def errors(self, placements: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n)."""

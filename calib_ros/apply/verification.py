@@ -161,15 +161,12 @@ def verify(
         Largest RMS position error [m] that will do; without one there is no verdict.
     confidence : float
         Of the verdict.
-    new_base : bool
-        The measuring device stands elsewhere than for the calibration: its frame is fitted, which
-        costs the freedom of two configurations.
+    new_base, new_tool : bool
+        The measuring device stands elsewhere than for the calibration; another target is on the
+        flange, or the same was mounted anew. Their frames are fitted, which costs freedom (LOST).
     commanded : (M, n), optional
         Joint values [rad or m] of the program before its correction: the nominal arm means there
         what is wanted. The nearest belongs to a measurement.
-    new_tool : bool
-        Another target is on the flange than for the calibration, or the same was mounted anew: its
-        frame is fitted, which costs the freedom of one configuration.
 
     Raises
     ------
@@ -178,40 +175,17 @@ def verify(
         know, or measurements far from all that was commanded.
 
     """
-    if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
-        raise ConfigError(
-            'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
-            f'{tolerance} and {confidence}'
-        )
-    for each in sets:
-        _check(arm.chain, each)
-    before, after = arm.before, arm.chain
-    wanted = sets
-    if commanded is not None:
-        after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
-        wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
-    before, after = (
-        _in_new_frames(chain, each, new_base, new_tool)
-        for chain, each in ((before, sets), (after, wanted))
-    )
-    comparison = replace(compare(before, after, sets), after=compare(before, after, wanted).after)
+    _check(arm.chain, sets, tolerance, confidence)
+    fitted = ('base',) * new_base + ('tool',) * new_tool
+    comparison, left = _compared(arm, sets, commanded, fitted)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
-    fitted = ('base',) * new_base + ('tool',) * new_tool
-    count, lost = len(moments), sum(LOST[frame] for frame in fitted)
-    if count - lost < LEAST:
-        raise InputError(
-            f'{count} configurations were measured, at least {LEAST + lost} are needed: five are '
-            'usual (calib_ros plan --iso9283)'
-        )
+    lost = sum(LOST[frame] for frame in fitted)
     rms = _rms(moments, lost)
-    numbers = np.unique(np.geomspace(count, MOST, 200).astype(int))
+    numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
     lower, upper = rms_limits(rms, freedom_of(moments) * (numbers - lost), confidence)
     verdict, needed = _decided(tolerance, lower, upper, numbers)
-    common = 1.0
-    if not new_base:
-        shaped = compare(before, _rebased(after, wanted), wanted).after
-        common = _rms(moments_of(shaped.position, group), LOST['base']) / rms
+    common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
     return Verification(
         comparison,
         tolerance,
@@ -228,9 +202,35 @@ def verify(
     )
 
 
-def _rms(moments: FloatArray, lost: int) -> float:
-    """Return the RMS error [m] of configurations, some of which a fitted frame took up."""
-    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(len(moments) - lost, 1)))
+def _compared(
+    arm: Calibration,
+    sets: Sequence[Observations],
+    commanded: FloatArray | None,
+    fitted: tuple[str, ...],
+) -> tuple[Comparison, FloatArray]:
+    """Return the residuals, and those of position (N, 3) [m] without one motion that all share."""
+    before, after = arm.before, arm.chain
+    wanted = sets
+    if commanded is not None:
+        after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
+        wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
+    new_base, new_tool = ('base' in fitted), ('tool' in fitted)
+    before = _in_new_frames(before, sets, new_base, new_tool)
+    after = _in_new_frames(after, wanted, new_base, new_tool)
+    reached = compare(before, after, wanted).after
+    shaped = compare(before, _rebased(after, wanted), wanted).after
+    return replace(compare(before, after, sets), after=reached), shaped.position
+
+
+def _rms(moments: FloatArray, lost: int, least: int = LEAST) -> float:
+    """Return the RMS error [m] of configurations, some of which fitted frames took up."""
+    count = len(moments)
+    if count - lost < least:
+        raise InputError(
+            f'{count} configurations were measured, at least {least + lost} are needed: five are '
+            'usual (calib_ros plan --iso9283)'
+        )
+    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
 
 
 def _decided(
@@ -246,15 +246,23 @@ def _decided(
     return ('PASS' if upper[0] <= tolerance else 'FAIL'), needed
 
 
-def _check(chain: Chain, observations: Observations) -> None:
-    """Refuse measurements that the calibration says nothing about."""
-    if observations.distances is not None or observations.socket:
-        raise InputError('to verify, poses or positions must be measured, not distances')
-    if not {observations.base, observations.tool} <= set(chain.frame_names):
-        raise InputError(
-            f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
-            f'{observations.base} and {observations.tool}: measure with the same device and target'
+def _check(
+    chain: Chain, sets: Sequence[Observations], tolerance: float | None, confidence: float
+) -> None:
+    """Refuse limits that are none, and measurements that the calibration says nothing about."""
+    if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
+        raise ConfigError(
+            'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
+            f'{tolerance} and {confidence}'
         )
+    for each in sets:
+        if each.distances is not None or each.socket:
+            raise InputError('to verify, poses or positions must be measured, not distances')
+        if not {each.base, each.tool} <= set(chain.frame_names):
+            raise InputError(
+                f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
+                f'{each.base} and {each.tool}: measure with the same device and target'
+            )
 
 
 def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:

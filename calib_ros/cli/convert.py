@@ -80,7 +80,7 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     import numpy as np
 
-    from calib_ros.files.bags import Recording, write_bag
+    from calib_ros.files.recording import Recording, write_bag
     from calib_ros.files.tables import read_table
     from calib_ros.identification.observations import Observations
     from calib_ros.kinematics.chain_file import load_chain

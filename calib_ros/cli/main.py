@@ -11,7 +11,6 @@ not pass; 130 interrupted.
 from __future__ import annotations
 
 import argparse
-import errno
 import os
 import sys
 import textwrap
@@ -26,7 +25,7 @@ from calib_ros import __version__
 from calib_ros.cli.command import GROUPS, Command, commands
 from calib_ros.cli.kinds import proposal
 from calib_ros.cli.screen import WIDTH, Screen
-from calib_ros.errors import CalibrationError, UnknownNameError, shortened
+from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
 
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
@@ -36,13 +35,6 @@ WAY = (
     ('calib_ros verify new.csv --chain ur10e --calibration result/', ''),
     ('calib_ros compensate program.csv --chain ur10e --calibration result/ ...', ''),
 )
-ADVICE = {
-    errno.ENOSPC: 'the disk is full: make room, or write to another place',
-    errno.EDQUOT: 'your share of the disk is full: make room, or write to another place',
-    errno.EROFS: 'it cannot be written to: choose another place',
-    errno.EACCES: 'you may not do that there: choose another place, or ask its owner',
-    errno.EMFILE: 'too many files are open: close programs, or raise the limit (ulimit -n)',
-}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _failed('there is not enough memory: give less data, or close other programs')
     except OSError as err:
-        advice = ADVICE.get(err.errno or 0)
+        advice = advice_on(err)
         return _failed(f'{err}; {advice}' if advice else str(err))
     except CalibrationError as err:
         return _failed(str(err))

@@ -90,7 +90,7 @@ def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> P
     import numpy as np
 
     from calib_ros.apply.simulation import Cell, drive, faulty, measure
-    from calib_ros.files.bags import Recording, write_bag
+    from calib_ros.files.recording import Recording, write_bag
     from calib_ros.kinematics.chain_file import dump_chain
 
     if options.poses < 1 or options.seed < 0:

@@ -1,34 +1,19 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings: bag to session, and synthetic or tabulated measurements to bag."""
+"""Recordings: bag to session."""
 
 from __future__ import annotations
 
 import itertools
 import re
-import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cache, partial
-from mmap import ACCESS_READ, mmap
-from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from calib_ros.atomic import whole_folder, write_file
 from calib_ros.errors import InputError, UnknownNameError, shortened
-from calib_ros.files.mcap import (
-    LARGEST_CHUNK,
-    LARGEST_RATIO,
-    logged,
-    unindexed,
-    unpacked,
-    unpacked_size,
-)
 from calib_ros.files.salvage import (
     NOT_CLOSED,
     Salvage,
@@ -38,35 +23,23 @@ from calib_ros.files.salvage import (
     salvage,
     unpacked_files,
 )
-from calib_ros.identification.observations import Observations
+from calib_ros.files.stored import LARGEST_MESSAGE, read
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import VALIDATION
 from calib_ros.sampling.topics import Reading, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
-    from rosbags.rosbag2 import Reader
 
-STORAGES = ('sqlite3', 'mcap')
-STORAGE = ('chunks', 'connections', 'path')
-TIMES = ('message_start_time', 'message_end_time')
-CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompressed_size')
-"""What the library does not promise: without them, it is asked for the messages itself."""
 BATCH = 2000
 """Messages that are decoded at once."""
 PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-LARGEST_MESSAGE = 65_536
-"""Bytes of a message; a joint state of a thousand joints has fewer."""
 ALLOW = 'take the rest all the same with --largest-loss'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|is there already')
-STAND_NS = 400_000_000
-"""Time for which the arm stands at each row of a table that is made into a bag."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +116,7 @@ def _replay(
     path: Path, folder: Path, session: CalibrationSession, told: Callable[[float], None]
 ) -> Replayed:
     """Feed the files in a folder, which are those of a bag or were unpacked from it."""
-    library = _rosbag2()
+    library = rosbag2()
     try:
         check(folder)
         reader = library.Reader(folder)
@@ -206,7 +179,7 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
     """
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
-    library, deserialise = _rosbag2(), _deserialiser({})
+    library, deserialise = rosbag2(), _deserialiser({})
     with unpacked_files(path) as folder:
         try:
             check(folder)
@@ -271,98 +244,7 @@ def _check_links(streams: Mapping[str, Stream]) -> None:
         raise InputError('; '.join(problems))
 
 
-def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-    """Return the messages of an open bag on some topics, in the order in which they were logged.
-
-    Those of mcap files come chunk by chunk, merged where chunks overlap in time, and as they
-    stand in the file where it has none. All others come as the library reads them.
-    """
-    storage = getattr(reader, 'storage', None)
-    storages = getattr(storage, 'storages', [storage])
-    if not all(map(_is_known, storages)):
-        connections = [c for c in reader.connections if c.topic in streams]
-        return (
-            (streams[c.topic], data)
-            for c, _, data in reader.messages(connections)
-            if c.msgtype == streams[c.topic].type
-        )
-    found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
-    if reader.compression_mode == 'message':
-        return ((stream, unpacked(data, 'zstd', LARGEST_MESSAGE)) for stream, data in found)
-    return found
-
-
-def _is_known(storage: Any) -> bool:
-    """Return whether it is a database, or an mcap file with what is needed of its index."""
-    if hasattr(storage, 'dbconn'):
-        return True
-    if not all(hasattr(storage, name) for name in STORAGE):
-        return False
-    return all(hasattr(each, name) for each in storage.chunks for name in CHUNK)
-
-
-def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-    """Yield the messages of a file; what is wrong with a chunk is raised at the end."""
-    wanted = [
-        each
-        for each in storage.connections
-        if each.topic in streams and each.msgtype == streams[each.topic].type
-    ]
-    channels = {each.id: streams[each.topic] for each in wanted}
-    if hasattr(storage, 'dbconn'):
-        if wanted:
-            yield from ((channels[c.id], data) for c, _, data in storage.messages(wanted))
-        return
-    with storage.path.open('rb') as file:
-        if not storage.chunks:
-            with closing(mmap(file.fileno(), 0, access=ACCESS_READ)) as content:
-                yield from unindexed(content, channels)
-            return
-        left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
-        problem: Exception | None = None
-        for overlapping in _together(storage.chunks, channels):
-            found: list[tuple[int, Stream, bytes]] = []
-            for chunk in overlapping:
-                file.seek(chunk.chunk_start_offset)
-                try:
-                    data = file.read(chunk.chunk_length)
-                    left -= unpacked_size(data)
-                    if left < 0:
-                        raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
-                    messages, wrong = logged(data, channels)
-                except Exception as err:  # see `replay`
-                    messages, wrong = [], err
-                found += messages
-                problem = wrong or problem
-            if len(overlapping) > 1:
-                found.sort(key=itemgetter(0))
-            yield from ((stream, data) for _, stream, data in found)
-    if problem is not None:
-        raise problem
-
-
-def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
-    """Yield chunks that hold messages on some channels, those that overlap in time together.
-
-    As far as they fit into memory; messages may come in any order.
-    """
-    together: list[Any] = []
-    end = size = 0
-    for chunk in sorted(chunks, key=attrgetter('message_start_time', 'chunk_start_offset')):
-        counts = chunk.channel_count  # empty where the recorder wrote no index of messages
-        if counts and not any(counts.get(key) for key in channels):
-            continue
-        size += chunk.uncompressed_size
-        if together and (chunk.message_start_time >= end or size > LARGEST_CHUNK):
-            yield sorted(together, key=attrgetter('chunk_start_offset'))
-            together, end, size = [], 0, chunk.uncompressed_size
-        together.append(chunk)
-        end = max(end, chunk.message_end_time)
-    if together:
-        yield sorted(together, key=attrgetter('chunk_start_offset'))
-
-
-def _rosbag2() -> Any:
+def rosbag2() -> Any:
     """Return the library that reads and writes bags; nothing but bags needs it.
 
     Raises
@@ -383,7 +265,7 @@ def _rosbag2() -> Any:
 
 
 @cache
-def _typestore() -> Any:
+def typestore() -> Any:
     """Return the library's message types, which take a tenth of a second that few bags need."""
     from rosbags.typesys import Stores, get_typestore
 
@@ -393,7 +275,7 @@ def _typestore() -> Any:
 def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     """Return what makes messages of bytes, also of types that a bag itself defines."""
     if not defined:
-        return lambda data, kind: _typestore().deserialize_cdr(data, kind)
+        return lambda data, kind: typestore().deserialize_cdr(data, kind)
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -444,107 +326,3 @@ def _feed(
         told(count)
     session.finish()
     return count, problem
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What to write into a bag: joint samples (M, n), poses (N) and which of those judge only."""
-
-    joint_names: tuple[str, ...]
-    joint_stamps_ns: NDArray[np.int64]
-    joints: FloatArray
-    poses: Observations
-    held_out: NDArray[np.bool_]
-
-    @classmethod
-    def of_dwells(
-        cls,
-        joint_names: tuple[str, ...],
-        observations: Observations,
-        held_out: NDArray[np.bool_],
-    ) -> Recording:
-        """Turn a table into a recording: the arm stands for a while at every row."""
-        count = len(observations)
-        begin = (1 + np.arange(count)[:, np.newaxis]) * 1_000_000_000
-        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 4)
-        return cls(
-            joint_names,
-            stamps.ravel(),
-            np.repeat(observations.joints, stamps.shape[1], axis=0),
-            observations.at(begin.ravel() + STAND_NS * 3 // 4),
-            held_out,
-        )
-
-
-def write_bag(
-    path: Path,
-    recording: Recording,
-    storage: str = 'mcap',
-    beside: Mapping[Path, str] | None = None,
-) -> None:
-    """Write a recording as a rosbag2 folder, in the order of the stamps, as a whole or not at all.
-
-    Topics: /joint_states, and /measured_pose or /measured_point; /validation_pose or
-    /validation_point for held-out poses. Files `beside` the bag are there before it is.
-
-    Raises
-    ------
-    InputError
-        When there is something at the path already.
-    OSError
-        When it cannot be written, because the disk is full say.
-
-    """
-    with whole_folder(path) as folder:
-        try:
-            _write_bag(folder, recording, storage)
-        except (OSError, sqlite3.Error) as err:
-            raise OSError(f'cannot write {path}: {err}') from err
-        for file, text in (beside or {}).items():
-            write_file(file, text, overwrite=True)
-
-
-def _write_bag(path: Path, recording: Recording, storage: str) -> None:
-    library = _rosbag2()
-    store = _typestore()
-    types = store.types
-    time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
-    joint_state, poses = types[JOINT_STATE], recording.poses
-    oriented = bool(poses.oriented.all())
-    kind = f'geometry_msgs/msg/{"PoseStamped" if oriented else "PointStamped"}'
-    noun = 'pose' if oriented else 'point'
-    none = np.zeros(0)
-    quats = to_quat(poses.rotations)
-
-    def head(stamp_ns: int, frame_id: str) -> Any:
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        return header(time(sec=seconds, nanosec=nanoseconds), frame_id)
-
-    def measured(k: int, stamp_ns: int) -> Any:
-        point = types['geometry_msgs/msg/Point'](*poses.positions[k].tolist())
-        if not oriented:
-            return types[kind](head(stamp_ns, 'tracker'), point)
-        turn = types['geometry_msgs/msg/Quaternion'](*quats[k].tolist())
-        pose = types['geometry_msgs/msg/Pose'](point, turn)
-        return types[kind](head(stamp_ns, 'tracker'), pose)
-
-    stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
-    names = list(recording.joint_names)
-    plugin = library.StoragePlugin[storage.upper()]
-    with library.Writer(path, version=9, storage_plugin=plugin) as writer:
-        joint_connection = writer.add_connection('/joint_states', JOINT_STATE, typestore=store)
-        pose_connections = [
-            writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)
-            for prefix in ('measured_', VALIDATION)[: 1 + int(recording.held_out.any())]
-        ]
-        for k in np.argsort(stamps, kind='stable').tolist():
-            stamp_ns = int(stamps[k])
-            if k < len(recording.joints):
-                values = np.ascontiguousarray(recording.joints[k])
-                message = joint_state(head(stamp_ns, ''), names, values, none, none)
-                data = store.serialize_cdr(message, JOINT_STATE)
-                writer.write(joint_connection, stamp_ns, data)
-                continue
-            k -= len(recording.joints)
-            data = store.serialize_cdr(measured(k, stamp_ns), kind)
-            writer.write(pose_connections[int(recording.held_out[k])], stamp_ns, data)

@@ -113,12 +113,14 @@ class _Bulk:
         _require(position is None or not np.isnan(position[placed]).any())
         quat = self._values(QUATERNION) if self._header & set(QUATERNION) else None
         oriented = np.zeros(count, bool)
-        rotations = np.tile(np.eye(3), (count, 1, 1))
-        if quat is not None:
-            oriented = placed & ~np.isnan(quat).all(axis=1)
-            lengths = np.linalg.norm(quat[oriented], axis=1)
-            _require((np.abs(lengths - 1.0) <= QUATERNION_TOLERANCE).all())
-            rotations[oriented] = se3.from_quat(quat[oriented])
+        if quat is None:
+            quat = np.zeros((count, 4))
+        else:
+            oriented = placed & ~np.isnan(quat[:, 0])
+            lengths = np.sqrt(np.einsum('ni,ni->n', quat, quat))
+            _require((np.abs(lengths - 1.0) <= QUATERNION_TOLERANCE)[oriented].all())
+        quat[~oriented] = (0.0, 0.0, 0.0, 1.0)
+        rotations = se3.from_quat(quat)
         covariance = self._covariance(placed, oriented)
         device, target = self._codes('device'), self._codes('target')
         frame_id = self._codes('frame_id')
@@ -151,12 +153,13 @@ class _Bulk:
         fitted: list[Observations] = []
         held_out: list[Observations] = []
         for (base, tool, distance, _, eye, test), members in groups.items():
-            which = np.flatnonzero(np.isin(number, members))
+            where = np.flatnonzero(np.isin(number, members))
+            which = slice(None) if len(where) == count else where
             some = covariance is not None and not np.isnan(covariance[which, 0, 0]).all()
             found = Observations(
                 stamps[which],
                 self._joints[which],
-                np.zeros((len(which), 3)) if position is None or distance else position[which],
+                np.zeros((len(where), 3)) if position is None or distance else position[which],
                 rotations[which],
                 oriented[which],
                 covariance[which] if covariance is not None and some else None,
@@ -164,7 +167,7 @@ class _Bulk:
                 self._distance[which, 0] if self._distance is not None and distance else None,
                 self._optional(self._velocity, which),
                 self._optional(self._acceleration, which),
-                np.zeros(len(which))
+                np.zeros(len(where))
                 if self._delay is None
                 else np.nan_to_num(self._delay[which, 0]),
                 base=base,
@@ -305,7 +308,7 @@ class _Bulk:
 
     @staticmethod
     def _optional(
-        values: FloatArray | None, which: NDArray[np.intp], sign: bool = False
+        values: FloatArray | None, which: NDArray[np.intp] | slice, sign: bool = False
     ) -> FloatArray | None:
         """Return the values of some rows, zeros where there is none; None where all are none."""
         if values is None or np.isnan(values[which]).all():

@@ -19,7 +19,14 @@ import numpy as np
 from calib_ros.apply.program import Program
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_lines, parse_yaml, read_text
+from calib_ros.texts import (
+    LARGEST_TABLE,
+    LARGEST_TEXT,
+    MOST_ROWS,
+    csv_lines,
+    parse_yaml,
+    read_text,
+)
 from calib_ros.values import parse_number, parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
@@ -66,6 +73,8 @@ def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
         raise InputError(f'cannot read {where}: {err}') from err
     if len(lines) < 2:
         raise InputError(f'{where} has no rows')
+    if len(lines) > MOST_ROWS + 1:
+        raise InputError(f'{where} has more than {MOST_ROWS} rows: cut the program into parts')
     (_, header), *rows = lines
     names = [f'q{k + 1}' for k in range(len(joints))]
     for name in names:

@@ -158,20 +158,24 @@ def vendor_files(
         if layouts[0] is None or layouts[1] is None or not vendor.has_layout(layouts[0][0]):
             continue
         places, reference = layouts[1]
-        q = chain.random_joints(POSES, np.random.default_rng(0))
-        shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
-        lost = float(np.linalg.norm(shift, axis=1).max())
-        content = head(chain, 'kinematics', lost, table_hash(chain)) + _document(
-            vendor, places, origin, checksum
-        )
-        difference = float(np.abs(forward_of(content, vendor, q) - reference.forward(q)).max())
-        if not difference <= EXACT:
-            raise ExportError(
-                f'{vendor.file}, read back, differs from the calibration by {difference:.3g} m or '
-                'more in rotation: it is not written'
-            )
-        found.append(Export(vendor.file, content, lost))
+        document = _document(vendor, places, origin, checksum)
+        found.append(_checked(vendor, chain, arm, reference, document))
     return tuple(found)
+
+
+def _checked(vendor: Vendor, chain: Chain, arm: Chain, reference: Chain, document: str) -> Export:
+    """Return the file of an arm, read back and compared with the chain that it stands for."""
+    q = chain.random_joints(POSES, np.random.default_rng(0))
+    shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
+    lost = float(np.linalg.norm(shift, axis=1).max())
+    content = head(chain, 'kinematics', lost, table_hash(chain)) + document
+    difference = float(np.abs(forward_of(content, vendor, q) - reference.forward(q)).max())
+    if not difference <= EXACT:
+        raise ExportError(
+            f'{vendor.file}, read back, differs from the calibration by {difference:.3g} m or '
+            'more in rotation: it is not written'
+        )
+    return Export(vendor.file, content, lost)
 
 
 def forward_of(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:

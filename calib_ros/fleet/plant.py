@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from datetime import date, datetime, timezone
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ class Robot:
     largest_loss: float = 0.1
     since: datetime | None = None
 
-    @property
+    @cached_property
     def settings_hash(self) -> str:
         """Return the hash of what a result depends on besides the measurements."""
         return settings_hash(self.chain, self.settings, self.largest_loss)

@@ -176,6 +176,7 @@ def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, foun
 def _client(cluster: Cluster) -> Iterator[Any]:
     """Yield a client of the workers; those of this machine end with it."""
     try:
+        import dask
         from distributed import Client, LocalCluster
     except ImportError:
         raise ConfigError(MISSING) from None
@@ -183,6 +184,7 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         if cluster.address:
             where: Any = cluster.address
         else:
+            stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
             where = stack.enter_context(
                 LocalCluster(
                     n_workers=cluster.workers or None,
@@ -223,23 +225,19 @@ def _done(
     running: dict[str, Task] = {}
 
     def submitted(count: int) -> list[Any]:
-        futures = []
-        for task in islice(waiting, count):
-            future = client.submit(work, task, pure=False)
-            running[future.key] = task
-            futures.append(future)
-        return futures
+        chosen = list(islice(waiting, count))
+        futures = client.map(work, chosen, pure=False) if chosen else []
+        running.update(zip((future.key for future in futures), chosen, strict=True))
+        return list(futures)
 
     ahead = AHEAD * max(1, len(client.nthreads()))
     completed = as_completed(submitted(ahead), client.loop, with_results=True, raise_errors=False)
     for future, result in completed:
         if future.status in ('cancelled', 'lost'):
-            raise LostError(
-                'the scheduler is lost: what was done is filed, start again for the rest'
-            )
-        for more in submitted(1):
-            completed.add(more)
+            raise LostError('the scheduler is lost: results so far are filed, run again')
         task = running.pop(future.key)
+        if len(running) <= ahead // 2:  # many at once cost the scheduler less
+            completed.update(submitted(ahead - len(running)))
         if future.status == 'error':
             result = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
         yield task, result

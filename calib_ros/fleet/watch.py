@@ -14,8 +14,9 @@ An arm is bumped at one joint, not at all of them. That joint j alone changed, b
 
 explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution where nothing
 changed: as many degrees of freedom as j has parameters, over those of the noise. s^2 is by how
-much the nights so far scatter more than their covariances tell, where they clearly do: what warms
-up, what the model lacks. After a change all begins anew.
+much the nights so far scatter more than their covariances tell, where they clearly do, or by how
+much more j leaves of the difference: what warms up, what the model lacks. `changes.py` names what
+changed, and all begins anew.
 """
 
 from __future__ import annotations
@@ -24,12 +25,21 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
 
 from calib_ros.files.rows import Row
+from calib_ros.identification.changes import (
+    DOUBT,
+    Columns,
+    Explanation,
+    Told,
+    explanations,
+    reason_in_words,
+)
+from calib_ros.identification.region import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -38,14 +48,9 @@ LAGS = (1, 2, 4, 8)
 YEARS = 100.0
 """Time between false alarms of a robot, of one night each day."""
 DAYS = 365.25
-TWIN = 20.0
-"""Odds from which on one joint is told from another."""
-SHOWN = 3.0
-"""A parameter of the joint that changed by so many of its standard deviations is named."""
-KNOWN = 1e9
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Change:
     """An arm that is another one than before.
 
@@ -53,33 +58,25 @@ class Change:
     ----------
     time : datetime
         Of the first night after it.
-    joint : str
-    others : tuple of str
-        Joints that explain it about as well.
-    parts : tuple of (str, float, float)
-        Parameters of the joint that changed, by how much and its standard deviation [m or rad].
     seen : datetime
-        The night in which it was found.
+        Of the night in which it was found.
+    reasons : tuple of Explanation
+        What may have changed, the likeliest first: they cannot be told apart.
 
     """
 
     time: datetime
-    joint: str
-    others: tuple[str, ...]
-    parts: tuple[tuple[str, float, float], ...]
     seen: datetime
+    reasons: tuple[Explanation, ...]
+
+    @property
+    def joint(self) -> str:
+        """Return the joint that changed, most likely."""
+        return self.reasons[0].owner
 
     def __str__(self) -> str:
         """Return it in words."""
-        parts = ', '.join(
-            f'{name} by {1e3 * size:+.3f} ± {1e3 * sigma:.3f} '
-            f'{"mm" if Parameter(name).is_length else "mrad"}'
-            for name, size, sigma in self.parts
-        )
-        others = (
-            f' (or {", ".join(self.others)}: they cannot be told apart)' if self.others else ''
-        )
-        return f'{self.joint}{others} changed, {parts}: was it bumped?'
+        return f'{reason_in_words(self.reasons)}: was it bumped?'
 
 
 class Night(NamedTuple):
@@ -111,7 +108,7 @@ def watch(rows: Sequence[Row], since: datetime | None = None, years: float = YEA
         return Watched((), (), left_out)
     joints = {joint['name'] for joint in json.loads(alike[0].chain)['joints']}
     own = [k for k, name in enumerate(wanted) if Parameter(name).owner in joints]
-    names = tuple(wanted[k] for k in own)
+    names = tuple(Parameter(wanted[k]) for k in own)
     data = _Data(
         names,
         np.array([row.offsets[own] for row in alike]),
@@ -133,7 +130,10 @@ def watch(rows: Sequence[Row], since: datetime | None = None, years: float = YEA
         k = int(alarms[0])
         lag = int(tests.chances[:, k].min(axis=1).argmin())
         first, known_up_to = k + 1 - LAGS[lag], k + 1
-        changes.append(data.change(tests, lag, k, alike[first].time, alike[k].time))
+        columns = Columns(alike[k].corrected(), data.names)
+        found = explanations(data.told(tests, lag, k), columns, float(data.freedom[k]))
+        reasons = tuple(each for each in found if each.share > DOUBT) or found[:1]
+        changes.append(Change(alike[first].time, alike[k].time, reasons))
     nights = tuple(
         Night(row, dict(zip(data.joints, values, strict=True)))
         for row, values in zip(alike, strengths.tolist(), strict=True)
@@ -158,14 +158,14 @@ class _Data:
 
     def __init__(
         self,
-        names: tuple[str, ...],
+        names: tuple[Parameter, ...],
         values: FloatArray,
         information: FloatArray,
         freedom: FloatArray,
     ) -> None:
-        self._names, self._values, self._information = names, values, information
-        self._freedom = freedom
-        owners = [Parameter(name).owner for name in names]
+        self.names, self.freedom = names, freedom
+        self._values, self._information = values, information
+        owners = [name.owner for name in names]
         self.joints = tuple(dict.fromkeys(owners))
         self._groups = [
             np.array([k for k, owner in enumerate(owners) if owner == joint])
@@ -193,8 +193,9 @@ class _Data:
             moved -= np.einsum('kpr,kr->kp', before, pulled[ends - lag])
             inverse = np.linalg.inv(after + before)
             force = np.einsum('kpr,kr->kp', inverse, moved)
+            whole_of = np.einsum('kp,kp->k', moved, force)
             if lag == 1:
-                scatter[first + ends] = np.einsum('kp,kp->k', moved, force) / size
+                scatter[first + ends] = whole_of / size
             nights = first + ends
             usual = np.array([self._usual(scatter[first + 1 : k + 1 - lag]) for k in nights])
             weight[number, nights] = inverse / usual[:, np.newaxis, np.newaxis]
@@ -202,36 +203,24 @@ class _Data:
             for j, group in enumerate(self._groups):
                 part = inverse[:, group[:, np.newaxis], group]
                 found = np.linalg.solve(part, force[:, group, np.newaxis])[..., 0]
-                gain = np.einsum('kp,kp->k', found, force[:, group]) / usual / len(group)
-                chances[number, nights, j] = special.fdtrc(len(group), self._freedom[nights], gain)
+                gain = np.einsum('kp,kp->k', found, force[:, group])
+                others = max(1, size - len(group))
+                left = _clearly((whole_of - gain) / others, others)
+                gain /= np.maximum(usual, left) * len(group)
+                chances[number, nights, j] = special.fdtrc(len(group), self.freedom[nights], gain)
         return _Tests(chances, pull, weight)
 
     def _usual(self, scatter: FloatArray) -> float:
         """Return how much nights scatter, by their covariances; 1 where these may be right."""
         if not scatter.size:
             return 1.0
-        middle = float(np.median(scatter))
-        error = np.sqrt(np.pi / (len(self._names) * scatter.size))  # of a median, in normal terms
-        return middle if middle > 1.0 + 2.0 * error else 1.0
+        return float(_clearly(np.median(scatter), len(self.names) * scatter.size))
 
-    def change(self, tests: _Tests, lag: int, k: int, time: datetime, seen: datetime) -> Change:
-        """Return the change that was found by a lag at a night."""
-        chances = tests.chances[lag, k]
-        best = int(chances.argmin())
-        gains = -2.0 * np.log(np.maximum(chances, 1e-300))
-        others = [
-            joint
-            for j, joint in enumerate(self.joints)
-            if j != best and gains[best] - gains[j] < 2.0 * np.log(TWIN)
-        ]
-        group = self._groups[best]
-        covariance = np.linalg.inv(tests.weight[lag, k][np.ix_(group, group)])
-        sizes, sigmas = covariance @ tests.pull[lag, k, group], np.sqrt(np.diag(covariance))
-        clear = np.abs(sizes) > SHOWN * sigmas
-        clear[np.argmax(np.abs(sizes) / sigmas)] = True
-        parts = tuple(
-            (self._names[p], float(size), float(sigma))
-            for p, size, sigma, yes in zip(group, sizes, sigmas, clear, strict=True)
-            if yes
-        )
-        return Change(time, self.joints[best], tuple(others), parts, seen)
+    def told(self, tests: _Tests, lag: int, k: int) -> Told:
+        """Return what a lag at a night tells about the change."""
+        return Told(self.names, tests.weight[lag, k], tests.pull[lag, k])
+
+
+def _clearly(ratio: FloatArray | np.floating[Any], freedom: int) -> FloatArray:
+    """Return what is clearly more than chance makes of 1 with so many degrees of freedom, or 1."""
+    return np.asarray(np.where(ratio > 1.0 + 2.0 * np.sqrt(2.0 / freedom), ratio, 1.0))

@@ -28,8 +28,10 @@ from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.robust import Robust, reweighted, thorough_fit
+from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 
 SOME = 500
 """Pairs that are enough for a first fit."""
@@ -219,3 +221,44 @@ def require_enough(problem: Problem, names: Sequence[str]) -> None:
             -(-len(names) // width),
             f'{width} equations each for {len(names)} parameters',
         )
+
+
+def parameter_rows(
+    problem: Problem,
+    chain: Chain,
+    structural: Sequence[str],
+    names: Sequence[str],
+    uncertainty: identifiability.Uncertainty,
+) -> tuple[ParameterRow, ...]:
+    """Return every parameter of a fitted chain, with its deviation where it was fitted."""
+    change = _to_values(chain, names)
+    variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
+    std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
+    freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
+    free = set(problem.free)
+    rows = []
+    for name in chain.parameter_names:
+        if name in std:
+            status = 'fitted'
+        elif name in structural:
+            status = 'not excited'
+        else:
+            status = 'gauge' if name in free else 'fixed'
+        offset = chain.offset(name, problem.model)
+        value, spread = chain.value(name), std.get(name)
+        rows.append(ParameterRow(name, value, offset, spread, status, freedom.get(name, np.inf)))
+    return tuple(rows)
+
+
+def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
+    """Return the derivative (P, P) of the values: of rotation vectors, where frames were turned.
+
+    A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
+    """
+    change = np.eye(len(names))
+    for frame in chain.frame_names:
+        index = [names.index(name) for name in parameters_of(frame)[3:] if name in names]
+        if len(index) == 3:
+            vector = chain.frame(frame).offsets()[3:]
+            change[np.ix_(index, index)] = left_jacobian_inverse(vector)
+    return change

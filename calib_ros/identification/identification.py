@@ -26,6 +26,7 @@ from calib_ros.identification.fitting import (
     Simpler,
     excited_names,
     fit_all,
+    parameter_rows,
     require_enough,
     some,
 )
@@ -49,8 +50,7 @@ from calib_ros.identification.validation import (
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame, as_html
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
@@ -266,20 +266,19 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     before = minimise(start, [n for n in names if start.owns_frame(n)], fitted.system)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
-    parameters = _parameters(problem, chain, structural, names, fitted.uncertainty)
+    parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)
     posterior = fitted.posterior(
         _size(fitted), considered(chain, names), rounding_errors(problem, coarse)
     )
-    step = find_step(problem, names, robust)
     found = Findings(
         converged=before.converged and robust.fit.converged and robust.settled,
         parameters=parameters,
         validation=validation,
         chance=_chance(problem, before.chain, names, robust),
         region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
-        step=step,
-        own_behaviour=arms_own(problem, robust) if step is None else None,
+        step=(step := find_step(problem, names, robust)),
+        own_behaviour=None if step else arms_own(problem, robust),
         may_be_rounding=bool(coarse)
         and may_be_rounding(problem, before.chain, names, coarse, robust.good),
     )
@@ -379,43 +378,3 @@ def _outliers(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
             stamp = int(each.stamps_ns[sample])
             found.append(Outlier(number, int(sample), stamp, float(distances[sample])))
     return tuple(found)
-
-
-def _parameters(
-    problem: Problem,
-    chain: Chain,
-    structural: Sequence[str],
-    names: Sequence[str],
-    uncertainty: identifiability.Uncertainty,
-) -> tuple[ParameterRow, ...]:
-    change = _to_values(chain, names)
-    variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
-    std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
-    freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
-    free = set(problem.free)
-    rows = []
-    for name in chain.parameter_names:
-        if name in std:
-            status = 'fitted'
-        elif name in structural:
-            status = 'not excited'
-        else:
-            status = 'gauge' if name in free else 'fixed'
-        offset = chain.offset(name, problem.model)
-        value, spread = chain.value(name), std.get(name)
-        rows.append(ParameterRow(name, value, offset, spread, status, freedom.get(name, np.inf)))
-    return tuple(rows)
-
-
-def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
-    """Return the derivative (P, P) of the values: of rotation vectors, where frames were turned.
-
-    A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
-    """
-    change = np.eye(len(names))
-    for frame in chain.frame_names:
-        index = [names.index(name) for name in parameters_of(frame)[3:] if name in names]
-        if len(index) == 3:
-            vector = chain.frame(frame).offsets()[3:]
-            change[np.ix_(index, index)] = left_jacobian_inverse(vector)
-    return change

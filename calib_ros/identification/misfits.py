@@ -21,12 +21,11 @@ from calib_ros.identification.drift import chance
 from calib_ros.identification.observations import STILL, stops
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust
+from calib_ros.identification.steps import BY_CHANCE
 from calib_ros.kinematics.se3 import FloatArray
 
 LEFT = 0.1
 """Share of a joint's range that is left without outliers, up to which only they move it."""
-BY_CHANCE = 1e-3
-"""Probability below which outliers of a device are not alike so much."""
 TOGETHER = 0.01
 """Probability below which several targets are not off at the same stops."""
 FEWEST, LEAST_STOPS = 4, 50

@@ -31,6 +31,7 @@ from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
 PAYS = 0.999
@@ -117,7 +118,9 @@ def choose_effects(
         harmonic = model.strongest_harmonic(chosen, progress)
         if harmonic is None:
             break
-        verdict = model.judge(chosen, harmonic, f'{harmonic[0].replace(".sin_", ", ")} per turn')
+        verdict = model.judge(
+            chosen, harmonic, f'{harmonic[0].owner}, {harmonic[0].effect[1]} per turn'
+        )
         found.append(verdict)
         if not verdict.pays:
             break
@@ -203,7 +206,7 @@ class _Linear:
 
     def strongest_harmonic(
         self, chosen: Sequence[str], progress: Callable[[str], None]
-    ) -> list[str] | None:
+    ) -> list[Parameter] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
         None where the strongest one of residuals moved in time often explains as much.

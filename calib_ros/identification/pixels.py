@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.samples import Samples, seen_residuals
+from calib_ros.identification.samples import BLOCK, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import View, at_the_board, require_lens, view
@@ -30,8 +30,6 @@ from calib_ros.kinematics.se3 import FloatArray
 
 BOUNDED = 3.0
 """Usual residuals that one point counts for at most in the sum of its image."""
-POINTS = 4096
-"""Points that are linearised at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +145,7 @@ class PixelSamples(Samples):
         yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
     def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Block]:
-        """Yield blocks of whole images with about POINTS points."""
+        """Yield blocks of whole images with about four BLOCKs of points."""
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
         lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
@@ -158,7 +156,7 @@ class PixelSamples(Samples):
         ends = np.append(self._begins, self.count)
         first = 0
         while first < len(self._begins):
-            last = max(int(np.searchsorted(ends, ends[first] + POINTS, 'right')) - 1, first + 1)
+            last = max(int(np.searchsorted(ends, ends[first] + 4 * BLOCK, 'right')) - 1, first + 1)
             images, part = self._begins[first:last], slice(int(ends[first]), int(ends[last]))
             approach = None if self.approach is None else self.approach[:, images]
             moving = None if velocity is None else velocity[:, images]

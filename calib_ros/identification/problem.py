@@ -112,6 +112,13 @@ class Problem(Shown):
                 raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
+        self._check_sets()
+        self._check_patterns()
+        self._check_effects()
+        if not self.free:
+            raise ConfigError('every parameter is fixed: nothing is left to identify')
+
+    def _check_sets(self) -> None:
         joints = len(self.chain.joints)
         for observations in (*self.sets, *self.judging):
             if observations.joints.shape[1:] != (joints,):
@@ -119,10 +126,17 @@ class Problem(Shown):
                     f'observations have {observations.joints.shape[1:]} joint values, chain '
                     f'"{self.chain.name}" has {joints} joints'
                 )
-
-        for observations in (*self.sets, *self.judging):
             if observations.pixels is not None:
                 require_lens(self.model.frame(observations.camera).lens, observations.camera)
+        sockets = {each.base for each in self.sets if each.socket}
+        for *pair, distance in self.separations:
+            for base in pair:
+                if base not in sockets:
+                    raise UnknownNameError('socket that is a known distance away', base, sockets)
+            if not distance > 0.0:
+                raise ConfigError(f'the distance of sockets must be positive, not {distance}')
+
+    def _check_patterns(self) -> None:
         names = self.model.parameter_names
         for pattern in (*self.fixed, *self.priors):
             if not fnmatch.filter(names, pattern):
@@ -130,6 +144,17 @@ class Problem(Shown):
         for pattern, sigma in self.priors.items():
             if not 0.0 < sigma < np.inf:
                 raise ConfigError(f'the prior of {pattern} must be a positive number, not {sigma}')
+        for pattern in self.priors:
+            if self._places(pattern):
+                raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
+        for pattern in self.fixed:
+            if self._places(pattern):
+                raise ConfigError(
+                    f'a frame is held as a whole: give it in the chain file with "fixed: true", '
+                    f'instead of fixing "{pattern}"'
+                )
+
+    def _check_effects(self) -> None:
         for name in self.effects:
             if not effects.resolve(self.chain, name):
                 raise ConfigError(
@@ -144,24 +169,6 @@ class Problem(Shown):
                 each.approach is None for each in self.sets
             ):
                 raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
-        for pattern in self.priors:
-            if self._places(pattern):
-                raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
-        sockets = {each.base for each in self.sets if each.socket}
-        for *pair, distance in self.separations:
-            for base in pair:
-                if base not in sockets:
-                    raise UnknownNameError('socket that is a known distance away', base, sockets)
-            if not distance > 0.0:
-                raise ConfigError(f'the distance of sockets must be positive, not {distance}')
-        for pattern in self.fixed:
-            if self._places(pattern):
-                raise ConfigError(
-                    f'a frame is held as a whole: give it in the chain file with "fixed: true", '
-                    f'instead of fixing "{pattern}"'
-                )
-        if not self.free:
-            raise ConfigError('every parameter is fixed: nothing is left to identify')
 
     def _places(self, pattern: str) -> bool:
         """Tell whether a pattern is that of the place of a frame, not of a lens there."""

@@ -21,8 +21,6 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, view
 from calib_ros.kinematics.se3 import FloatArray
 
-FEWEST = 4
-"""Points of a board that tell its pose."""
 FLAT = 1e-3
 """Thickness of a board, of its size, up to which it is flat."""
 IN_LINE = 1e-2
@@ -55,7 +53,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     first = np.flatnonzero(np.diff(index, prepend=-1))[good]
     if not len(good):
         raise InputError(
-            f'no image shows {FEWEST} points of the board that are not in line: nothing tells '
+            'no image shows 4 points of the board that are not in line: nothing tells '
             'where the camera is'
         )
     rows = observations.select(np.isin(index, good))
@@ -114,7 +112,7 @@ def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray
     outer = np.einsum('ni,nj->nij', rest, rest).reshape(-1, 9)
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins).reshape(-1, 3, 3))
-    return np.asarray((count >= FEWEST) & (spread[:, 1] > IN_LINE**2 * spread[:, 2]))
+    return np.asarray((count >= 4) & (spread[:, 1] > IN_LINE**2 * spread[:, 2]))
 
 
 def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:

@@ -31,6 +31,7 @@ from scipy import special
 
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.mistakes import NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -58,8 +59,6 @@ POSES = 24
 """Poses, spread evenly over those measured, that tell enough: of gravity, of all else."""
 ANOTHER = (2e-3, 5e-3)
 """Least offset [m, rad] of an arm that may be another one than the nominal."""
-NEARER = 0.3
-"""Ratio of the distances from which a shipped robot is named instead of the nominal one."""
 EXPLAINED = 0.5
 """Share of the residual squares that couplings explain, or that gravity must explain more."""
 

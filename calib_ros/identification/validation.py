@@ -200,6 +200,19 @@ def validate(
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
+    said = ', because all held-out samples are at such' if len(repeated) else ''
+    return _cross_validate(problem, before, after, names, robust, said)
+
+
+def _cross_validate(
+    problem: Problem,
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+    said: str,
+) -> tuple[Comparison | None, str]:
+    """Judge both chains on parts of the configurations that were left out in turn."""
     groups = problem.configurations
     count = len(np.unique(np.concatenate(groups)))
     rows = sum(
@@ -244,8 +257,7 @@ def validate(
             _joined([part.after for part in parts], whole, index),
             ~robust.outliers,
         ),
-        f'{folds}-fold cross-validation over {count} distinct configurations'
-        + (', because all held-out samples are at such' if len(repeated) else ''),
+        f'{folds}-fold cross-validation over {count} distinct configurations{said}',
     )
 
 

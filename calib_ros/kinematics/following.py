@@ -34,10 +34,9 @@ Flags = NDArray[np.bool_]
 
 BLOCK = 2048
 ITERATIONS = 50
-STEP = 1e-8
-"""An iteration has converged when no joint moves by more, in units of the largest change."""
 EXACT = 1e-8
-"""Errors [m, rad] below which a pose is reached."""
+"""Errors [m, rad] below which a pose is reached; steps below which it has converged, in units of
+the largest change."""
 EVEN = 1e-12
 """Share by which the cost may change and count as the same."""
 CAUTION = 1e-3
@@ -232,7 +231,7 @@ class Follower:
             step = solve_positive(normal, np.where(task.held | still, 0.0, slope))
             new = x + step
             found[:, active] = new
-            settled = still | (np.abs(step).max(axis=0) <= STEP)
+            settled = still | (np.abs(step).max(axis=0) <= EXACT)
             far = ~(settle | (np.einsum('ib,ib->b', new, new) <= 1.0))
             converged[active[settled & ~far]] = True
             going = np.flatnonzero(~settled & ~far)

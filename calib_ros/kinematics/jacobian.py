@@ -41,6 +41,7 @@ from calib_ros.kinematics.parameter import (
     parameters_of,
 )
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import Walk
 
 
 class ErrorModel:
@@ -121,7 +122,7 @@ class ErrorModel:
             behind = frames[layout.behind]
             behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
             behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
-        flat = frames.reshape(-1, 3, samples)
+        flat = frames.reshape(4 * len(frames), 3, samples)
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
         cross(axes, target[3] - flat[layout.points], levers[:-1])
@@ -138,14 +139,7 @@ class ErrorModel:
             turning = layout.driven < self.rotations
             turn[layout.driven[turning]] *= phi[turning, np.newaxis]
         if velocity is not None and layout.delay is not None:
-            rates = -walk.signs * velocity
-            turning = walk.turning
-            driven, points = frames[:count, 2], frames[:count, 3]
-            turn[layout.delay] = np.einsum('jb,jcb->cb', rates[turning], driven[turning])
-            moved = np.empty_like(driven)
-            cross(driven, target[3] - points, moved)
-            moved[~turning] = driven[~turning]
-            shift[layout.delay] = np.einsum('jb,jcb->cb', rates, moved)
+            turn[layout.delay], shift[layout.delay] = _twist(walk, velocity, frames, target[3])
         return target[:3], target[3], shift, turn
 
     def jacobian(
@@ -268,6 +262,21 @@ def _layout(
         _indices(row[name] for name in fitted),
         _indices(owners),
         row.get(Parameter(ends[0], DELAY)),
+    )
+
+
+def _twist(
+    walk: Walk, velocity: FloatArray, frames: FloatArray, origin: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a delay of one second would change: turn and shift (3, B) of a target there."""
+    rates, turning = -walk.signs * velocity, walk.turning
+    driven, points = frames[: len(rates), 2], frames[: len(rates), 3]
+    moved = np.empty_like(driven)
+    cross(driven, origin - points, moved)
+    moved[~turning] = driven[~turning]
+    return (
+        np.einsum('jb,jcb->cb', rates[turning], driven[turning]),
+        np.einsum('jb,jcb->cb', rates, moved),
     )
 
 

@@ -25,8 +25,6 @@ from calib_ros.kinematics.se3 import FloatArray
 
 NEAREST = 1e-6
 """Depth [m] up to which a point is taken to be in front of the camera."""
-UNDISTORTIONS = 20
-"""Steps in which the distortion is taken out."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class Lens:
         """Return (N, 2) the points at depth 1 of pixels (N, 2), by Newton steps."""
         centre, focal = np.array([self.cx, self.cy]), np.array([self.fx, self.fy])
         found = (pixels - centre) / focal
-        for _ in range(UNDISTORTIONS):
+        for _ in range(20):
             points = np.concatenate([found, np.ones((len(found), 1))], axis=1).T
             seen, by_point = self.project(points)
             matrices = by_point[:, :2].transpose(2, 0, 1)

@@ -17,7 +17,7 @@ from calib_ros.identification.changes import FALSE, reason_in_words
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.region import Region
-from calib_ros.identification.validation import Comparison, ErrorFigures
+from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_yaml
@@ -174,17 +174,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'not_excited': list(result.not_excited),
         'weakly_determined': list(weakly_determined(result)),
         'held_near_nominal': list(result.weak),
-        'parameters': {
-            p.name: {
-                'value': p.value,
-                'offset': p.offset,
-                'std': p.std,
-                'half_width_95': p.half_width(0.95),
-                'unit': p.name.unit,
-                'status': p.status,
-            }
-            for p in result.parameters
-        },
+        'parameters': {p.name: _parameter(p) for p in result.parameters},
         'fitted': comparison(result.fitted),
         'validation': None if validation is None else {'by': result.validated_by, **validation},
         'before_is': BEFORE,
@@ -209,6 +199,17 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'python': platform.python_version(),
             'numpy': np.__version__,
         },
+    }
+
+
+def _parameter(p: ParameterRow) -> dict[str, Any]:
+    return {
+        'value': p.value,
+        'offset': p.offset,
+        'std': p.std,
+        'half_width_95': p.half_width(0.95),
+        'unit': p.name.unit,
+        'status': p.status,
     }
 
 

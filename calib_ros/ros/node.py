@@ -39,7 +39,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, advice_on
 from calib_ros.files.archive import Archive
 from calib_ros.files.waypoints import read_joints
 from calib_ros.identification.calibration import Calibration
@@ -60,8 +60,9 @@ from calib_ros.ros.outputs import Exportable, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.problems import check_settings
 from calib_ros.sampling.sample import Sample, named
-from calib_ros.sampling.session import CalibrationSession, check_settings
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD, parse_sources
 
 TAKING_PERIOD = 0.1
@@ -482,8 +483,10 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Run the work of a service; an error is its answer. Who reads the log sees it, too."""
         try:
             success, text = work()
-        except (CalibrationError, OSError) as err:
+        except CalibrationError as err:
             success, text = False, str(err)
+        except OSError as err:
+            success, text = False, '; '.join(filter(None, (str(err), advice_on(err))))
         except Exception as err:
             self.get_logger().error(f'internal error: {traceback.format_exc()}')
             success, text = False, f'internal error, see the log: {err!r}'

@@ -13,13 +13,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.making import RESTLESS, VIBRATING, WIDTH, Maker
+from calib_ros.sampling.making import WIDTH, Maker
+from calib_ros.sampling.names import MOST_NAMES
+from calib_ros.sampling.rests import Rests
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, Slice, StreamKey
@@ -31,14 +34,8 @@ WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
-STILL = 6.0
-"""What `still` must be at least [noise of the joints] for a stop to show as one."""
-MOST_RESTS = 1000
-"""Rests in which no stop shows that are counted."""
-MOST_STREAMS = 50
-"""Streams of measurements that are told apart: a tracker may number its markers without end."""
-SOCKET_LOOKS = 11
-"""Joint values that are averaged while a ball sits in a socket."""
+MOST_STREAMS = MOST_NAMES
+"""Streams of measurements that are told apart: a tracker may number markers without end."""
 TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
 
 
@@ -64,16 +61,12 @@ class Collector:
         self._advanced_ns = 0  # that at the last round
         self._settled_ns = 0  # measurements before have been dealt with
         self._sampled_ns = 0  # a stop that stands at this moment has been sampled
-        self._stopped = 0  # how many stops were sampled
-        self._unseen: list[float] = []  # noise of the joints at rests in which no stop shows
-        self._rests = False
+        self.rests = Rests()
         self._backwards = 0
-        self.stamped_late_ns = round(settings.delay * 1e9)
-        """By how much measurements are known to be stamped late."""
-        self.delay_ns = self.stamped_late_ns
+        self.delay_ns = round(settings.delay * 1e9)
         """How much later than the joints' the stamps of measurements are."""
         self.holding = False
-        """True while nothing may be taken because the delay is being looked for."""
+        """True while the delay is being looked for, so that nothing may be taken."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
         self.unused: Counter[str] = Counter()
@@ -85,9 +78,7 @@ class Collector:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
 
-    def known(
-        self, now_ns: int | None
-    ) -> tuple[Stamps, FloatArray, list[tuple[Stamps, FloatArray]]]:
+    def known(self, now_ns: int | None) -> tuple[Stamps, FloatArray, list[Any]]:
         """Return stamps and joint values, and stamps and rows (N, WIDTH) of waiting positions.
 
         Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
@@ -114,14 +105,13 @@ class Collector:
         if len(late):  # one by one
             count = max(int(late[0]), 1)
         due = joints[stamps >= self._advanced_ns + ADVANCE_NS]
-        if len(due):
-            count = min(count, int(due[0]) + 1)
+        count = int(min([count, *(due[:1] + 1).tolist()]))
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
             room = self.track.room(columns)
             if room <= len(joints):
                 places = [each.places for each in given.pieces if each.key == columns]
                 full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
-                count = min([count, *(full + 1).tolist()])
+                count = int(min([count, *(full + 1).tolist()]))
         return count
 
     def take(self, given: Slice) -> bool:
@@ -168,18 +158,15 @@ class Collector:
         """Return the buffer of a stream; None when too many others are in use."""
         rows = self._waiting.get(key)
         if rows is None:
-            if len(self._waiting) >= MOST_STREAMS:
-                self._forget_idle()
+            if len(self._waiting) >= MOST_STREAMS:  # forget those without any use
+                idle = [key for key, rows in self._waiting.items() if not rows.count]
+                for each in idle:
+                    if not self.maker.has(each):
+                        del self._waiting[each]
             if len(self._waiting) >= MOST_STREAMS:
                 return None
             rows = self._waiting[key] = Rows(WIDTH, self.settings.pose_buffer)
         return rows
-
-    def _forget_idle(self) -> None:
-        """Forget the streams of which nothing waits and no sample was made."""
-        for key in [key for key, rows in self._waiting.items() if not rows.count]:
-            if not self.maker.has(key):
-                del self._waiting[key]
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
@@ -212,19 +199,6 @@ class Collector:
             return 'the arm stands and is sampled: move on'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
-    @property
-    def still_needed(self) -> float | None:
-        """Return what `still` must be at least where more rests passed unseen than not."""
-        if len(self._unseen) <= self._stopped:
-            return None
-        needed = STILL * float(np.median(self._unseen))
-        return needed if needed > self.settings.still else None
-
-    @property
-    def unrest(self) -> int:
-        """Return how many measurements at stops were not at rest."""
-        return self.dropped[VIBRATING] + self.dropped[RESTLESS]
-
     def capture(self, place: str = '') -> tuple[int, str]:
         """Take one sample of each stream now; return how many, and why not more in words.
 
@@ -247,7 +221,8 @@ class Collector:
             )
         begin = int(stands[-1, 0])
         if place:
-            stamps = np.linspace(begin + shortest, newest, SOCKET_LOOKS).astype(np.int64)
+            stamps = self.track.samples()[0]
+            stamps = stamps[stamps >= begin]
             self.maker.in_socket(place, stamps, self.track.at(stamps, standing=True))
             return 1, ''
         self._round(begin)  # a stop before is not waited for any longer
@@ -258,8 +233,6 @@ class Collector:
             self._sampled_ns = self._settled_ns = newest
         causes = ', '.join(dict.fromkeys(self.dropped - dropped))
         return count, '' if count else causes or 'no measurement within this stop'
-
-    # Rounds
 
     @property
     def _complete_ns(self) -> int:
@@ -315,7 +288,8 @@ class Collector:
         newest = self.track.newest_ns
         done = self._settled_ns
         stands = self.track.standing(settings.still, WINDOW)
-        self._look_for_rest(bool((np.diff(stands) >= shortest).any()))
+        found = bool((np.diff(stands) >= shortest).any())
+        self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS))
         for begin, end in stands.tolist():
             goes_on = end >= newest
             if ends_here:
@@ -349,13 +323,6 @@ class Collector:
                 self._sampled_ns = done
         return self._drop(done, until, 'the arm was moving')
 
-    def _look_for_rest(self, found: bool) -> None:
-        """Note the noise of the joints where they rest though no stop is `found`."""
-        noise = None if found else self.track.noise_at_rest(ADVANCE_NS)
-        before, self._rests = self._rests, noise is not None
-        if noise is not None and not before and len(self._unseen) < MOST_RESTS:
-            self._unseen.append(noise)
-
     def _drop(self, after: int, until: int, why: str) -> int:
         """Drop what was measured after a stamp and until another; return the latter."""
         for rows in self._waiting.values():
@@ -384,7 +351,7 @@ class Collector:
 
     def _average(self, begin: int, end: int) -> None:
         """Make one sample of each stream from what was measured in a stop."""
-        self._stopped += 1
+        self.rests.sampled += 1
         calm = begin + round(self.settings.settle * 1e9)
         for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns

@@ -12,6 +12,10 @@ A sample that lies too far from where the others predict it is left out as suspi
 ones cannot be judged so, because the estimate bends to them. So it begins anew, from the nominal
 chain and by the robust fit of the identification (`robust.py`), each time the number of samples
 has grown by a fifth: an early gross error is found, and what was left out wrongly comes back.
+
+The robust fit alone, each time on some hundred samples, would be less code, but it takes too long
+beside the messages: 0.05 s with 50 samples of a six-axis arm, 0.2 s with 100 to 300, 4 s with
+thirty targets. A sample costs the filter 0.02 s in the mean, all beginnings included.
 """
 
 from __future__ import annotations

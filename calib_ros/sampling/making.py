@@ -20,9 +20,9 @@ from calib_ros.sampling.slices import StreamKey
 from calib_ros.sampling.stops import RestlessError, average
 from calib_ros.sampling.track import Motion
 
-WIDTH = 43
 DISTANCE, POSITION = slice(0, 1), slice(0, 3)
-QUAT, COVARIANCE = slice(3, 7), slice(7, WIDTH)
+QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
+WIDTH = COVARIANCE.stop
 VIBRATING = 'poses: still vibrating, or a spike'
 RESTLESS = 'poses: a stop that spreads more than the noise'
 
@@ -151,6 +151,11 @@ class Maker:
         """Return the samples made since the last call."""
         fresh, self.fresh = self.fresh, []
         return fresh
+
+    @property
+    def unrest(self) -> int:
+        """Return how many measurements at stops were not at rest."""
+        return self.dropped[VIBRATING] + self.dropped[RESTLESS]
 
     def has(self, key: StreamKey) -> bool:
         """Tell whether there is a sample of a stream."""

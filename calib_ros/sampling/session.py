@@ -5,8 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -19,25 +18,25 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.account import Account
-from calib_ros.sampling.clocks import Clocks
-from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, Part
 from calib_ros.sampling.hints import Hint, restless, sparse
+from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
-from calib_ros.sampling.names import FrameNames, JointNames, strange
+from calib_ros.sampling.names import FrameNames, JointNames
+from calib_ros.sampling.problems import check_settings, problem_of
 from calib_ros.sampling.progress import progress
+from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import (
     SOCKETS,
     Frames,
     Sample,
     collect,
     named,
-    socket_pairs,
     socket_place,
 )
-from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
-from calib_ros.sampling.strays import STRAY, Gate
+from calib_ros.sampling.slices import POSES
+from calib_ros.sampling.strays import STRAY
 from calib_ros.sampling.track import APART
 from calib_ros.settings import Settings
 
@@ -49,23 +48,6 @@ ONE_FRAME = (
 )
 RECENT = 20
 """Samples that a check of the calibration in use looks at: a few stops of daily work."""
-LEAST_FAR = 1.0
-"""Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
-what has not come yet; joint states up to `max_gap` apart belong together."""
-
-
-def check_settings(chain: Chain, settings: Settings) -> None:
-    """Refuse settings that no identification of a chain could use, before anything is measured.
-
-    Raises
-    ------
-    ConfigError
-        When a name is unknown to this chain, say.
-
-    """
-    nothing = np.zeros((0, len(chain.joints)))
-    empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
-    Problem(chain, empty, **settings.for_problem())
 
 
 class CalibrationSession:
@@ -96,7 +78,7 @@ class CalibrationSession:
         self.on_removed = on_removed or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
         count = len(chain.joints)
-        if len(self.joint_names) != count or len(set(self.joint_names)) != count:
+        if not len(self.joint_names) == len(set(self.joint_names)) == count:
             raise ConfigError(
                 f'joint_names must be {count} different names, one for each of '
                 f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
@@ -113,20 +95,13 @@ class CalibrationSession:
     def clear(self) -> None:
         """Forget all samples and counts; the last good calibration stays."""
         settings = self.settings
-        self._collector = Collector(
-            [joint.type == 'revolute' for joint in self.chain.joints], settings
-        )
-        self._collector.holding = settings.mode == 'continuous' and settings.delay == 0.0
-        self._clocks = Clocks(self.chain, settings)
-        self._gate = Gate(max(settings.lateness + settings.max_gap, LEAST_FAR))
+        self._road = Road(self.chain, settings, self._take)
+        self._collector, self._clocks = self._road.collector, self._road.clocks
         self._frames = FrameNames()
         self._names = JointNames(self.joint_names)
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
         self._live = LiveEstimate(self.problem_of)
-        self.samples: list[Sample] = []
-        self._notes: Counter[str] = Counter()
-        self._newest = {JOINTS: 0, POSES: 0}
-        self._once: set[tuple[str, str]] = set()
+        self._kept = Kept(self._frames, settings.frame_id, self._entry.dropped, self._removed)
 
     def change(self, settings: Settings) -> None:
         """Go on with other settings; the buffers and samples stay.
@@ -140,73 +115,24 @@ class CalibrationSession:
         check_settings(self.chain, settings)
         self.settings = settings
         self._collector.settings = self._clocks.settings = settings
+        self._kept.wanted = settings.frame_id
         self._live.restart()
 
-    # Messages
-
     def take(self, parts: Sequence[Part]) -> None:
-        """Take messages in the order of their places.
-
-        They are kept by slices up to a joint state after which there is something to do. An error
-        costs the slice that makes it, and none after it.
-        """
+        """Take messages in the order of their places."""
         settled = self._frames.settled
         pieces = self._entry.pieces(parts, self.recording, self.settings.frame_id)
         if self._frames.settled != settled:
-            self._leave_out_strange()
-        error: Exception | None = None
-        for given in self._slices(pieces):
-            try:
-                self._keep(given)
-            except Exception as err:
-                error = error or err
-        if error is not None:
-            raise error
+            self._kept.leave_out_strange()
+        self._road.take(pieces)
 
     def miss(self, kind: str, count: int, cause: str) -> None:
         """Count messages that came and cannot be used."""
         self._entry.miss(kind, count, cause)
 
-    def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
-        """Yield messages up to one that gives something to do, when those before are kept."""
-        if not pieces:
-            return
-        for passed, moved in self._gate.through(Slice.of(pieces, self._collector.stamped_late_ns)):
-            if moved and passed.times[0] < self._collector.track.horizon_ns:
-                self._collector.start_anew()
-            yield from self._up_to_work(passed)
-
-    def _up_to_work(self, given: Slice) -> Iterator[Slice]:
-        begin = 0
-        while begin < len(given):
-            left = given.between(begin, len(given))
-            count = self._collector.reach(left)
-            yield left.between(0, count)
-            begin += count
-
-    def _keep(self, given: Slice) -> None:
-        """Keep messages, and do what the last one gives to do."""
-        for kind in (JOINTS, POSES):
-            times = given.times[given.where(kind)]
-            if len(times):
-                newest = np.maximum(np.maximum.accumulate(times), self._newest[kind])
-                self._newest[kind] = int(newest[-1])
-                if back := int((times < newest).sum()):  # nothing is lost by it
-                    self._notes[f'{kind} with a stamp older than the one before'] += back
-        self._clocks.take(given)
-        if self._collector.take(given):
-            self._clocks.look(self._collector, int(given.times[given.where(JOINTS)[-1]]))
-            self._collector.round()
-        self._take()
-
     def finish(self) -> None:
         """Make samples of everything that still waits; nothing more will come."""
-        for held in self._gate.release():
-            for given in self._up_to_work(held):
-                self._keep(given)
-        self._clocks.look(self._collector, None)
-        self._collector.finish()
-        self._take()
+        self._road.finish()
 
     @property
     def received(self) -> Counter[str]:
@@ -226,7 +152,7 @@ class CalibrationSession:
         With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
         """
         found = self._collector.capture(socket_place(socket) if socket else '')
-        self._take()
+        self._road.hand_over()
         return found
 
     def remove_last(self) -> Sample:
@@ -258,60 +184,19 @@ class CalibrationSession:
             if sample.frame_id:
                 self._frames.note(sample.device, sample.frame_id, sample.count)
         self._collector.maker.remember(samples)
-        self.samples = [*samples, *self.samples]
-        self._leave_out_strange()
+        self._kept.samples[:0] = samples
+        self._kept.leave_out_strange()
         self._live.restart()
 
     @property
-    def usable(self) -> list[Sample]:
-        """Return the samples in the frame of their device, `frame_id` or the usual one.
-
-        Those of targets that were measured once are left out where others were more often: they
-        tell nothing about the arm, and hundreds of them would take minutes.
-        """
-        wanted = self.settings.frame_id
-        found = self.samples
-        if wanted or self._frames.several:
-            found = [each for each in found if self._frame_of(each, wanted) == each.frame_id]
-        counts = Counter((each.device, each.target) for each in found if not each.validation)
-        once = {key for key, count in counts.items() if count == 1}
-        if once != self._once:  # the list does not only grow
-            self._once = once
-            self._live.restart()
-        if not once or len(once) == len(counts):
-            return found
-        return [each for each in found if (each.device, each.target) not in once]
-
-    def _frame_of(self, sample: Sample, wanted: str = '') -> str:
-        """Return in which frame a sample should be; some do not tell in which they are."""
-        return (
-            sample.frame_id and (wanted or self._frames.main(sample.device))
-        ) or sample.frame_id
-
-    def _leave_out_strange(self) -> None:
-        """Take back samples in strange frames, the first ones say, if there are only a few."""
-        for sample in tuple(self.samples):
-            if self._is_strange(sample):
-                self.samples.remove(sample)
-                self._live.restart()
-                self.on_removed(sample)
-
-    def _is_strange(self, sample: Sample) -> bool:
-        """Tell whether a sample is one of a few in a frame of their own; count it if so."""
-        if self.settings.frame_id or not self._frames.several or self._frames.different:
-            return False
-        frame_id = self._frame_of(sample)
-        strays = sample.frame_id != frame_id
-        if strays:
-            self._entry.dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
-        return strays
+    def samples(self) -> list[Sample]:
+        """Return the samples so far."""
+        return self._kept.samples
 
     @property
-    def _different(self) -> str:
-        """Return in words that one device measured in different frames, if it matters."""
-        if self.settings.frame_id or not self._frames.different:
-            return ''
-        return f'poses came in different frames ({", ".join(self._frames.different)})'
+    def usable(self) -> list[Sample]:
+        """Return the samples that are identified on (`Kept.usable`)."""
+        return self._kept.usable()
 
     @property
     def state(self) -> str:
@@ -336,17 +221,17 @@ class CalibrationSession:
         if self.settings.mode != 'continuous' and fitted:
             distinct = len(np.unique(configurations(np.array(fitted))))
         collector = self._collector
-        notes = self._notes + collector.notes
+        notes = self._road.notes + collector.notes
         if len(usable) < len(self.samples):
             notes['samples left out, in another frame or of a target measured once'] += len(
                 self.samples
             ) - len(usable)
-        strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._gate.dropped.items()})
+        strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._road.gate.dropped.items()})
         dropped = self._entry.dropped + collector.dropped + strays
         return Account(
             self.received['joints'],
             self.received['poses'],
-            collector.waiting + self._gate.held(POSES),
+            collector.waiting + self._road.gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
@@ -365,12 +250,10 @@ class CalibrationSession:
     def hints(self) -> list[Hint]:
         """Return what looks wrong in what is heard."""
         found: list[Hint | None] = []
-        if self._different:
-            found.append(
-                Hint(f'{self._different}: set frame_id', f'{self._different}, {ONE_FRAME}')
-            )
+        if words := self._kept.different:
+            found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         found += self._clocks.hints()
-        needed = self._collector.still_needed
+        needed = self._collector.rests.needed(self.settings.still)
         if needed is not None:
             found.append(restless(needed, self.settings.still))
         between = self._collector.dropped[f'poses: {APART}']
@@ -419,11 +302,10 @@ class CalibrationSession:
 
         """
         self._clocks.look(self._collector, None)
-        self._collector.flush()
-        self._take()
-        if self._different:
-            raise InputError(f'{self._different}, {ONE_FRAME}')
-        self._leave_out_strange()
+        self._road.flush()
+        if self._kept.different:
+            raise InputError(f'{self._kept.different}, {ONE_FRAME}')
+        self._kept.leave_out_strange()
         return self.problem_of(self.usable)
 
     def problem_of(self, samples: Sequence[Sample]) -> Problem:
@@ -435,22 +317,10 @@ class CalibrationSession:
             When there is none to fit.
 
         """
-        settings, frames = self.settings, Frames()
-        sigmas = (settings.sigma_position, settings.sigma_orientation)
-        fitted, held_out = collect(samples, sigmas, frames)
-        if not fitted:
+        found = problem_of(self.chain, samples, self.settings, self.socket_distance)
+        if found is None:
             raise InputError(f'no samples to fit: {self._came}')
-        return Problem(
-            self.chain,
-            fitted[0],
-            held_out,
-            more=fitted[1:],
-            separations=tuple(
-                (*pair, self.socket_distance) for pair in socket_pairs(samples, frames)
-            ),
-            world_frame=samples[0].frame_id,  # it is the frame of `base`
-            **settings.for_problem(),
-        )
+        return found
 
     def identify(self) -> Identification:
         """Identify on the samples so far and keep the result if it is accepted."""
@@ -519,8 +389,7 @@ class CalibrationSession:
         calibration = self.calibration
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
-        self._collector.flush()
-        self._take()
+        self._road.flush()
         settings = self.settings
         sigmas = (settings.sigma_position, settings.sigma_orientation)
         # the first device and target are those of a file that does not name any
@@ -538,12 +407,16 @@ class CalibrationSession:
             )
         return calibration, sets
 
-    # Details
-
-    def _take(self) -> None:
-        """Keep the samples that the collector has made."""
-        fresh = [each for each in self._collector.maker.take() if not self._is_strange(each)]
-        self.samples += fresh
+    def _take(self, made: Sequence[Sample]) -> int:
+        """Keep the samples that were made; return how many there are now."""
+        fresh = [each for each in made if not self._kept.is_strange(each)]
+        self._kept.samples += fresh
         for sample in fresh:
             self.on_sample(sample)
-        self._clocks.wake(self._collector.unrest, len(self.samples))
+        return len(self.samples)
+
+    def _removed(self, sample: Sample | None) -> None:
+        """Begin the estimate anew, for the samples are others; one may have been taken back."""
+        self._live.restart()
+        if sample is not None:
+            self.on_removed(sample)

@@ -25,7 +25,7 @@ MOST_SPIKES = 0.3
 SETTLED = 4.0
 """Distance [noise] to the later half within which a measurement is taken to have settled."""
 MOST_SPREAD = 2.0
-"""Largest spread of a stop [noise]."""
+"""Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
 FEW = 4
 """With fewer measurements nothing can be said about their spread."""
 

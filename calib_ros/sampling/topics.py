@@ -24,12 +24,8 @@ from calib_ros.sampling.sources import (
     parse_sources,
     short_type,
 )
-from calib_ros.sampling.transforms import STATIC, Links
+from calib_ros.sampling.transforms import SAME, STATIC, Links
 from calib_ros.settings import Settings
-
-SAME = 1e-9
-"""Joint values [rad or m] of two topics that differ by less are the same."""
-
 
 Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 """Returns the messages of a recording on some topics."""

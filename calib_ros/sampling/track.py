@@ -19,11 +19,10 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.intervals import intersection, standing, unheard, union
 from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.sampling.stops import MOST_SPREAD
 
-FEWEST = 8
+FEWEST_AT_REST = 8
 """Fewest samples that tell the noise of joints."""
-MOST_SPREAD = 2.0
-"""Largest spread [noise] of joints that stand; a motion is in the spread, not in the noise."""
 
 APART = 'joint samples too far apart'
 CAUSES = ('', 'no joint sample before', 'no joint sample after', APART)
@@ -207,8 +206,8 @@ class Track:
         largest = None
         for columns, rows in self._parts.items():
             first = int(np.searchsorted(rows.stamps, self.newest_ns - time_ns))
-            values = rows.values[max(0, min(first, rows.count - FEWEST)) :]
-            if len(values) < FEWEST:
+            values = rows.values[max(0, min(first, rows.count - FEWEST_AT_REST)) :]
+            if len(values) < FEWEST_AT_REST:
                 return None
             values = continuous(values, self._revolute[list(columns)])
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)

@@ -33,7 +33,7 @@ STATIC = '_static'
 HELD = 20_000
 """Transforms that wait for the frames between which they are."""
 SAME = 1e-9
-"""A link that stands still may come again with numbers that differ by less."""
+"""Numbers [m, rad] that differ by less are the same."""
 LISTED = 20
 """Links that are named when none of them was chosen."""
 

@@ -30,8 +30,8 @@ from calib_ros.report.words import as_document
 
 CELL = Cell(length_error=1e-3, angle_error=1e-3)
 ROBOTS = {name: load_chain(name) for name in shipped_robots()}
-SIX = [name for name, chain in ROBOTS.items() if len(chain.joints) == 6]
-REDUNDANT = ['franka_fr3', 'franka_panda', 'kuka_iiwa14', 'ur10e_on_linear_axis']
+SIX = ['puma560', 'staubli_tx90l', 'ur10e']
+REDUNDANT = ['kuka_iiwa14', 'ur10e_on_linear_axis']
 UR = ROBOTS['ur10e']
 UR_TRUE = faulty(UR, CELL, np.random.default_rng(4))
 TURNED_SCARA = Chain(

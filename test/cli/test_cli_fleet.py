@@ -59,7 +59,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
         assert main(command) == NOT_ACCEPTED
     said = capsys.readouterr()
     assert '1 changed, 1 unreadable, 1 fine' in said.out
-    assert 'B, 2025-10-12: elbow_joint changed, elbow_joint.theta by +0.' in said.out
+    assert 'B, 2025-10-12: changed: elbow_joint.theta by +0.' in said.out
     assert '<C>: ' in said.err
     assert '003.csv' in said.err
 

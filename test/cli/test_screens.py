@@ -130,13 +130,18 @@ MORE = {
     'verify_of_a_bag': (3, 'verify', 'bag', *UR5E, '--calibration', 'result', '--tolerance', '1'),
     'a_table_as_command': (2, 'measured.csv'),
     'a_bag_as_command': (2, 'bag'),
-    'a_wrong_command': (2, 'identfy'),
     'nothing_there': (1, 'identify', 'missing.csv', *UR5E),
 }
 
 
+def test_a_wrong_command_proposes_the_right_one(shown):
+    status, text = shown('identfy')
+    assert status == 2
+    assert 'unknown command "identfy": did you mean "identify"?' in text
+
+
 def test_every_command_has_a_screen():
-    apart = {'images'}  # in test_images.py: it needs photographs
+    apart = {'images', 'compare', 'fleet', 'history'}  # in tests of their own, with more data
     assert {*RESULTS, *apart} >= {*commands()}
 
 

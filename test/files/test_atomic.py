@@ -22,7 +22,8 @@ from rosbags.rosbag2 import Writer
 from calib_ros.atomic import confined, whole_folder, write_file, write_files
 from calib_ros.cli import main
 from calib_ros.errors import InputError
-from calib_ros.files.bags import Recording, replay, write_bag
+from calib_ros.files.bags import replay
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import os
+import shutil
 import struct
 from types import SimpleNamespace
 
@@ -29,15 +30,10 @@ from recorded import (
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 
 from calib_ros.errors import InputError
-from calib_ros.files.bags import (
-    CHUNK,
-    STORAGE,
-    STORAGES,
-    read,
-    replay,
-    write_bag,
-)
+from calib_ros.files.bags import replay
 from calib_ros.files.mcap import DATA_END, MAGIC, records
+from calib_ros.files.recording import STORAGES, write_bag
+from calib_ros.files.stored import CHUNK, STORAGE, read
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import JOINT_STATE, reading
 from calib_ros.sampling.session import CalibrationSession
@@ -385,13 +381,21 @@ def damage(path, share=None, metadata=True):
     return file
 
 
+@pytest.fixture(scope='module')
+def long_bags(tmp_path_factory):
+    """A bag of each storage, and the observations in it."""
+    folder = tmp_path_factory.mktemp('long')
+    for storage in STORAGES:
+        write_bag(folder / storage, recording(300), storage)
+    return folder, observations_of(folder / STORAGES[0])
+
+
 @storages
 @pytest.mark.parametrize(('metadata', 'alone'), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize('share', [0.45, 0.55, 0.9])
-def test_of_a_truncated_bag_the_rest_is_used(tmp_path, storage, metadata, alone, share):
-    path = tmp_path / 'bag'
-    write_bag(path, recording(300), storage)
-    whole = observations_of(path)
+def test_of_a_truncated_bag_the_rest_is_used(tmp_path, long_bags, storage, metadata, alone, share):
+    folder, whole = long_bags
+    path = shutil.copytree(folder / storage, tmp_path / 'bag')
     file = damage(path, share, metadata)
     session, warnings = session_of(file if alone else path)
     part = session.problem().observations
@@ -436,9 +440,10 @@ def test_a_damaged_bag_in_a_folder_with_an_odd_name(tmp_path, storage):
     assert session_of(path)[0].account().samples == 30
 
 
-@pytest.mark.parametrize('share', [0.6, 0.75, 0.9])
-def test_of_a_truncated_compressed_bag_the_whole_chunks_are_used(tmp_path, share):
-    path = tmp_path / 'bag'
+@pytest.fixture(scope='module')
+def compressed_bag(tmp_path_factory):
+    """A bag of several chunks, in 6000 poses."""
+    path = tmp_path_factory.mktemp('compressed') / 'bag'
     writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     noise = np.random.default_rng(1)
@@ -452,15 +457,20 @@ def test_of_a_truncated_compressed_bag_the_whole_chunks_are_used(tmp_path, share
             message = pose_stamped(k * 10 * MS, noise.normal(size=3))
             writer.write(poses, k, TYPESTORE.serialize_cdr(message, kind))
     assert session_of(path)[0].account().samples == 6000
+    return path
+
+
+@pytest.mark.parametrize('share', [0.6, 0.75, 0.9])
+def test_of_a_truncated_compressed_bag_the_whole_chunks_are_used(tmp_path, compressed_bag, share):
+    path = shutil.copytree(compressed_bag, tmp_path / 'bag')
     session, warnings = session_of(damage(path, share))
     assert 1000 < session.account().samples < 6000
     assert len(warnings) == 1
 
 
 @storages
-def test_a_hole_in_a_file_is_reported(tmp_path, storage):
-    path = tmp_path / 'bag'
-    write_bag(path, recording(300), storage)
+def test_a_hole_in_a_file_is_reported(tmp_path, long_bags, storage):
+    path = shutil.copytree(long_bags[0] / storage, tmp_path / 'bag')
     file = damage(path)
     content = bytearray(file.read_bytes())
     middle = len(content) // 2

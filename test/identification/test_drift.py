@@ -9,8 +9,11 @@ import pytest
 from scipy.signal import lfilter
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.start import start_frames
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.markdown import markdown
@@ -62,12 +65,12 @@ def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
 
 @pytest.mark.parametrize('kind', DRIFTS)
 def test_a_drift_is_no_gain_of_the_arm(kind):
-    """At 95 %: of 30 arms without any error four or more are accepted once in 20 times."""
-    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(30)]
-    assert sum(result.accepted for result in results) <= 3
+    """At 95 %: of 15 arms without any error three or more are accepted once in 28 times."""
+    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(15)]
+    assert sum(result.accepted for result in results) <= 2
     # by held-out poses alone most of them would be
     alone = [all('of a drift' in text for text in result.refusals) for result in results]
-    assert sum(alone) > 8
+    assert sum(alone) > 4
 
 
 @pytest.mark.parametrize('kind', DRIFTS)
@@ -83,11 +86,17 @@ def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts(kind):
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
     """Of 120 sessions a tenth is below 0.1: 12, and 3.3 a standard deviation."""
+    frames = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
+    arm = [f'{joint}.{kind}' for joint in UR10E.joint_names[1:5] for kind in ('a', 'theta')]
     found = []
     for seed in range(120):
         kind = ('fading', 'none')[seed % 2]
         seen = session(seed, 0.0, kind, count=60, width=None)
-        found.append(identify(Problem(UR10E, seen, loss='none', folds=2, **SIGMAS)).chance)
+        known = frames if seen.oriented.all() else frames[:9]
+        system = Problem(UR10E, seen, **SIGMAS).system([seen])
+        start = start_frames(UR10E, [seen], *NOISE, 'none')
+        before = minimise(start, known, system).chain
+        found.append(chance_of_gain(before, known, arm, system))
     chances = np.array(found)
     for level in (0.1, 0.5, 0.9):
         spread = np.sqrt(120 * level * (1.0 - level))
@@ -115,8 +124,7 @@ def test_sessions_move_each_in_itself():
     assert identify(Problem(UR10E, apart[0], more=apart[1:], **SIGMAS)).chance > 0.05
 
 
-@pytest.mark.parametrize('kind', ['walk', 'swing'])
-@pytest.mark.parametrize(('count', 'width'), [(60, None), (120, 0.8)])
+@pytest.mark.parametrize(('kind', 'count', 'width'), [('walk', 60, None), ('swing', 120, 0.8)])
 def test_a_drift_of_the_tracker_chooses_no_effects(kind, count, width):
     """At 99 % a group: of 8 sessions one or none."""
     chosen = 0

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import fitted
 from scipy import stats
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -320,9 +321,9 @@ def test_priors_help_where_poses_are_few(count, oriented, gain):
         seen = measure(true, UR10E.random_joints(count, rng), rng, *noise, oriented=oriented)
         unseen = UR10E.random_joints(300, rng)
         options = {'sigma_position': noise[0], 'sigma_orientation': noise[1], 'loss': 'none'}
-        without = identify(Problem(UR10E, seen, priors={'*_joint.*': 1e6}, **options))
-        told = identify(Problem(UR10E, seen, **options))
-        helped = identify(Problem(UR10E, seen, priors=manufacture(), **options))
+        without = fitted(Problem(UR10E, seen, priors={'*_joint.*': 1e6}, **options))
+        told = fitted(Problem(UR10E, seen, **options))
+        helped = fitted(Problem(UR10E, seen, priors=manufacture(), **options))
         errors.append(
             [
                 rms(c, true, unseen)
@@ -359,9 +360,7 @@ def test_standard_deviations_are_honest_where_errors_are_drawn_from_the_priors(c
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
-        result = identify(
-            Problem(UR10E, seen, held_out=seen.select([0, 1]), priors=manufacture(), **SIGMAS)
-        )
+        result = fitted(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
         scores += [
             (p.value - true.value(p.name)) / p.std for p in result.parameters if p.name in prior
         ]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import fitted
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -256,7 +257,7 @@ def test_standard_deviations_are_honest():
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = measure(true, UR10E.random_joints(40, rng), rng, 5e-5, 5e-5 / 0.3)
-        result = identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2))))
+        result = fitted(Problem(UR10E, seen))
         scores += [
             (p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None
         ]
@@ -524,7 +525,7 @@ def test_errors_shared_by_a_configuration_count_once():
         true = faulty(UR10E, Cell(), rng)
         once = measure(true, UR10E.random_joints(40, rng), rng, 1e-4, 1e-4 / 0.3)
         thrice = once.select(np.repeat(np.arange(40), 3))
-        result = identify(Problem(UR10E, thrice, held_out=once))
+        result = fitted(Problem(UR10E, thrice))
         scores += [
             (p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None
         ]
@@ -538,7 +539,7 @@ def test_standard_deviations_follow_the_noise_that_is_there(position, orientatio
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = measure(true, UR10E.random_joints(40, rng), rng, position, orientation)
-        result = identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2))))
+        result = fitted(Problem(UR10E, seen))
         assert not result.noise.consistent
         scores += [
             (p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None

@@ -137,7 +137,7 @@ def test_table_and_running_node_give_the_same_parameters(capsys, tmp_path, name,
     from ros_cell import LATCHED, Cell, joint_messages, pose_messages
     from std_msgs.msg import String
 
-    from calib_ros.files.bags import Recording
+    from calib_ros.files.recording import Recording
 
     folder = DATA / name
     path = folder / 'chain.yaml'

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import fitted
 from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
 
@@ -47,16 +48,17 @@ def shifted(seen, errors):
     return replace(seen, positions=seen.positions + errors)
 
 
-def run(seed, count=60, order='path', drift=None, oriented=True, amplitude=1e-4):
-    """Return the true arm and the identification of it with a drifting tracker."""
+def run(
+    seed, count=60, order='path', drift=None, oriented=True, amplitude=1e-4, identified=fitted
+):
+    """Return the true arm and a fit of it with a drifting tracker."""
     rng = np.random.default_rng(seed)
     true = faulty(UR10E, Cell(), rng)
     q = along_path(count, rng) if order == 'path' else UR10E.random_joints(count, rng)
     seen = measure(true, q, rng, *NOISE, oriented=oriented)
     if drift is not None:
         seen = shifted(seen, amplitude * fading(count, drift, rng))
-    # the verdict is not asked for, so it is judged by two poses
-    return true, identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2)), **SIGMAS))
+    return true, identified(Problem(UR10E, seen, **SIGMAS))
 
 
 def hits(true, result, widened=True):
@@ -99,7 +101,7 @@ def test_errors_smooth_over_the_joint_space_are_shared_by_what_is_near():
         true = faulty(UR10E, Cell(), rng)
         q = rng.permutation(along_path(180, rng))
         seen = shifted(measure(true, q, rng, *NOISE), 1e-4 * smooth(q, rng))
-        result = identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2)), **SIGMAS))
+        result = fitted(Problem(UR10E, seen, **SIGMAS))
         kinds.append(result.noise.shared)
         covered.append(hits(true, result))
         alone.append(hits(true, result, widened=False))
@@ -209,7 +211,7 @@ def test_pairs_of_a_stop_with_one_error_tell_no_more_than_one():
 
 
 def test_the_report_says_what_is_shared_and_what_follows():
-    _, drifting = run(9, drift=10.0, amplitude=3e-4)
+    _, drifting = run(9, drift=10.0, amplitude=3e-4, identified=identify)
     text = noise_in_words(drifting)
     assert 'measured in succession (0.' in text
     assert f'{drifting.noise.widened:.1f} times those of independent errors' in text
@@ -218,7 +220,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
     for parameter in document['parameters'].values():
         if parameter['std'] is not None:
             assert parameter['half_width_95'] > 1.95 * parameter['std']
-    _, quiet = run(9)
+    _, quiet = run(9, identified=identify)
     assert 'share no errors' in noise_in_words(quiet)
 
 

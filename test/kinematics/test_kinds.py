@@ -111,7 +111,7 @@ GROSS = {
 @pytest.mark.parametrize(('count', 'share'), [(200, 0.1), (200, 0.3), (100, 0.3)])
 def test_distances_of_gross_error_are_named_and_do_no_harm(count, share, errors):
     """A wire that slipped from its hook, or another one measured."""
-    for seed in range(5):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = wire(true, count, rng, noise=NOISE[0])

@@ -241,8 +241,7 @@ def fresh_home(monkeypatch, tmp_path):
     yield tmp_path / '.ros' / 'calib_ros'
 
 
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
-@pytest.mark.parametrize('default', [True, False])
+@pytest.mark.parametrize(('number', 'default'), [(signal.SIGKILL, True), (signal.SIGTERM, False)])
 def test_the_first_run_of_an_account_loses_nothing(
     monkeypatch, tmp_path, recording, default, number
 ):
@@ -316,6 +315,7 @@ def test_a_full_disk(tmp_path, recording):
         unsaved = cell.call('save')
         assert not unsaved.success
         assert 'File too large' in unsaved.message
+        assert unsaved.message.endswith('write to another place')
         assert [each.name for each in tmp_path.iterdir() if 'yaml' in each.name] == [
             path.with_suffix('.settings.yaml').name
         ]

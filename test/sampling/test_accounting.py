@@ -133,7 +133,7 @@ def happening(seed, parts, dies, joint_period, sources, period, stand, latest, w
     return [what for _, what in events] * (1 + again)
 
 
-@settings(max_examples=50, phases=[Phase.generate])  # to shrink takes minutes
+@settings(max_examples=25, phases=[Phase.generate])  # to shrink takes minutes
 @given(plans, traffic)
 def test_every_measurement_is_accounted_for(plan, traffic):
     session, come = CalibrationSession(ARM, Settings(**plan)), []
@@ -148,7 +148,7 @@ def test_every_measurement_is_accounted_for(plan, traffic):
             take(session, *come)
             come = []
             call(session, name)
-        if k % 40 == 0 or name in CALLS:
+        if k % 100 == 0 or name in CALLS:
             take(session, *come)
             come = []
             came, found = balance(session)

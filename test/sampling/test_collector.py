@@ -77,7 +77,7 @@ def give(made, come):
         Piece(key, *(np.array(each) for each in zip(*rows, strict=True)))
         for key, rows in streams.items()
     ]
-    left = Slice.of(pieces, made.stamped_late_ns) if pieces else ()
+    left = Slice.of(pieces, round(1e9 * made.settings.delay)) if pieces else ()
     while len(left):
         count = made.reach(left)
         if made.take(left.between(0, count)):

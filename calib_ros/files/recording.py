@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic or tabulated measurements to bag."""
+
+from __future__ import annotations
+
+import errno
+import sqlite3
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.atomic import whole_folder, write_file
+from calib_ros.files.bags import rosbag2, typestore
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.se3 import FloatArray, to_quat
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.sources import VALIDATION
+
+STORAGES = ('sqlite3', 'mcap')
+STAND_NS = 400_000_000
+"""Time for which the arm stands at each row of a table that is made into a bag."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What to write into a bag: joint samples (M, n), poses (N) and which of those judge only."""
+
+    joint_names: tuple[str, ...]
+    joint_stamps_ns: NDArray[np.int64]
+    joints: FloatArray
+    poses: Observations
+    held_out: NDArray[np.bool_]
+
+    @classmethod
+    def of_dwells(
+        cls,
+        joint_names: tuple[str, ...],
+        observations: Observations,
+        held_out: NDArray[np.bool_],
+    ) -> Recording:
+        """Turn a table into a recording: the arm stands for a while at every row."""
+        count = len(observations)
+        begin = (1 + np.arange(count)[:, np.newaxis]) * 1_000_000_000
+        stamps = begin + np.arange(0, STAND_NS + 1, STAND_NS // 4)
+        return cls(
+            joint_names,
+            stamps.ravel(),
+            np.repeat(observations.joints, stamps.shape[1], axis=0),
+            observations.at(begin.ravel() + STAND_NS * 3 // 4),
+            held_out,
+        )
+
+
+def write_bag(
+    path: Path,
+    recording: Recording,
+    storage: str = 'mcap',
+    beside: Mapping[Path, str] | None = None,
+) -> None:
+    """Write a recording as a rosbag2 folder, in the order of the stamps, as a whole or not at all.
+
+    Topics: /joint_states, and /measured_pose or /measured_point; /validation_pose or
+    /validation_point for held-out poses. Files `beside` the bag are there before it is.
+
+    Raises
+    ------
+    InputError
+        When there is something at the path already.
+    OSError
+        When it cannot be written, because the disk is full say.
+
+    """
+    with whole_folder(path) as folder:
+        try:
+            _write_bag(folder, recording, storage)
+        except (OSError, sqlite3.Error) as err:
+            failed = OSError(f'cannot write {path}: {err}')
+            full = errno.ENOSPC if 'full' in str(err) else None
+            failed.errno = getattr(err, 'errno', None) or full
+            raise failed from err
+        for file, text in (beside or {}).items():
+            write_file(file, text, overwrite=True)
+
+
+def _write_bag(path: Path, recording: Recording, storage: str) -> None:
+    library = rosbag2()
+    store = typestore()
+    types = store.types
+    time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
+    joint_state, poses = types[JOINT_STATE], recording.poses
+    oriented = bool(poses.oriented.all())
+    kind = f'geometry_msgs/msg/{"PoseStamped" if oriented else "PointStamped"}'
+    noun = 'pose' if oriented else 'point'
+    none = np.zeros(0)
+    quats = to_quat(poses.rotations)
+
+    def head(stamp_ns: int, frame_id: str) -> Any:
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        return header(time(sec=seconds, nanosec=nanoseconds), frame_id)
+
+    def measured(k: int, stamp_ns: int) -> Any:
+        point = types['geometry_msgs/msg/Point'](*poses.positions[k].tolist())
+        if not oriented:
+            return types[kind](head(stamp_ns, 'tracker'), point)
+        turn = types['geometry_msgs/msg/Quaternion'](*quats[k].tolist())
+        pose = types['geometry_msgs/msg/Pose'](point, turn)
+        return types[kind](head(stamp_ns, 'tracker'), pose)
+
+    stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
+    names = list(recording.joint_names)
+    plugin = library.StoragePlugin[storage.upper()]
+    with library.Writer(path, version=9, storage_plugin=plugin) as writer:
+        joint_connection = writer.add_connection('/joint_states', JOINT_STATE, typestore=store)
+        pose_connections = [
+            writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)
+            for prefix in ('measured_', VALIDATION)[: 1 + int(recording.held_out.any())]
+        ]
+        for k in np.argsort(stamps, kind='stable').tolist():
+            stamp_ns = int(stamps[k])
+            if k < len(recording.joints):
+                values = np.ascontiguousarray(recording.joints[k])
+                message = joint_state(head(stamp_ns, ''), names, values, none, none)
+                data = store.serialize_cdr(message, JOINT_STATE)
+                writer.write(joint_connection, stamp_ns, data)
+                continue
+            k -= len(recording.joints)
+            data = store.serialize_cdr(measured(k, stamp_ns), kind)
+            writer.write(pose_connections[int(recording.held_out[k])], stamp_ns, data)

@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations, and standard deviations, as others write them: quaternions and covariances of them.
+
+XYZ are turns about the axes as turned before, R = Rx(r1) Ry(r2) Rz(r3); xyz about fixed ones,
+which is ZYX in the other order. Standard deviations s of Euler angles make the covariance
+J diag(s^2) J' of the rotation about the device's axes: the columns of J are the axes about which
+the angles turn, e1, R1 e2, R1 R2 e3. For a rotation vector v it is J_l(v), for quaternions the
+standard deviations are those about the device's axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.bulk import COVARIANCE, UPPER
+from calib_ros.files.columns import MadeColumns
+from calib_ros.files.layouts import IN_TURN, POSITION, QUATERNION, SIGMAS, TURNS, Layout
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.values import QUATERNION_TOLERANCE
+
+
+def finished(made: MadeColumns, layout: Layout, path: Path) -> MadeColumns:
+    """Return the columns with quaternions for rotations, covariances for standard deviations."""
+    values, words = dict(made.values), dict(made.words)
+    time = values.pop('time', None)
+    if time is not None:
+        if np.isnan(time).any() or np.abs(time).max(initial=0.0) > 9e9:
+            line = made.lines[int(np.argmax(~(np.abs(time) <= 9e9)))]
+            raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
+        words['stamp_ns'] = [str(round(each * 1e9)) for each in time.tolist()]
+    rotation, axes = _rotations(values, layout, path, made)
+    sigmas = [values.pop(name, None) for name in SIGMAS]
+    for name in (*TURNS, *IN_TURN):
+        values.pop(name, None)
+    covariance = _covariance(sigmas, axes, path)
+    if layout.inverse:
+        if rotation is None or not set(POSITION) <= set(values):
+            raise ConfigError('--inverse needs poses with their rotations')
+        given = np.column_stack([values[name] for name in POSITION])
+        count = len(made.lines)
+        turned = Observations(
+            np.arange(count),
+            np.zeros((count, 1)),
+            given,
+            rotation,
+            np.ones(count, bool),
+            covariance,
+        ).inverted()
+        values |= dict(zip(POSITION, turned.positions.T, strict=True))
+        rotation, covariance = turned.rotations, turned.covariance
+    if rotation is not None:
+        values |= dict(zip(QUATERNION, se3.to_quat(rotation).T, strict=True))
+    if covariance is not None:
+        rows, columns = np.transpose(UPPER)
+        values |= dict(zip(COVARIANCE, covariance[:, rows, columns].T, strict=True))
+    return MadeColumns(made.lines, values, words)
+
+
+def _rotations(
+    values: dict[str, FloatArray], layout: Layout, path: Path, made: MadeColumns
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns that standard deviations are
+    about; None where there are none.
+    """
+    if set(QUATERNION) & set(values):
+        return _from_quaternions(values, layout, path, made)
+    three = [name for name in (TURNS, IN_TURN) if set(name) & set(values)]
+    if not three:
+        for name in ('euler', 'rotation_vector', 'quaternion'):
+            if getattr(layout, name):
+                raise ConfigError(
+                    f'{path}: {name.replace("_", " ")} is given, but no columns: --columns '
+                    'rx=NAME,ry=NAME,rz=NAME (or qx, qy, qz, qw)'
+                )
+        return None, None
+    names = three[0]
+    missing = [name for name in names if name not in values]
+    if missing or len(three) > 1:
+        raise ConfigError(f'{path}: give rx, ry, rz or r1, r2, r3, all three; missing {missing}')
+    angles = np.column_stack([values[name] for name in names])
+    _require_whole(angles, path, made, ', '.join(names))
+    if layout.rotation_vector:
+        rotation = se3.exp_rotation(angles)
+        return rotation, _left_jacobians(angles)
+    if not layout.euler:
+        raise ConfigError(
+            f'{path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, zyx, ...) or '
+            '--rotation-vector'
+        )
+    letters = layout.euler
+    if names == TURNS:
+        if len(set(letters.upper())) < 3:
+            raise ConfigError(
+                f'with --euler {letters} an axis comes twice: give r1, r2, r3 in its order'
+            )
+        angles = angles[:, ['XYZ'.index(letter) for letter in letters.upper()]]
+    axes = np.zeros((len(angles), 3, 3))
+    turned = np.tile(np.eye(3), (len(angles), 1, 1))
+    order = range(3) if letters.isupper() else range(2, -1, -1)
+    for k in order:
+        unit = 'XYZ'.index(letters[k].upper())
+        axes[:, :, k] = turned[:, :, unit]
+        step = Rotation.from_rotvec(np.eye(3)[unit] * angles[:, k, np.newaxis]).as_matrix()
+        turned = turned @ step
+    if names == TURNS:  # columns in the order of rx, ry, rz
+        axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
+    return turned, axes
+
+
+def _from_quaternions(
+    values: dict[str, FloatArray], layout: Layout, path: Path, made: MadeColumns
+) -> tuple[FloatArray, FloatArray]:
+    """Return rotations, and the device's axes."""
+    missing = [name for name in QUATERNION if name not in values]
+    if missing:
+        raise ConfigError(f'{path}: a quaternion has four columns, missing {", ".join(missing)}')
+    quat = np.column_stack([values[name] for name in QUATERNION])
+    if layout.quaternion == 'wxyz':
+        quat = quat[:, [1, 2, 3, 0]]
+    _require_whole(quat, path, made, 'qx, qy, qz, qw')
+    length = np.linalg.norm(quat, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
+    if len(wrong):
+        raise InputError(
+            f'{path}, line {made.lines[wrong[0]]}: quaternion qx qy qz qw has length '
+            f'{length[wrong[0]]:.6g}, expected 1'
+        )
+    return se3.from_quat(quat), np.tile(np.eye(3), (len(quat), 1, 1))
+
+
+def _require_whole(values: FloatArray, path: Path, made: MadeColumns, names: str) -> None:
+    nothing = np.isnan(values).any(axis=1)
+    if nothing.any():
+        line = made.lines[int(np.argmax(nothing))]
+        raise InputError(f'{path}, line {line}: {names} must be numbers, not blank')
+
+
+def _left_jacobians(vectors: FloatArray) -> FloatArray:
+    """Return J_l(v) (N, 3, 3) of rotation vectors (N, 3) (Chirikjian 2012)."""
+    angle = np.linalg.norm(vectors, axis=1)[:, np.newaxis, np.newaxis]
+    cross = se3.skew(vectors)
+    small = angle < 1e-6
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
+
+
+def _covariance(
+    sigmas: Sequence[FloatArray | None], axes: FloatArray | None, path: Path
+) -> FloatArray | None:
+    """Return covariances (N, 6, 6) of standard deviations (N,); None where there are none."""
+    place = sigmas[:3]
+    if all(each is None for each in sigmas):
+        return None
+    if any(each is None for each in place):
+        raise ConfigError(f'{path}: standard deviations need sx, sy and sz')
+    turn = [each for each in sigmas[3:] if each is not None]
+    if turn and (len(turn) < 3 or axes is None):
+        raise ConfigError(
+            f'{path}: standard deviations of rotations need srx, sry, srz, and rotations'
+        )
+    position = np.column_stack([each for each in place if each is not None])
+    found = np.zeros((len(position), 6, 6))
+    found[:, :3, :3] = np.square(position)[:, :, np.newaxis] * np.eye(3)
+    if turn:
+        assert axes is not None
+        scaled = axes * np.column_stack(turn)[:, np.newaxis, :]
+        found[:, 3:, 3:] = scaled @ np.swapaxes(scaled, 1, 2)
+    return found
