@@ -67,11 +67,11 @@ def test_a_bent_link_is_named(earlier):
 
 
 def test_of_an_arm_that_has_not_changed_nothing_is_claimed(earlier):
-    """Of 60 sets of 8 poses at 0.5 % each, more than 2 claims are improbable (0.3 %)."""
+    """Of 25 sets of 8 poses at 0.5 % each, more than one claim is improbable (0.7 %)."""
     true, previous = earlier
-    found = [recalibrate(previous, problem(true, 8, seed), 0.1) for seed in range(60)]
-    assert sum(bool(each.changed) for each in found) <= 2
-    assert sum(not each.accepted for each in found) <= 3
+    found = [recalibrate(previous, problem(true, 8, seed), 0.1) for seed in range(25)]
+    assert sum(bool(each.changed) for each in found) <= 1
+    assert sum(not each.accepted for each in found) <= 1
     assert np.mean([rms(each.calibration.chain, true) for each in found]) < 1.1 * rms(
         previous.chain, true
     )
