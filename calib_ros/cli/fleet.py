@@ -22,6 +22,8 @@ INCOMPLETE = 4
 
 
 def _add_fleet(parser: argparse.ArgumentParser) -> None:
+    from calib_ros.fleet.watch import YEARS
+
     add = parser.add_argument
     add('plant', type=Path, metavar='PLANT', help='plant.yaml: the robots (docs/fleet.md)')
     add('--history', required=True, metavar='DIR', help='where results are filed; also a URL')
@@ -36,7 +38,7 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         '--years',
         type=float,
-        default=100.0,
+        default=YEARS,
         metavar='N',
         help='between two false alarms of a robot that is measured every night',
     )

@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
+from calib_ros.apply.chart import DAYS
 from calib_ros.files.rows import Row
 from calib_ros.identification.changes import (
     DOUBT,
@@ -47,7 +48,6 @@ LAGS = (1, 2, 4, 8)
 """Nights that a change is looked for in: a large one shows at once, a small one after some."""
 YEARS = 100.0
 """Time between false alarms of a robot, of one night each day."""
-DAYS = 365.25
 
 
 @dataclass(frozen=True, eq=False)
