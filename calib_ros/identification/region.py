@@ -146,6 +146,9 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             str(document['base']),
             str(document['tool']),
         )
+    except UnknownNameError as err:
+        what = f'parameter in {where}: calibration.region'
+        raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
         raise ConfigError(
             f'{where}: calibration.region is damaged ({type(err).__name__}): identify again'

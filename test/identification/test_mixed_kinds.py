@@ -348,7 +348,7 @@ def test_poses_that_were_not_used_are_predicted(bag):
     replay(path, session)
     stops = sorted({sample.stamp_ns // 800_000_000 for sample in session.samples})
     held_out = set(stops[::5])
-    session.samples = [
+    session.samples[:] = [
         replace(sample, validation=sample.stamp_ns // 800_000_000 in held_out)
         for sample in session.samples
     ]

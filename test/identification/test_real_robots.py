@@ -133,7 +133,6 @@ def test_table_and_bag_give_the_same_parameters(capsys, tmp_path, name, session,
 @pytest.mark.parametrize(('name', 'session'), SMALL)
 def test_table_and_running_node_give_the_same_parameters(capsys, tmp_path, name, session):
     from geometry_msgs.msg import PointStamped, PoseStamped
-    from rclpy.executors import SingleThreadedExecutor
     from ros_cell import LATCHED, Cell, joint_messages, pose_messages
     from std_msgs.msg import String
 
@@ -152,7 +151,7 @@ def test_table_and_running_node_give_the_same_parameters(capsys, tmp_path, name,
     kind = PoseStamped if fitted.oriented.all() else PointStamped
     topic = 'measured_pose' if kind is PoseStamped else 'measured_point'
     parameters = {'chain': str(path), 'data_dir': str(tmp_path)}
-    with Cell(SingleThreadedExecutor, **parameters) as cell:
+    with Cell(**parameters) as cell:
         joints, poses = joint_messages(recording), pose_messages(recording.poses, kind)
         cell.play({'joint_states': joints, topic: poses})
         texts = cell.listen(String, 'calibration_node/calibration', LATCHED)
