@@ -9,7 +9,8 @@ import numpy as np
 from cell_simulator import RIPPLE, Arm, poses, resized
 from scipy.spatial.transform import Rotation
 
-from calib_ros.identification.identification import Observations, Problem
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = (5e-5, 2e-4)

@@ -31,9 +31,10 @@ from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.leastsquares import Samples, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import parameters_of
 
