@@ -8,7 +8,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from calib_ros.cli.inputs import SIGMA_TOUCH, Loaded, table
+from calib_ros.cli.inputs import Loaded, table
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,6 +62,8 @@ def detected(
         lens = replace(lens, fixed=options.lens != 'fitted')
     chain = chain.with_frame(seen.camera, replace(camera, lens=lens))
     given = settings.for_problem()
+    if options.sigma_touch is not None:
+        given['sigma_touch'] = options.sigma_touch
     if posed:
         given['fixed'] = (*given['fixed'], *(f'{name}.*' for name in chain.joint_names))
     problem = Problem(
@@ -70,7 +72,6 @@ def detected(
         rows.held_out if options.csv is not None else None,
         more=more,
         sigma_pixel=SIGMA_PIXEL if options.sigma_pixel is None else options.sigma_pixel,
-        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
         **given,
     )
     reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'

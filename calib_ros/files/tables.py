@@ -16,6 +16,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,9 +34,11 @@ from calib_ros.files.bulk import (
 from calib_ros.files.columns import MadeColumns, regular
 from calib_ros.files.foreign import Foreign, refuse_separator
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.sample import Frames, Sample, collect
+from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect
 from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, Row, decoded, read_bytes, read_rows
 from calib_ros.values import (
@@ -69,6 +72,18 @@ class Table(Shown):
     warnings: tuple[str, ...] = ()
     world_frame: str = ''
     by_line: bool = False
+
+    def problem(self, chain: Chain, sockets: float = SOCKETS, **more: Any) -> Problem:
+        """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
+        return Problem(
+            chain,
+            self.fitted[0],
+            self.held_out,
+            more=self.fitted[1:],
+            separations=tuple((*pair, sockets) for pair in self.pairs),
+            world_frame=self.world_frame,
+            **more,
+        )
 
 
 def read_table(
