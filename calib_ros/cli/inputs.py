@@ -98,12 +98,13 @@ def of_table(
 ) -> Loaded:
     """Return what is to be fitted of a table."""
     from calib_ros.identification.problem import Problem
+    from calib_ros.sampling.problems import with_lenses
     from calib_ros.sampling.sample import SOCKETS
 
     found = table(options, options.csv, chain, settings, screen, options.eye_in_hand)
     sockets = SOCKETS if options.socket_distance is None else options.socket_distance
     problem = Problem(
-        chain,
+        with_lenses(chain, found.lenses),
         found.fitted[0],
         found.held_out,
         more=found.fitted[1:],
