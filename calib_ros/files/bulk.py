@@ -32,7 +32,7 @@ POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
-ROW_BY_ROW = ('socket', 'location', 'plane')
+ROW_BY_ROW = ('socket', 'location', 'plane', 'view')
 MOST_FRAMES = 100
 """Sessions, devices and targets of a table."""
 Sets = tuple[Observations, ...]

@@ -5,16 +5,16 @@
 Joint values are in q1 ... qn. What was measured shows in the cells of the row that are filled: a
 pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), that a
 ball sat in a socket (location, socket) or that a plane was touched (plane), whose places are not
-known. Rows of all kinds may stand in
-one table.
+known. A pose may be that of a board whose corners are in the row (view). Rows of all kinds may
+stand in one table.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,15 @@ from calib_ros.files.bulk import (
 )
 from calib_ros.files.columns import MadeColumns, regular
 from calib_ros.files.foreign import Foreign, refuse_separator
+from calib_ros.files.views import view_cell, view_of
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect
+from calib_ros.sampling.problems import with_lenses
+from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses
 from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, Row, decoded, read_bytes, read_rows
 from calib_ros.values import (
@@ -53,8 +56,10 @@ from calib_ros.values import (
 
 SPLITS = ('', 'train', 'test', 'removed')
 MOST_LINES = 5
-SOCKET = ('location', 'socket')
 """Lines that an error names."""
+SOCKET = ('location', 'socket')
+LATER = (SOCKET, ('view',))
+"""Columns that journals of earlier versions do not have."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,7 +68,7 @@ class Table(Shown):
 
     `pairs` names the frames of the two sockets of each location, `world_frame` is the first frame
     of measurements that the table names, if any. `by_line` tells that the table has no stamps: a
-    sample's is its line, in seconds.
+    sample's is its line, in seconds. `lenses` are those at the frames of cameras.
     """
 
     fitted: tuple[Observations, ...]
@@ -72,11 +77,12 @@ class Table(Shown):
     warnings: tuple[str, ...] = ()
     world_frame: str = ''
     by_line: bool = False
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
 
     def problem(self, chain: Chain, sockets: float = SOCKETS, **more: Any) -> Problem:
         """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
         return Problem(
-            chain,
+            with_lenses(chain, self.lenses),
             self.fitted[0],
             self.held_out,
             more=self.fitted[1:],
@@ -176,10 +182,12 @@ def _by_rows(
     taken = [replace(s, eye_in_hand=True) if eye_in_hand else s for s in samples]
     if not any(not sample.validation for sample in taken):
         raise InputError(f'{path} has no rows to fit, only such that are marked test')
-    fitted, held_out = collect(taken, sigmas)
+    frames = Frames()
+    fitted, held_out = collect(taken, sigmas, frames)
     by_line = 'stamp_ns' not in header
     world_frame = next((sample.frame_id for sample in taken if sample.frame_id), '')
-    return Table(fitted, held_out, reader.pairs(taken), warnings, world_frame, by_line)
+    cameras = lenses(taken, frames)
+    return Table(fitted, held_out, reader.pairs(taken), warnings, world_frame, by_line, cameras)
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
@@ -206,7 +214,7 @@ def columns(joints: int) -> list[str]:
         'spread',
         'session',
         'split',
-        *SOCKET,
+        *(name for names in LATER for name in names),
     ]
 
 
@@ -231,7 +239,8 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row.append('1' if sample.eye_in_hand else '')
     row += [repr(sample.delay), str(sample.count), repr(sample.spread), sample.session]
     row.append(split or ('test' if sample.validation else 'train'))
-    return [*row, *map(to_cell, place)]
+    view = '' if sample.view is None else view_cell(sample.view)
+    return [*row, *map(to_cell, place), view]
 
 
 def table_text(samples: Sequence[Sample], joints: int) -> str:
@@ -396,7 +405,14 @@ class _Reader:
                 raise InputError(f'{self._path}, line {line}: c11 ... c66: {fault}')
             covariance = covariance if covariance.any() else None
         rotation = None if quat is None else se3.from_quat(quat)
-        return replace(plain, position=position, rotation=rotation, covariance=covariance)
+        text = row.get('view')
+        return replace(
+            plain,
+            position=position,
+            rotation=rotation,
+            covariance=covariance,
+            view=view_of(text, f'{self._path}, line {line}: view') if text else None,
+        )
 
     def pairs(self, samples: Sequence[Sample]) -> tuple[tuple[str, str], ...]:
         """Return the names of the base frames of the two sockets of each location."""
