@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files.tables import SOCKET, cells, columns
+from calib_ros.files.tables import SOCKETS, cells, columns
 from calib_ros.sampling.sample import Sample
 
 
@@ -95,9 +95,9 @@ class Journal:
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""
         expected = ','.join(header).encode() + b'\n'
-        before = ','.join(header[: -len(SOCKET)]).encode() + b'\n'
+        before = ','.join(header[: -len(SOCKETS)]).encode() + b'\n'
         if os.pread(self._file, len(before), 0) == before:
-            expected, self._width = before, len(header) - len(SOCKET)
+            expected, self._width = before, len(header) - len(SOCKETS)
         found = os.pread(self._file, len(expected), 0)
         if not expected.startswith(found):
             raise InputError(
