@@ -24,7 +24,7 @@ from calib_ros.files.salvage import (
     salvage,
     unpacked_files,
 )
-from calib_ros.files.stored import LARGEST_MESSAGE, read
+from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
@@ -295,14 +295,14 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     return store.deserialize_cdr
 
 
-def _is_message(data: object) -> bool:
+def _is_message(stream: Stream, data: object) -> bool:
     """Tell whether it may be a message: a file may hold anything."""
-    return isinstance(data, bytes) and len(data) <= LARGEST_MESSAGE
+    return isinstance(data, bytes) and len(data) <= largest(stream)
 
 
 def _decodable(messages_on: Reading) -> Reading:
     """Leave out what cannot be a message; `_feed` tells of it."""
-    return lambda streams: (each for each in messages_on(streams) if _is_message(each[1]))
+    return lambda streams: (each for each in messages_on(streams) if _is_message(*each))
 
 
 def _extend(batch: list[tuple[Stream, bytes]], messages: Iterator[tuple[Stream, bytes]]) -> bool:
@@ -330,7 +330,7 @@ def _feed(
             ended = _extend(batch, messages)
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        usable = [each for each in batch if _is_message(each[1])]
+        usable = [each for each in batch if _is_message(*each)]
         problems = feed(session, usable, deserialise)
         count += len(usable) - len(problems)
         if len(usable) < len(batch):

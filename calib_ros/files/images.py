@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
+from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 
@@ -32,8 +33,6 @@ BENT = 5.0
 """Distance [px] from where the other corners say up to which lens and board may bend a board."""
 BENT_SHARE = 0.1
 """The same as a share of the distance between corners."""
-LARGEST_IMAGE = 200_000_000
-"""Bytes of a file."""
 Image = NDArray[np.uint8]
 
 
