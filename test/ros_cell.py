@@ -137,6 +137,13 @@ class Cell:
         self.spin_until(future.done)
         return future.result()
 
+    def in_full(self, answer):
+        """Return an answer of ~/identify in full: what stands beside the journal if it was cut."""
+        assert len(answer.message) <= 200
+        _, cut, name = answer.message.partition(' ... all of it: ')
+        folder = self.node._archive.folder
+        return (folder / name).read_text() if cut else answer.message
+
     def set_parameters(self, values, node='/calibration_node'):
         """Set parameters of a node; return the results that the client receives."""
         client = AsyncParameterClient(self.peer, node)

@@ -781,5 +781,5 @@ def test_a_negative_time_does_not_end_the_node(tmp_path, recording):
 def test_what_comes_out_after_the_end_is_no_error(tmp_path, capfd):
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         node = cell.node
-    node._guarded(node._status.publish)(String())
+    node._boundary.guarded(node._status.publish)(String())
     assert 'internal error' not in capfd.readouterr().err
