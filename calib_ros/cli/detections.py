@@ -8,7 +8,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from calib_ros.cli.inputs import SIGMA_TOUCH, Loaded, table
+from calib_ros.cli.inputs import Loaded, table
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ def detected(
     if lens is not None:
         chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
     given = settings.for_problem()
+    if options.sigma_touch is not None:
+        given['sigma_touch'] = options.sigma_touch
     if posed:
         given['fixed'] = (*given['fixed'], *(f'{name}.*' for name in chain.joint_names))
     problem = Problem(
@@ -63,7 +65,6 @@ def detected(
         seen,
         rows.held_out if options.csv is not None else None,
         more=more,
-        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
         **given,
     )
     reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'

@@ -310,7 +310,7 @@ def _extend(batch: list[tuple[Stream, bytes]], messages: Iterator[tuple[Stream, 
     size = 0
     for each in itertools.islice(messages, BATCH):
         batch.append(each)
-        size += len(each[1])
+        size += len(each[1]) if isinstance(each[1], bytes) else 0
         if size > MOST_AT_ONCE:
             return False
     return len(batch) < BATCH

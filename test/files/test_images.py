@@ -116,7 +116,7 @@ def test_boards_that_are_none_are_refused(tmp_path, old, new, said):
 @pytest.mark.parametrize(
     ('text', 'said'),
     [
-        ('image,corner,u\na,0,1\n', 'column v missing'),
+        ('image,corner,u\na,0,1\n', 'no column v;'),
         ('image,corner,u,v\na,24,1,2\n', 'line 2: corner must be from 0 to 23 on this board'),
         ('image,corner,u,v\na,0,1,2\na,0,1,2\n', 'line 3: corner 0 of image a is there already'),
         ('image,corner,u,v\na,0,x,2\n', 'line 2: u'),
