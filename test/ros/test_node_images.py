@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera on the flange before a printed board, live: from images to a calibration."""
 
+import sys
 import threading
 from array import array
 from functools import cache
@@ -284,6 +285,16 @@ def test_a_camera_info_that_cannot_be_used(change, said):
 def test_a_source_of_images_that_cannot_be(board, text, said):
     with pytest.raises(CalibrationError, match=said):
         cameras_of([text.replace('BOARD', str(board))])
+
+
+def test_what_images_need_is_told(monkeypatch, board):
+    with pytest.raises(ConfigError, match='mode must not be continuous'):
+        CalibrationSession(
+            load_chain('ur10e'), Settings(mode='continuous', sources=sources(board, Image))
+        )
+    monkeypatch.setitem(sys.modules, 'cv2', None)
+    with pytest.raises(ConfigError, match='photographs need OpenCV: sudo apt install'):
+        cameras_of(sources(board, Image))
 
 
 def test_bayer_patterns_become_grey():
