@@ -41,7 +41,7 @@ PRIOR |= {'p2': 1e-3, 'k3': 0.02}
 """Standard deviations by which they are wrong where a prior holds them."""
 
 
-def scene(nominal, seed, on_flange, known, images):
+def scene(nominal, seed, on_flange, kind, images):
     """Return the true chain, the nominal one with its lens, what was seen, and other joints.
 
     The lens is `given`, `fitted` from OFF on, or off by a PRIOR.
@@ -51,8 +51,12 @@ def scene(nominal, seed, on_flange, known, images):
     true = before_camera(faulty(nominal, Cell(), rng), camera, POINTS, on_flange, rng)
     seen = photograph(true, camera, POINTS, on_flange, images, rng, SIGMA)
     other = photograph(true, camera, POINTS[:1], on_flange, 50, rng).joints
-    off = {'given': {}, 'fitted': OFF, 'prior': {k: s * rng.normal() for k, s in PRIOR.items()}}
-    lens = replace(camera.lens.moved(off[known]), fixed=known == 'given')
+    off = {
+        'given': {},
+        'fitted': OFF,
+        'prior': {name: s * rng.normal() for name, s in PRIOR.items()},
+    }
+    lens = replace(camera.lens.moved(off[kind]), fixed=kind == 'given')
     frame = Frame(lens=lens)
     known = replace(nominal, tool=frame) if on_flange else replace(nominal, base=frame)
     return true, known, seen, other
