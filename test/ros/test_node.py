@@ -663,6 +663,9 @@ def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stag
         assert cell.node.session.calibration is good
         assert len(texts) == 1
         assert len(cell.node.session.samples) == STOPS
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
 
 
 def test_a_result_that_was_cancelled_at_last_is_not_published(monkeypatch, cell, recording):
