@@ -598,7 +598,7 @@ STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_jo
 def stages(monkeypatch):
     """Let identifications of model auto wait at each stage; return a queue that lets them go."""
     release, reached = queue.Queue(), []
-    identify_model = node_module.identify_model
+    identify_model = identifying_module.identify_model
 
     def slow(problem, model, progress):
         def at(stage):
