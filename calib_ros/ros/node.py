@@ -347,7 +347,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         tried('the journal', self._archive.write)
         status = tried('the status', self._publish_status) or ''
         tried('the next pose', self._guide.advise)
-        self._diagnostics.publish(status, self._answers())
+        self._diagnostics.publish(status, self._answers)
 
     def _publish_status(self) -> str:
         """Return how the session goes; its first words are published when they have changed."""
