@@ -62,7 +62,8 @@ class Diagnostics:
         if account is not None:
             judged = tried('judging', lambda: self._judged(account))
             level, words = judged or (level, words)
-            figures = tried('the figures', lambda: self._figures(account) | answers()) or {}
+            figures = tried('the figures', lambda: {**self._figures(account), **answers()})
+        figures = figures or {}
         if failed := self._boundary.failed:
             level = DiagnosticStatus.ERROR
             words = ''.join(f'{text}; ' for text in failed.values()) + words
