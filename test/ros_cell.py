@@ -60,7 +60,7 @@ LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
-node_module.DIAGNOSTICS_PERIOD = 0.25  # who waits for a report does not wait long
+node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
 node_module.JOIN_TIMEOUT = 60.0  # what was begun ends, however busy the machine is
 BURST_NS = 370_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""

@@ -37,7 +37,6 @@ from ros_cell import (
     shift,
     stamp_ns,
     topics,
-    true_arm,
     values_of,
 )
 from rosgraph_msgs.msg import Clock
@@ -64,16 +63,6 @@ from calib_ros.sampling.topics import outputs
 from calib_ros.settings import Settings
 
 SHIPPED = Path(__file__).parents[2] / 'config' / 'calibration_node.yaml'
-
-
-@pytest.fixture(scope='module')
-def truth():
-    return true_arm()
-
-
-@pytest.fixture(scope='module')
-def recording(truth):
-    return shift(truth)
 
 
 @pytest.fixture(scope='module')
@@ -154,12 +143,6 @@ def test_what_looks_wrong_is_told_live_and_of_a_bag(
         assert answer.success == accepted
         assert said in cell.in_full(answer)
         cell.spin_until(lambda: words and status in words[-1].data)
-
-
-@pytest.fixture
-def cell(tmp_path):
-    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
-        yield cell
 
 
 def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):
@@ -526,7 +509,6 @@ def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
     monkeypatch, tmp_path, recording, content, said
 ):
     """A node that did not start would take no samples, and a respawned one gives up."""
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
     path = tmp_path / 'of_before.yaml'
     if content is not None:
         path.write_text(content and dump_chain(load_chain('puma560')))
@@ -612,8 +594,7 @@ def stages(monkeypatch):
     return release, reached
 
 
-def test_the_status_names_the_stage_of_an_identification(monkeypatch, tmp_path, recording, stages):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_the_status_names_the_stage_of_an_identification(tmp_path, recording, stages):
     release, reached = stages
     with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
         words = cell.listen(String, 'calibration_node/status')
@@ -746,8 +727,7 @@ def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cel
 # What it publishes
 
 
-def test_diagnostics_status_and_corrected_pose(monkeypatch, tmp_path, recording, truth):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
     joints = joint_messages(recording)
     twice = joints[:1000] + joints[900:901] + joints[1000:]
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': 'A7'}
@@ -959,8 +939,7 @@ def test_namespace_and_remapping(tmp_path, recording):
         assert record['topics'] == ['/cell_2/ur/joint_states', '/tracker/pose']
 
 
-def test_stamps_follow_simulated_time(monkeypatch, tmp_path):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_stamps_follow_simulated_time(tmp_path):
     with Cell(chain='ur10e', data_dir=str(tmp_path), use_sim_time=True) as cell:
         diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
         cell.spin_until(lambda: diagnostics)  # it speaks although the clock stands still

@@ -24,10 +24,8 @@ from ros_cell import (
     direct,
     joint_messages,
     pose_messages,
-    shift,
     stamp_ns,
     topics,
-    true_arm,
     values_of,
 )
 from rosgraph_msgs.msg import Clock
@@ -45,18 +43,6 @@ from calib_ros.ros.outputs import Keeper
 from calib_ros.sampling.session import CalibrationSession
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-@pytest.fixture(scope='module')
-def recording():
-    return shift(true_arm())
-
-
-@pytest.fixture
-def cell(monkeypatch, tmp_path):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
-    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
-        yield cell
 
 
 @pytest.fixture
@@ -493,8 +479,7 @@ def test_stray_stamps_are_told_and_cost_nothing_else(cell, recording):
     assert len(cell.node.session.samples) == STOPS
 
 
-def test_poses_in_another_frame_than_frame_id_are_dropped(monkeypatch, tmp_path, recording):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_poses_in_another_frame_than_frame_id_are_dropped(tmp_path, recording):
     some = pose_messages(recording.poses)
     some[40].header.frame_id = 'camera'
     with Cell(chain='ur10e', data_dir=str(tmp_path), frame_id='tracker') as cell:
@@ -547,8 +532,7 @@ def test_broken_messages_are_counted_by_cause(cell, recording):
     assert cell.call('identify').success
 
 
-def test_an_overridden_qos(monkeypatch, tmp_path, recording):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_an_overridden_qos(tmp_path, recording):
     override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
     with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
@@ -615,8 +599,7 @@ def test_an_overridden_qos_leaves_other_topics_alone(tmp_path):
         assert offered('/measured_pose') == [ReliabilityPolicy.BEST_EFFORT]
 
 
-def test_a_queue_that_was_full_is_told(monkeypatch, tmp_path, recording):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_a_queue_that_was_full_is_told(tmp_path, recording):
     override = {'qos_overrides./joint_states.subscription.depth': 5}
     with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
