@@ -141,6 +141,7 @@ def test_what_looks_wrong_is_told_live_and_of_a_bag(
         cell.play(topics(recording))
         answer = cell.call('identify')
         assert answer.success == accepted
+        assert len(answer.message) <= 200
         assert said in cell.in_full(answer)
         cell.spin_until(lambda: words and status in words[-1].data)
 
@@ -343,7 +344,7 @@ def test_answers_are_in_the_log_as_well(cell, recording):
     told = cell.log()
 
     def said(name, answer, level):
-        text = f'~/{name}: {answer.message}'
+        text = f'~/{name}: {cell.in_full(answer)}'
         cell.spin_until(lambda: (text, level) in [(each.msg, each.level) for each in told])
 
     for name in ('identify', 'export', 'capture', 'remove_last', 'validate', 'save', 'load'):
@@ -390,7 +391,7 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
         assert ball.success, ball.message
         assert ball.message == 'sample 2 taken: ball in socket plate A/1'
         (path,) = tmp_path.glob('*Z.csv')
-        assert path.read_text().splitlines()[-1].endswith(',plate A,1')
+        assert path.read_text().splitlines()[-1].endswith(',plate A,1,')
         assert cell.call('remove_last').success
         cell.node.set_parameters([Parameter('socket', value='A')])
         assert 'socket must be LOCATION/SOCKET' in cell.call('capture').message
@@ -506,7 +507,7 @@ def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
     [(None, 'there is no file'), ('', 'is not a calibration'), ('puma', 'joints')],
 )
 def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
-    monkeypatch, tmp_path, recording, content, said
+    tmp_path, recording, content, said
 ):
     """A node that did not start would take no samples, and a respawned one gives up."""
     path = tmp_path / 'of_before.yaml'
@@ -763,7 +764,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         assert 'enough for the accuracy wanted' in words[0].data
 
 
-def test_the_status_tells_what_the_arm_does(monkeypatch, cell, recording):
+def test_the_status_tells_what_the_arm_does(cell, recording):
     joints = joint_messages(recording)
     session = cell.node.session
     assert session.state == 'waiting for joint states'

@@ -101,7 +101,7 @@ def test_candidates_that_are_none_stop_the_start(tmp_path):
         cell.start(chain='ur10e', data_dir=str(tmp_path), candidates=str(tmp_path / 'poses.csv'))
 
 
-def test_nothing_is_planned_for_distances_or_in_motion(tmp_path, recording, truth):
+def test_nothing_is_planned_for_distances_or_in_motion(tmp_path, recording):
     distances = np.linalg.norm(recording.poses.positions, axis=1)
     wire = pose_messages(recording.poses, Range, distances=distances)
     for more, parameters in (

@@ -708,7 +708,7 @@ def test_a_list_without_end_is_refused(cell):
     assert cell.node.session.settings.fixed == ()
 
 
-def test_a_negative_time_does_not_end_the_node(tmp_path, recording):
+def test_a_negative_time_does_not_end_the_node(tmp_path):
     with cell_and_child(data_dir=tmp_path, use_sim_time='true') as (cell, child):
         clock = cell.publisher(Clock, '/clock')
         stamps = cell.listen(DiagnosticArray, '/diagnostics', 10)
