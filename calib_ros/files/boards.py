@@ -146,19 +146,25 @@ def read_lens(path: Path) -> Lens:
     content = parse_yaml(read_text(path, what='intrinsics '), str(path))
     if not isinstance(content, dict):
         raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
-    model = content.get('distortion_model', DISTORTED[0])
+    return lens_of(
+        content.get('distortion_model', DISTORTED[0]),
+        _numbers(content, ('camera_matrix', 'k', 'K'), path),
+        _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False),
+        str(path),
+    )
+
+
+def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
+    """Return the lens of a camera matrix (9) row by row, and its distortion k1 k2 p1 p2 k3."""
     if model not in DISTORTED:
-        raise ConfigError(f'{path}: distortion_model must be plumb_bob, not {model!r}')
-    matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
+        raise ConfigError(f'{where}: distortion_model must be plumb_bob, not {model!r}')
     if len(matrix) != 9:
-        raise ConfigError(f'{path}: camera_matrix must hold 9 numbers, not {len(matrix)}')
-    fx, skew, cx, *rest = matrix
-    _, fy, cy = rest[:3]
+        raise ConfigError(f'{where}: camera_matrix must hold 9 numbers, not {len(matrix)}')
+    fx, skew, cx, _, fy, cy = matrix[:6]
     if skew or fx <= 0.0 or fy <= 0.0:
-        raise ConfigError(f'{path}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
-    distortion = _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False)
+        raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
     if any(distortion[5:]):
-        raise ConfigError(f'{path}: of distortion only k1 k2 p1 p2 k3 are known')
+        raise ConfigError(f'{where}: of distortion only k1 k2 p1 p2 k3 are known')
     k1, k2, p1, p2, k3 = (*distortion[:5], *(0.0,) * (5 - len(distortion[:5])))
     return Lens(fx, fy, cx, cy, k1, k2, p1, p2, k3)
 

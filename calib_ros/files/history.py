@@ -32,8 +32,6 @@ MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
 UNCACHED = 8
 """Rows of a robot that are read one by one before its cache is written anew."""
-PLAIN = {'use_dictionary': False, 'write_statistics': False}
-"""Of no use in a file of one row, and the most of it."""
 
 
 class History:
@@ -62,17 +60,13 @@ class History:
         """Add a row; return False where it was there already."""
         import pyarrow.parquet as parquet
 
-        if row.key in self.keys(row.serial):
+        path = self._path(row.serial, row.key)
+        if self._files.exists(path):
             return False
         buffer = io.BytesIO()
-        parquet.write_table(
-            _table_of(row),
-            buffer,
-            compression='zstd',
-            use_dictionary=False,
-            write_statistics=False,
-        )
-        self._write(f'{self._folder(row.serial)}/{row.key}{ENDING}', buffer.getvalue())
+        small = {'use_dictionary': False, 'write_statistics': False}  # most of a file of one row
+        parquet.write_table(_table_of(row), buffer, compression='zstd', **small)
+        self._write(path, buffer.getvalue())
         return True
 
     def serials(self) -> tuple[str, ...]:

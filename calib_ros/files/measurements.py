@@ -61,7 +61,7 @@ class Measurements:
         In metres; 0 of touched planes.
     covariance : (N, 6, 6), optional
         Of poses [m, rad].
-    session, device, target, frame_id : Codes
+    session, device, target, frame_id, view : Codes
     eye_in_hand, test, removed : (N,)
         Flags.
     delay, count, spread : (N,)
@@ -86,6 +86,7 @@ class Measurements:
     device: Codes
     target: Codes
     frame_id: Codes
+    view: Codes
     eye_in_hand: NDArray[np.bool_]
     test: NDArray[np.bool_]
     removed: NDArray[np.bool_]
@@ -222,6 +223,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         _devices(columns, kind),
         columns.labels('target'),
         columns.labels('frame_id'),
+        columns.labels('view'),
         choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
         split == 'test',
         split == 'removed',

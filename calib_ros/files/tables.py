@@ -5,14 +5,15 @@
 Joint values are in q1 ... qn. What was measured shows in the cells of the row that are filled: a
 pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), that a
 ball sat in a socket (location, socket) or that a plane was touched (plane), whose places are not
-known. Rows of all kinds may stand in one table.
+known. A pose may be that of a board whose corners are in the row (view). Rows of all kinds may
+stand in one table.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,14 +35,20 @@ from calib_ros.files.measurements import (
     measurements,
     named,
 )
+from calib_ros.files.views import view_cell, view_of
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.sample import Frames, Sample, socket_pairs
+from calib_ros.sampling.problems import with_lenses
+from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses, socket_pairs
 from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, decoded, read_bytes
 
-SOCKETS = ('location', 'socket')
+LATER = (('location', 'socket'), ('view',))
+"""Columns that journals of earlier versions do not have."""
 Sets = tuple[Observations, ...]
 
 
@@ -51,7 +58,7 @@ class Table(Shown):
 
     `pairs` names the frames of the two sockets of each location, `world_frame` is the first frame
     of measurements that the table names, if any. `by_line` tells that the table has no stamps: a
-    sample's is its line, in seconds.
+    sample's is its line, in seconds. `lenses` are those at the frames of cameras.
     """
 
     fitted: tuple[Observations, ...]
@@ -60,6 +67,19 @@ class Table(Shown):
     warnings: tuple[str, ...] = ()
     world_frame: str = ''
     by_line: bool = False
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
+
+    def problem(self, chain: Chain, sockets: float = SOCKETS, **more: Any) -> Problem:
+        """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
+        return Problem(
+            with_lenses(chain, self.lenses),
+            self.fitted[0],
+            self.held_out,
+            more=self.fitted[1:],
+            separations=tuple((*pair, sockets) for pair in self.pairs),
+            world_frame=self.world_frame,
+            **more,
+        )
 
 
 def read_table(
@@ -116,12 +136,18 @@ def table_of(
         raise InputError(f'{found.path} has no rows to fit, only such that are marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
-    fitted, held_out, pairs = _sets(made, sigmas)
+    frames, cameras = Frames(), dict[str, Lens]()
+    if made.view[1] == ['']:
+        fitted, held_out, pairs = _sets(made, sigmas, frames)
+    else:
+        samples = [*_samples(made)]
+        fitted, held_out = collect(samples, sigmas, frames)
+        pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
     place, names = made.frame_id
     first = np.flatnonzero(np.array([bool(name) for name in names])[place])[:1]
     world_frame = names[place[first[0]]] if len(first) else ''
     by_line = 'stamp_ns' not in found.header
-    return Table(fitted, held_out, pairs, warnings, world_frame, by_line)
+    return Table(fitted, held_out, pairs, warnings, world_frame, by_line, cameras)
 
 
 def check_table(made: MadeColumns) -> None:
@@ -131,10 +157,9 @@ def check_table(made: MadeColumns) -> None:
 
 
 def _sets(
-    made: Measurements, sigmas: tuple[float, float]
+    made: Measurements, sigmas: tuple[float, float], frames: Frames
 ) -> tuple[Sets, Sets, tuple[tuple[str, str], ...]]:
     """Return the sets to fit and held out, and the frames of the sockets of each location."""
-    frames = Frames()
     kinds, number = distinct(made.codes)
     examples = [
         Sample(
@@ -202,6 +227,8 @@ def _samples(made: Measurements) -> Iterator[Sample]:
             for name in ('approach', 'velocity', 'acceleration', 'covariance')
             for values in (getattr(made, name),)
         }
+        view = made.view[1][made.view[0][k]]
+        where = f'{made.path}, line {made.lines[k]}: view'
         yield Sample(
             int(made.stamps_ns[k]),
             made.joints[k],
@@ -210,6 +237,7 @@ def _samples(made: Measurements) -> Iterator[Sample]:
             distance=float(made.distance[k]) if kind in (DISTANCE, PLANE) else None,
             socket=kind == SOCKET,
             plane=kind == PLANE,
+            view=view_of(view, where) if view else None,
             eye_in_hand=bool(made.eye_in_hand[k]),
             validation=bool(made.test[k]),
             delay=float(made.delay[k]),
@@ -224,7 +252,7 @@ def columns(joints: int) -> list[str]:
     """Return the columns of a table that can hold every kind of sample."""
     names = ['stamp_ns', *(name for letter in 'qsva' for name in named(letter, joints))]
     names += [*POSITION, *QUATERNION, 'distance', *COVARIANCE, 'device', 'target', 'frame_id']
-    return [*names, 'eye_in_hand', 'delay', 'count', 'spread', 'session', 'split', *SOCKETS]
+    return [*names, 'eye_in_hand', 'delay', 'count', 'spread', 'session', 'split', *sum(LATER, ())]
 
 
 def cells(sample: Sample, split: str | None = None) -> list[str]:
@@ -249,7 +277,8 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row += [repr(sample.delay), str(sample.count), repr(sample.spread)]
     row.append(to_cell(sample.session))
     row.append(split or ('test' if sample.validation else 'train'))
-    return [*row, *map(to_cell, place)]
+    view = '' if sample.view is None else view_cell(sample.view)
+    return [*row, *map(to_cell, place), view]
 
 
 def table_text(samples: Sequence[Sample], joints: int) -> str:

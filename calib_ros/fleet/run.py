@@ -10,11 +10,11 @@ running; the next run does the rest.
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 from urllib.parse import quote
@@ -28,10 +28,18 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
-AHEAD = 20
-"""Tasks for each worker that the scheduler knows of: enough to keep it busy, few to lose."""
+AHEAD = 3
+"""Pieces of work for each worker that the scheduler knows of: none waits for more."""
+SPAN = 2.0
+"""Time [s] that a piece of several tasks takes: much to dask's 4 ms for it, little to lose."""
 PATIENCE = 60.0
 """Time [s] for a scheduler and its first worker to answer."""
+QUIET = {
+    'distributed.worker.profile.enabled': False,
+    'distributed.admin.tick.interval': '1s',
+    'distributed.admin.system-monitor.interval': '2s',
+}
+"""Settings of dask: it watches itself less, which takes more than its work."""
 NEVER = datetime.fromtimestamp(0, timezone.utc)
 Told: TypeAlias = Callable[[str, float], None]
 
@@ -98,7 +106,9 @@ def run(
         client = None
         for plan in (_new, _without_page):
             tasks = [task for robot in robots for task in plan(robot, history, out, found)]
-            if tasks and client is None:
+            if not tasks:
+                continue
+            if client is None:
                 client = stack.enter_context(_client(cluster))
                 told(f'dashboard: {client.dashboard_link}', 0.0)
             for number, (task, outcome) in enumerate(_done(client, tasks), 1):
@@ -184,7 +194,7 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         if cluster.address:
             where: Any = cluster.address
         else:
-            stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
+            stack.enter_context(dask.config.set(QUIET))
             where = stack.enter_context(
                 LocalCluster(
                     n_workers=cluster.workers or None,
@@ -216,28 +226,40 @@ def _version() -> str:
 def _done(
     client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks with what became of them, as they are done."""
-    if not tasks:
-        return
+    """Yield tasks with what became of them, as they are done: some at once, for dask's sake."""
     from distributed import as_completed
 
-    waiting = iter(tasks)
-    running: dict[str, Task] = {}
+    workers = max(1, len(client.nthreads()))
+    waiting, alone = deque(tasks), deque[Task]()
+    running: dict[str, tuple[Task, ...]] = {}
+    seconds, count = 0.0, 0
 
-    def submitted(count: int) -> list[Any]:
-        chosen = list(islice(waiting, count))
-        futures = client.map(work, chosen, pure=False) if chosen else []
+    def submitted() -> list[Any]:
+        chosen: list[tuple[Task, ...]] = []
+        while (waiting or alone) and len(running) + len(chosen) < AHEAD * workers:
+            fair = len(waiting) // (2 * workers)
+            fit = SPAN * count / max(seconds, 1e-9)
+            most = 1 if alone else max(1, min(fair, int(min(fit, len(waiting)))))
+            source = alone or waiting
+            chosen.append(tuple(source.popleft() for _ in range(most)))
+        futures = client.map(_all, chosen, [work] * len(chosen), pure=False) if chosen else []
         running.update(zip((future.key for future in futures), chosen, strict=True))
         return list(futures)
 
-    ahead = AHEAD * max(1, len(client.nthreads()))
-    completed = as_completed(submitted(ahead), client.loop, with_results=True, raise_errors=False)
-    for future, result in completed:
+    completed = as_completed(submitted(), client.loop, with_results=True, raise_errors=False)
+    for future, outcomes in completed:
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are filed, run again')
-        task = running.pop(future.key)
-        if len(running) <= ahead // 2:  # many at once cost the scheduler less
-            completed.update(submitted(ahead - len(running)))
-        if future.status == 'error':
-            result = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
-        yield task, result
+        done = running.pop(future.key)
+        if future.status == 'error' and len(done) > 1:  # which of them ends a worker?
+            alone.extend(done)
+            outcomes = ()
+        elif future.status == 'error':
+            outcomes = (Outcome(error=f'its worker ended: {shortened(str(future.exception()))}'),)
+        seconds, count = seconds + sum(each.seconds for each in outcomes), count + len(outcomes)
+        completed.update(submitted())
+        yield from zip(done, outcomes, strict=False)
+
+
+def _all(tasks: Sequence[Task], work: Callable[[Task], Outcome]) -> tuple[Outcome, ...]:
+    return tuple(work(task) for task in tasks)

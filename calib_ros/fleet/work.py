@@ -103,38 +103,39 @@ def work(task: Task) -> Outcome:
     """Do a task; what goes wrong is told of its source and harms nothing else."""
     begin = time.monotonic()
     try:
-        with fetched(task.source.url) as path:
-            inputs = input_of(path)
-            content = content_hash([each.sha256 for each in inputs], task.source.session)
-            if content in task.known and not task.page:
-                return Outcome()
-            problem, result, warnings, lines = _identify(path, task)
-            robot, source = task.robot, task.source
-            about = Filing(
-                robot.serial,
-                measured_at((*problem.sets, *problem.judging), source.modified),
-                content,
-                robot.settings_hash,
-                source.name,
-                source.fingerprint,
-            )
-            row = identified(result, about, warnings)
-            page = ''
-            if task.page:
-                origin = Origin(
-                    inputs,
-                    serial=robot.serial,
-                    settings=configuration_yaml(robot.chain.name, robot.settings),
-                )
-                wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
-                poses = poses_of(problem, result, lines)
-                report = identification_report(problem, result, poses, origin, warnings, wanted)
-                page = render(report, f'../../{PLOTLY}') or ''
+        outcome = _outcome(task)
     except (CalibrationError, OSError) as err:
-        return Outcome(error=shortened(str(err)))
+        outcome = Outcome(error=shortened(str(err)))
     except Exception as err:  # a fault of ours, or of a file system: it costs this source only
-        return Outcome(error=shortened(f'{type(err).__name__}: {err}'))
-    return Outcome(row, page=page, seconds=time.monotonic() - begin)
+        outcome = Outcome(error=shortened(f'{type(err).__name__}: {err}'))
+    return outcome._replace(seconds=time.monotonic() - begin)
+
+
+def _outcome(task: Task) -> Outcome:
+    robot, source = task.robot, task.source
+    with fetched(source.url) as path:
+        inputs = input_of(path)
+        content = content_hash([each.sha256 for each in inputs], source.session)
+        if content in task.known and not task.page:
+            return Outcome()
+        problem, result, warnings, lines = _identify(path, task)
+        about = Filing(
+            robot.serial,
+            measured_at((*problem.sets, *problem.judging), source.modified),
+            content,
+            robot.settings_hash,
+            source.name,
+            source.fingerprint,
+        )
+        row = identified(result, about, warnings)
+        if not task.page:
+            return Outcome(row)
+        configuration = configuration_yaml(robot.chain.name, robot.settings)
+        origin = Origin(inputs, serial=robot.serial, settings=configuration)
+        wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
+        poses = poses_of(problem, result, lines)
+        report = identification_report(problem, result, poses, origin, warnings, wanted)
+        return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
 
 
 @contextmanager
@@ -154,21 +155,10 @@ def _identify(path: Path, task: Task) -> tuple[Problem, Identification, tuple[st
     """Return problem, result, warnings, and whether the stamps are the lines of a table."""
     robot, settings = task.robot, task.robot.settings
     if path.suffix in TABLES:
-        table = read_table(
-            path,
-            len(robot.chain.joints),
-            (task.source.session,) if task.source.session else (),
-            (settings.sigma_position, settings.sigma_orientation),
-        )
-        problem = Problem(
-            robot.chain,
-            table.fitted[0],
-            table.held_out,
-            more=table.fitted[1:],
-            separations=tuple((*pair, 0.05) for pair in table.pairs),
-            world_frame=table.world_frame,
-            **settings.for_problem(),
-        )
+        sessions = (task.source.session,) if task.source.session else ()
+        sigmas = (settings.sigma_position, settings.sigma_orientation)
+        table = read_table(path, len(robot.chain.joints), sessions, sigmas)
+        problem = table.problem(robot.chain, **settings.for_problem())
         result = identify_model(problem, settings.model)
         return problem, result, table.warnings, table.by_line
     session = CalibrationSession(robot.chain, settings)
