@@ -18,10 +18,11 @@ from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
 from calib_ros.files.bags import Replayed, replay
+from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.mcap import LARGEST_CHUNK
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.salvage import recorded
-from calib_ros.files.tables import COVARIANCE, read_journal, read_table
+from calib_ros.files.tables import read_journal, read_table
 from calib_ros.files.trajectories import read_program
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations

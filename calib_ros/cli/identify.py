@@ -50,7 +50,7 @@ LAYOUT = (
     *('rotation_vector', 'inverse', 'shift', 'separator', 'decimal', 'sheet', 'joints'),
 )
 """Options of tables of others."""
-DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens', 'sigma_pixel')
+DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
 OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
@@ -123,7 +123,6 @@ def _add_detections(parser: argparse.ArgumentParser) -> None:
     )
     add('--intrinsics', type=Path, metavar='FILE', help='camera_info, by camera_calibration')
     add('--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given')
-    add('--sigma-pixel', type=float, metavar='PX', help='of a corner, 0.3 if not given')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:

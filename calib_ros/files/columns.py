@@ -1,26 +1,28 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns: numbers of all rows at once.
-
-What is made here is exactly what reading row by row makes, or nothing: where a table is not as
-regular as most are (quotes, rows that end early, a cell that is no number), None is returned, and
-whoever asked reads row by row and names the fault.
-"""
+"""A table by columns: numbers of all rows at once. What is wrong is said with its line."""
 
 from __future__ import annotations
 
+import csv
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.errors import InputError
+from calib_ros.escapes import from_cell
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import MOST_COLUMNS, Row
+from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, MOST_ROWS, csv_lines, read_text
+from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, cell_number
 
 Lines = NDArray[np.intp]
-NEWLINE = 10
+Codes = tuple[NDArray[np.intp], list[str]]
+"""The number (N,) of each row's text, and the texts in order of appearance."""
 IRREGULAR = ('"', '\r', '\0')
 """What cells are not cut at separators alone with."""
 WIDEST, FEW = 40, 100
@@ -28,19 +30,135 @@ WIDEST, FEW = 40, 100
 
 
 @dataclass(frozen=True, eq=False)
-class TextColumns:
-    """The columns of a regular text.
+class Columns:
+    """The columns of a table: of the file at `path`, with the `lines` (N,) of the rows."""
 
-    Attributes
-    ----------
-    header : tuple of str
-    lines : (N,)
-        Line of each row in the file.
-
-    """
-
+    path: Path
     header: tuple[str, ...]
     lines: Lines
+
+    def where(self, row: int, name: str) -> str:
+        """Return the place of a cell in words."""
+        return f'{self.path}, line {self.lines[row]}: {name}'
+
+    def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:
+        """Return the numbers (N, len(names)), NaN for empty cells.
+
+        Many columns at once take hardly longer than one. Errors name them as they are `called`.
+
+        Raises
+        ------
+        InputError
+            When a cell is no number.
+
+        """
+        found = self._numbers(names)
+        if found is not None:
+            return found
+        parsed = np.full((len(self.lines), len(names)), np.nan)
+        first: tuple[int, int, str] | None = None
+        for k, name in enumerate(names):
+            texts = self.texts(name)
+            for row, text in enumerate(texts[: first[0]] if first else texts):
+                try:
+                    parsed[row, k] = float(text) if text else np.nan
+                except ValueError:
+                    parsed[row, k] = np.inf
+                if text and not np.isfinite(parsed[row, k]):
+                    first = (row, k, text)
+                    break
+        if first is not None:
+            row, k, text = first
+            cell_number(text, self.where(row, (called or names)[k]))
+        return parsed
+
+    def block(
+        self,
+        names: Sequence[str],
+        largest: float = LARGEST,
+        values: FloatArray | None = None,
+        needed: NDArray[np.bool_] | bool = True,
+    ) -> FloatArray:
+        """Return numbers (N, len(names)) of which each row has all or, if not `needed`, none.
+
+        `values` are the numbers of the columns where they are known.
+
+        Raises
+        ------
+        InputError
+            When a row has some of them only, or one beyond the largest.
+
+        """
+        found = self.numbers(names) if values is None else values
+        nothing = np.isnan(found)
+        lacking = nothing.any(axis=1)
+        if lacking.any():
+            lacking &= needed | ~nothing.all(axis=1)
+        if lacking.any():
+            row = int(lacking.argmax())
+            cell_number('', self.where(row, names[int(nothing[row].argmax())]))
+        if max(-np.nanmin(found, initial=0.0), np.nanmax(found, initial=0.0)) > largest:
+            row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
+            cell_number(repr(found[row, k]), self.where(row, names[k]), largest)
+        return found
+
+    def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Return the integers (N,) of a column, for empty cells those given if any are.
+
+        Raises
+        ------
+        InputError
+            When a cell holds no integer of 64 bits.
+
+        """
+        texts = self.texts(name)
+        try:
+            found = np.array([int(text) for text in texts], dtype=np.int64)
+            if list(map(str, found.tolist())) == texts:
+                return found
+        except (ValueError, OverflowError):
+            pass
+        numbers = [
+            int(blank[row])
+            if blank is not None and not text
+            else cell_integer(text, self.where(row, name))
+            for row, text in enumerate(texts)
+        ]
+        return np.array(numbers, dtype=np.int64)
+
+    def labels(self, name: str) -> Codes:
+        """Return the number of each row's name, and the names; empty ones without the column."""
+        if name not in self.header:
+            return np.zeros(len(self.lines), dtype=np.intp), ['']
+        numbers, found = self.codes(name)
+        place, names = numbered([from_cell(each) for each in found])
+        return place[numbers], names
+
+    def blank(self, name: str) -> NDArray[np.bool_]:
+        """Return (N,) which cells of a column are empty."""
+        raise NotImplementedError
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column."""
+        raise NotImplementedError
+
+    def select(self, rows: NDArray[np.generic] | slice) -> Columns:
+        """Return some of the rows, by a mask, by indices or by a slice."""
+        raise NotImplementedError
+
+    def codes(self, name: str) -> Codes:
+        """Return the number of each row's text, and the texts."""
+        return numbered(self.texts(name))
+
+    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+        """Return the numbers of columns, None where a cell may be none."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class TextColumns(Columns):
+    """The columns of a regular text: cells are what is between separators."""
+
     _rows: Sequence[str]
     _separator: str
     _bytes: NDArray[np.uint8]
@@ -51,56 +169,34 @@ class TextColumns:
         """Return (N,) which cells of a column are empty."""
         return self._empty[:, self.header.index(name)]
 
-    def numbers(self, names: Sequence[str]) -> FloatArray | None:
-        """Return the numbers (N, len(names)), NaN for empty cells; None where one is no number.
-
-        Many columns at once take hardly longer than one.
-        """
-        columns = [self.header.index(name) for name in names]
-        blank = self._empty[:, columns]
-        some = np.flatnonzero(~blank.all(axis=0))
-        if not len(some):
-            return np.full(blank.shape, np.nan)
-        rows = self._filled if blank[:, some].any() else self._rows
-        use = [columns[k] for k in some.tolist()]
-        try:
-            read = np.loadtxt(rows, delimiter=self._separator, usecols=use, ndmin=2, comments=None)
-        except (ValueError, OverflowError):
-            return None
-        found = read
-        if len(some) < len(names):
-            found = np.full(blank.shape, np.nan)
-            found[:, some] = read
-        return found if (np.isfinite(found) | blank).all() else None
-
-    def integers(self, name: str) -> NDArray[np.int64] | None:
-        """Return the integers (N,) of a column as written; None where one is not."""
-        texts = self.texts(name)
-        try:
-            found = np.array([int(text) for text in texts], dtype=np.int64)
-        except (ValueError, OverflowError):
-            return None
-        return found if list(map(str, found.tolist())) == texts else None
-
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
         k = self.header.index(name)
         return [row.split(self._separator, k + 1)[k] for row in self._rows]
 
-    def codes(self, name: str) -> tuple[NDArray[np.intp], list[str]]:
-        """Return the number (N,) of each row's text, and the texts in order of appearance."""
-        starts, ends = self._spans(name)
-        width = int((ends - starts).max(initial=0))
-        if width == 0:
+    def select(self, rows: NDArray[np.generic] | slice) -> TextColumns:
+        """Return some of the rows, by a mask, by indices or by a slice."""
+        index = np.arange(len(self.lines))[rows]
+        text = '\n'.join([self._rows[k] for k in index.tolist()])
+        found = regular(self.path, text, self._separator, self.header)
+        assert found is not None
+        return replace(found, lines=self.lines[index])
+
+    def codes(self, name: str) -> Codes:
+        """Return the number of each row's text, and the texts."""
+        k, width = self.header.index(name), len(self.header)
+        starts, ends = self._ends[k:-1:width] + np.int32(1), self._ends[k + 1 :: width]
+        longest = int((ends - starts).max(initial=0))
+        if longest == 0:
             return np.zeros(len(starts), dtype=np.intp), ['']
-        if width > WIDEST:
-            return _numbered(self.texts(name))
-        place = starts[:, np.newaxis] + np.arange(width, dtype=np.int32)
+        if longest > WIDEST:
+            return numbered(self.texts(name))
+        place = starts[:, np.newaxis] + np.arange(longest, dtype=np.int32)
         beyond = place >= ends[:, np.newaxis]
         place[beyond] = 0
         cells = self._bytes[place]
         cells[beyond] = 0
-        words = np.ascontiguousarray(cells).view(f'S{width}').ravel()
+        words = np.ascontiguousarray(cells).view(f'S{longest}').ravel()
         numbers = np.full(len(words), -1, dtype=np.intp)
         known: list[str] = []
         first = 0
@@ -112,13 +208,26 @@ class TextColumns:
             if not rest.any():
                 return numbers, known
             first += int(np.argmax(rest))
-        return _numbered(self.texts(name))
+        return numbered(self.texts(name))
 
-    def _spans(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return where the cells of a column begin and end (N,)."""
-        k, width = self.header.index(name), len(self.header)
-        flat = self._ends
-        return flat[k:-1:width] + np.int32(1), flat[k + 1 :: width]
+    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+        columns = [self.header.index(name) for name in names]
+        blank = self._empty[:, columns]
+        some = np.flatnonzero(~blank.all(axis=0))
+        found = np.full(blank.shape, np.nan)
+        if not len(some):
+            return found
+        rows = self._filled if blank[:, some].any() else self._rows
+        use = [columns[k] for k in some.tolist()]
+        try:
+            read = np.loadtxt(rows, delimiter=self._separator, usecols=use, ndmin=2, comments=None)
+        except (ValueError, OverflowError):
+            return None
+        if len(some) == len(names):
+            found = read
+        else:
+            found[:, some] = read
+        return found if (np.isfinite(found) | blank).all() else None
 
     @cached_property
     def _empty(self) -> NDArray[np.bool_]:
@@ -136,8 +245,82 @@ class TextColumns:
         return text[1:-1].split('\n')
 
 
+@dataclass(frozen=True, eq=False)
+class MadeColumns(Columns):
+    """Columns that were computed, `values` (N,) with NaN where there is none, or cut by csv."""
+
+    values: Mapping[str, FloatArray]
+    words: Mapping[str, Sequence[str]]
+    header: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Name the columns."""
+        object.__setattr__(self, 'header', (*self.words, *self.values))
+
+    def select(self, rows: NDArray[np.generic] | slice) -> MadeColumns:
+        """Return some of the rows, by a mask, by indices or by a slice."""
+        index = np.arange(len(self.lines))[rows].tolist()
+        return replace(
+            self,
+            lines=self.lines[rows],
+            values={name: value[rows] for name, value in self.values.items()},
+            words={name: [words[k] for k in index] for name, words in self.words.items()},
+        )
+
+    def blank(self, name: str) -> NDArray[np.bool_]:
+        """Return (N,) where a column holds nothing."""
+        if name in self.words:
+            return np.array([not word for word in self.words[name]], dtype=bool)
+        return np.isnan(self.values[name])
+
+    def texts(self, name: str) -> list[str]:
+        """Return the cells of a column."""
+        if name in self.words:
+            return list(self.words[name])
+        return ['' if value != value else repr(value) for value in self.values[name].tolist()]
+
+    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+        if set(names) & set(self.words):
+            return None
+        return np.column_stack([self.values[name] for name in names])
+
+
+def read_columns(path: Path, needed: Sequence[str]) -> Columns:
+    """Return the columns of a CSV with rows, some of which it needs to have.
+
+    Raises
+    ------
+    InputError
+        When it has not, or is no table.
+
+    """
+    found = columns_of(path, read_text(path, LARGEST_TABLE, InputError))
+    missing = [name for name in needed if name not in found.header]
+    if missing:
+        raise InputError(
+            f'{path} has no column {", ".join(missing)}; expected {", ".join(needed)}; found '
+            f'{", ".join(found.header) or "nothing"}'
+        )
+    if not len(found.lines):
+        raise InputError(f'{path} has no rows')
+    return found
+
+
+def columns_of(path: Path, text: str) -> Columns:
+    """Return the columns of the text of a CSV.
+
+    Raises
+    ------
+    InputError
+        When it is no table, has more columns or rows than any, or cells that no column or
+        several columns could be meant with.
+
+    """
+    return regular(path, text) or _irregular(path, text)
+
+
 def regular(
-    text: str, separator: str = ',', header: Sequence[str] = (), above: int = 0
+    path: Path, text: str, separator: str = ',', header: Sequence[str] = (), above: int = 0
 ) -> TextColumns | None:
     """Return the columns of a text, None where it is not regular.
 
@@ -147,79 +330,80 @@ def regular(
         text = text.replace('\r\n', '\n')
     if not text or any(each in text for each in IRREGULAR):
         return None
-    rows = text.split('\n')
-    if not rows[-1]:
-        rows.pop()
-    lines = np.arange(above + 1, above + 1 + len(rows))
-    whole = '' not in rows
-    if not whole:
+    if not text.endswith('\n'):
+        text += '\n'
+    lines = above + 1 + np.arange(text.count('\n'))
+    if text.startswith('\n') or '\n\n' in text:  # blank lines
+        rows = text.split('\n')[:-1]
         lines = lines[[bool(row) for row in rows]]
-        rows = [row for row in rows if row]
+        text = '\n'.join([*filter(None, rows), ''])
     if not header:
-        if not rows:
-            return None
-        header, lines = rows[0].split(separator), lines[1:]
-        rows, whole = rows[1:], False
+        first, _, text = text.partition('\n')
+        header, lines = first.split(separator), lines[1:]
     width = len(header)
-    if not rows or len(set(header)) < width or width > MOST_COLUMNS:
+    if not len(lines) or len(set(header)) < width or width > MOST_COLUMNS:
         return None
-    body = text if whole and text.endswith('\n') else '\n'.join(rows) + '\n'
-    flat = np.frombuffer(f'\n{body}'.encode(), dtype=np.uint8)
-    ends = np.flatnonzero((flat == ord(separator)) | (flat == NEWLINE)).astype(np.int32)
-    if len(ends) != width * len(rows) + 1 or not (flat[ends[::width]] == NEWLINE).all():
+    flat = np.frombuffer(text.encode(), dtype=np.uint8)
+    ends = np.flatnonzero((flat == ord(separator)) | (flat == ord('\n'))).astype(np.int32)
+    if len(ends) != width * len(lines) or not (flat[ends[width - 1 :: width]] == ord('\n')).all():
         return None
-    return TextColumns(tuple(header), lines, rows, separator, flat, ends)
+    ends = np.concatenate([np.array([-1], dtype=np.int32), ends])
+    rows = text[:-1].split('\n')
+    return TextColumns(path, tuple(header), lines, rows, separator, flat, ends)
 
 
-def _numbered(texts: Sequence[str]) -> tuple[NDArray[np.intp], list[str]]:
-    """Return the number (N,) of each text, and the different ones in order of appearance."""
+def _irregular(path: Path, text: str) -> MadeColumns:
+    """Return the columns of a text with quotes, or with rows that end early."""
+    reader = csv.reader(csv_lines(text, str(path)), strict=True)
+    header: list[str] = []
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    try:
+        for row in reader:
+            if not (row and header):
+                header = header or row
+                if len(header) > MOST_COLUMNS:
+                    raise InputError(f'{path} has {len(header)} columns, more than {MOST_COLUMNS}')
+                continue
+            if any(row[len(header) :]):
+                raise InputError(
+                    f'{path}, line {reader.line_num}: more values than the {len(header)} columns'
+                )
+            if len(rows) == MOST_ROWS:
+                raise InputError(
+                    f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
+                )
+            rows.append([*row[: len(header)], *[''] * (len(header) - len(row))])
+            lines.append(reader.line_num)
+    except csv.Error as err:
+        raise InputError(f'cannot read {path}: {err}') from err
+    twice = [name for name, count in Counter(header).items() if name and count > 1]
+    if twice:
+        raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
+    cells = zip(*rows, strict=True) if rows else [()] * len(header)
+    words = dict(zip(header, cells, strict=True))
+    return MadeColumns(path, np.array(lines, dtype=np.intp), {}, words)
+
+
+def numbered(texts: Sequence[str]) -> Codes:
+    """Return the number of each text, and the different ones."""
     known: dict[str, int] = {}
     numbers = [known.setdefault(text, len(known)) for text in texts]
     return np.array(numbers, dtype=np.intp), list(known)
 
 
-@dataclass(frozen=True, eq=False)
-class MadeColumns:
-    """Columns that were computed: numbers (N,), NaN where there is none, and texts."""
+def check_quaternions(columns: Columns, quat: FloatArray) -> None:
+    """Refuse quaternions (N, 4) of rows that are not of length 1, but for NaN."""
+    lengths = np.sqrt(np.einsum('ni,ni->n', quat, quat))
+    for row in np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)[:1].tolist():
+        raise InputError(
+            f'{columns.where(row, "quaternion")} qx qy qz qw has length {lengths[row]:.6g}, '
+            'expected 1'
+        )
 
-    lines: Lines
-    values: Mapping[str, FloatArray]
-    words: Mapping[str, Sequence[str]]
 
-    @property
-    def header(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-        return (*self.words, *self.values)
-
-    def blank(self, name: str) -> NDArray[np.bool_]:
-        """Return (N,) where a column holds nothing."""
-        if name in self.words:
-            return np.array([not word for word in self.words[name]])
-        return np.isnan(self.values[name])
-
-    def numbers(self, names: Sequence[str]) -> FloatArray | None:
-        """Return the numbers (N, len(names)), NaN where there is none."""
-        return np.column_stack([self.values[name] for name in names])
-
-    def integers(self, name: str) -> NDArray[np.int64] | None:
-        """Return the integers (N,) of a column."""
-        return np.array([int(word) for word in self.words[name]], dtype=np.int64)
-
-    def texts(self, name: str) -> list[str]:
-        """Return the cells of a column."""
-        if name in self.words:
-            return list(self.words[name])
-        return ['' if value != value else repr(value) for value in self.values[name].tolist()]
-
-    def codes(self, name: str) -> tuple[NDArray[np.intp], list[str]]:
-        """Return the number (N,) of each row's text, and the texts in order of appearance."""
-        return _numbered(self.texts(name))
-
-    def rows(self) -> list[tuple[int, Row]]:
-        """Return the rows with their lines."""
-        columns = [self.texts(name) for name in self.header]
-        cells = zip(*columns, strict=True)
-        return [
-            (line, dict(zip(self.header, row, strict=True)))
-            for line, row in zip(self.lines.tolist(), cells, strict=True)
-        ]
+def lines_in_words(lines: Sequence[int]) -> str:
+    """Return which lines of a file, the first ones by their numbers."""
+    shown = ', '.join(map(str, lines[:5]))
+    more = f' and {len(lines) - 5} more' if len(lines) > 5 else ''
+    return f'line{"s" if len(lines) > 1 else ""} {shown}{more}'

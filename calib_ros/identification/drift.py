@@ -87,7 +87,7 @@ class Shifts:
     ----------
     system : System
         Samples in the order in which they were taken; those of one stop move together.
-    residuals : sequence of (N, c)
+    residuals : sequence of (c, N)
         Weighted residuals of each set, sample by sample.
 
     """
@@ -100,29 +100,30 @@ class Shifts:
         self._circles: list[NDArray[np.complex128]] = []
         self._energy = np.zeros(count)
         for begins, residual in zip(self._begins, residuals, strict=True):
-            series = _by_stop(residual, begins).T
+            series = _by_stop(residual, begins)
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
             self._circles.append(np.fft.rfft(circle))
             length = len(begins)
             squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
-            slow = _correlation(slow_cosines(length)[:, np.newaxis], self._circles[-1], length)
+            spectrum = _spectrum(slow_cosines(length)[:, np.newaxis], self._circles[-1])
+            slow = np.fft.irfft(spectrum, 2 * length)
             energy = squares[length : 3 * length] - squares[: 2 * length]
             self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
 
     def columns(self, columns: Sequence[FloatArray], inverse: FloatArray) -> Columns:
-        """Return weighted columns, (N, c, P) for each set, with their products."""
+        """Return weighted columns, (P, c, N) for each set, with their products."""
         found = []
         products = np.zeros((len(inverse), len(self._share)))
         for begins, circle, column in zip(self._begins, self._circles, columns, strict=True):
             series = _by_stop(column, begins)
-            whole = np.linalg.norm(series, axis=(0, 1))
+            whole = np.linalg.norm(series, axis=(1, 2))
             slow = slow_cosines(len(begins))
-            series -= np.tensordot(slow, np.tensordot(slow, series, axes=1), axes=(0, 0))
-            series *= np.linalg.norm(series, axis=(0, 1)) > CONSTANT * whole
-            moved = _correlation(series.transpose(2, 1, 0), circle, len(begins)).sum(axis=1)
-            products += self._sampled(moved)
-            found.append(series.reshape(-1, series.shape[2]))
-        return Columns(np.concatenate(found), products, inverse)
+            series -= series @ slow.T @ slow
+            series *= (np.linalg.norm(series, axis=(1, 2)) > CONSTANT * whole)[:, None, None]
+            spectrum = _spectrum(series, circle).sum(axis=1)
+            products += self._sampled(np.fft.irfft(spectrum, 2 * len(begins)))
+            found.append(series.reshape(len(series), -1))
+        return Columns(np.concatenate(found, axis=1).T, products, inverse)
 
     def shares(self, before: Columns, groups: Sequence[Columns]) -> FloatArray:
         """Return the share (G, S) that each group of columns explains beside those before.
@@ -147,10 +148,9 @@ class Shifts:
 
 
 def _by_stop(values: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
-    """Return (n, ...) the sums over each stop of (N, ...), by the root of their number."""
-    count = np.diff([*begins, len(values)])
-    sums = np.add.reduceat(values, begins, axis=0)
-    return np.asarray(sums / np.sqrt(count).reshape(-1, *[1] * (values.ndim - 1)))
+    """Return (..., n) the sums over each stop of (..., N), by the root of their number."""
+    count = np.diff([*begins.tolist(), values.shape[-1]])
+    return np.asarray(np.add.reduceat(values, begins, axis=-1) / np.sqrt(count))
 
 
 def slow_cosines(length: int) -> FloatArray:
@@ -160,10 +160,10 @@ def slow_cosines(length: int) -> FloatArray:
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 
 
-def _correlation(series: FloatArray, circle: NDArray[np.complex128], length: int) -> FloatArray:
-    """Return (..., c, 2 n): series (..., c, n) times the circle moved by each shift, summed."""
-    spectrum = np.conj(np.fft.rfft(series, 2 * length)) * circle
-    return np.asarray(np.fft.irfft(spectrum, 2 * length))
+def _spectrum(series: FloatArray, circle: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return the spectrum of the circular correlation of series (..., c, n) with the circle."""
+    length = series.shape[-1]
+    return np.asarray(np.conj(np.fft.rfft(series, 2 * length)) * circle)
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
@@ -190,10 +190,10 @@ def chance_of_gain(
     The system is linearised at a chain that is fitted by those before.
     """
     names = [*before, *added]
-    rows = [samples.rows_of(chain, names) for samples in system.sets]
-    shifts = Shifts(system, [each[:, :, -1] for each in rows])
+    rows = system.rows_of(chain, names)
+    shifts = Shifts(system, [each[-1] for each in rows])
     prior = system.prior
     inverse = np.zeros(len(names)) if prior is None else prior.rows(chain, names)[0]
-    columns = shifts.columns([each[:, :, :-1] for each in rows], inverse)
+    columns = shifts.columns([each[:-1] for each in rows], inverse)
     known, more = columns[: len(before)], columns[len(before) :]
     return chance(shifts.shares(known, [more])[0])

@@ -60,7 +60,6 @@ class Fitted:
 
     problem: Problem
     names: tuple[str, ...]
-    system: System
     robust: Robust
     factor: FloatArray
     noise: Noise
@@ -71,6 +70,11 @@ class Fitted:
     def chain(self) -> Chain:
         """Return the fitted chain."""
         return self.robust.fit.chain
+
+    @property
+    def system(self) -> System:
+        """Return the samples with their weights in the fit."""
+        return self.robust.system
 
     def posterior(
         self, noise: float, more: Sequence[str] = (), doubts: Mapping[str, float] | None = None
@@ -150,9 +154,9 @@ def _fit(
     fit = robust.fit
     factor = fit.normal.factor()
     if factor is None:
-        factor = triangular_factor(fit.chain, names, system)
-    noise, uncertainty = noise_of(fit, names, system, factor)
-    return Fitted(problem, names, system, robust, factor, noise, uncertainty, noise.size)
+        factor = triangular_factor(fit.chain, names, robust.system)
+    noise, uncertainty = noise_of(fit, names, robust.system, factor)
+    return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
 
 
 def _told_by(noise: Noise, simpler: Simpler | None) -> float:

@@ -26,6 +26,7 @@ from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import ROUNDING, group_of
 from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
+from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import log_gain
@@ -160,11 +161,10 @@ class _Linear:
             blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
         self._dealings = (self._groups % problem.folds, blocks[self._groups])
         rows = self._rows(self._names)
-        self._base = _stacked(rows)[:, :-1]
-        self._residual = _stacked(rows)[:, -1]
-        self._ends = np.cumsum([each[:, :, -1].size for each in rows])
-        widths = np.concatenate([np.full(len(each), each.shape[1]) for each in rows])
-        self._owner = np.repeat(np.arange(len(widths)), widths)
+        self._base = stacked(rows)[:, :-1]
+        self._residual = stacked(rows)[:, -1]
+        self._ends = np.cumsum([each[-1].size for each in rows])
+        self._owner = owners(rows)
         self._columns: dict[str, FloatArray] = {}
         self._seen: dict[str, Columns] = {}
         self._pairs = [
@@ -175,7 +175,7 @@ class _Linear:
         ]
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
-            self._shifts = Shifts(self._system, [each[:, :, -1] for each in rows])
+            self._shifts = Shifts(self._system, [each[-1] for each in rows])
 
     def useful(self, names: Sequence[str]) -> list[str]:
         """Return those effects whose columns are independent of the geometric model."""
@@ -229,7 +229,7 @@ class _Linear:
         assert self._shifts is not None
         missing = [name for name in names if name not in self._seen]
         if missing:
-            columns = [each[:, :, :-1] for each in self._rows(missing)]
+            columns = [each[:-1] for each in self._rows(missing)]
             found = self._shifts.columns(columns, self._priors(missing))
             self._seen |= {name: found[[k]] for k, name in enumerate(missing)}
         return Columns.side_by_side([self._seen[name] for name in names])
@@ -238,16 +238,16 @@ class _Linear:
         """Return the weighted columns (R, E) of effects, each made once."""
         missing = [name for name in names if name not in self._columns]
         if missing:
-            rows = _stacked(self._rows(missing))[:, :-1]
+            rows = stacked(self._rows(missing))[:, :-1]
             self._columns |= dict(zip(missing, rows.T, strict=True))
         if not names:
             return np.zeros((len(self._residual), 0))
         return np.column_stack([self._columns[name] for name in names])
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
-        """Return weighted Jacobian and residual (N, c, P + 1) of each set."""
+        """Return weighted Jacobian and residual (P + 1, c, N) of each set."""
         chain = self._chain.with_effects([name for name in names if name not in self._names])
-        return [samples.rows_of(chain, names) for samples in self._system.sets]
+        return self._system.rows_of(chain, names)
 
     def _left_out(self, chosen: Sequence[str], dealing: NDArray[np.intp]) -> FloatArray:
         """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
@@ -292,8 +292,3 @@ class _Linear:
                 size = max(effects.expected(name), self._sizes.get(group, 0.0))
             found[k] = self._noise / size if size else 0.0
         return found
-
-
-def _stacked(rows: Sequence[FloatArray]) -> FloatArray:
-    """Return (R, P) from (N, c, P) of each set."""
-    return np.concatenate([each.reshape(-1, each.shape[2]) for each in rows])

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, minimise, stacked, triangular_factor
 from calib_ros.identification.mistakes import NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
@@ -223,12 +223,8 @@ def _explained(
     problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str], poses: int = POSES
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""
-    parts = []
     few = [each.select(_few(len(each), poses)) for each in problem.sets]
-    for samples in problem.system(few).sets:
-        rows = samples.rows_of(chain, (*fitted, *added))
-        parts.append(rows.reshape(-1, rows.shape[2]))
-    rows = np.concatenate(parts)
+    rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
     count = len(fitted)
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0.0] = 1.0

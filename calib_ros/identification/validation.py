@@ -16,7 +16,7 @@ from calib_ros.identification.leastsquares import System, minimise, without_each
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.region import KNOWN
-from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weights_of
+from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -223,40 +223,25 @@ def _cross_validate(
     if folds < 2:
         return None, 'nothing: too few configurations to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
-    firsts = np.cumsum([0, *(len(each) for each in problem.sets)])
-
-    def part(fold: int, inside: bool) -> tuple[list[NDArray[np.intp]], System]:
-        chosen = [np.flatnonzero((group % folds == fold) == inside) for group in groups]
-        sets = [each.select(index) for each, index in zip(problem.sets, chosen, strict=True)]
-        pairs = zip(robust.distances, chosen, strict=True)
-        return chosen, _weighted(problem, sets, [distances[index] for distances, index in pairs])
-
-    def training(fold: int) -> System:
-        return part(fold, inside=False)[1]
-
-    order, judging, systems = [], [], []
-    for fold in range(folds):
-        left_out, system = part(fold, inside=True)
-        systems.append(system)
-        judging.append([samples.observations for samples in system.sets])
-        order += [out + first for out, first in zip(left_out, firsts[:-1], strict=True)]
-    parts = [
-        compare(first, second, sets)
-        for first, second, sets in zip(
-            without_each(before, frames, systems, training),
-            without_each(after, names, systems, training),
-            judging,
-            strict=True,
-        )
-    ]
-    index = np.argsort(np.concatenate(order))
+    numbers = [group % folds for group in groups]
+    chains = zip(
+        without_each(before, frames, robust.system, numbers),
+        without_each(after, names, robust.system, numbers),
+        strict=True,
+    )
+    fold, pieces = np.concatenate(numbers), []
+    for k, pair in enumerate(chains):
+        pairs = zip(problem.sets, numbers, strict=True)
+        sets = [each.select(np.flatnonzero(number == k)) for each, number in pairs]
+        pieces.append([[residuals(chain, each) for each in sets] for chain in pair])
+    index = np.argsort(np.argsort(fold, kind='stable'))
     whole = np.concatenate(groups)
+    first, second = (
+        _joined([each for piece in pieces for each in piece[side]], whole, index)
+        for side in (0, 1)
+    )
     return (
-        Comparison(
-            _joined([part.before for part in parts], whole, index),
-            _joined([part.after for part in parts], whole, index),
-            ~robust.outliers,
-        ),
+        Comparison(first, second, ~robust.outliers),
         f'{folds}-fold cross-validation over {count} distinct configurations{said}',
     )
 
@@ -268,16 +253,6 @@ def _repeated(problem: Problem) -> NDArray[np.bool_]:
     numbers = numbered((*problem.sets, *problem.judging))
     count = len(problem.sets)
     return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
-
-
-def _weighted(
-    problem: Problem, sets: Sequence[Observations], distances: Sequence[FloatArray]
-) -> System:
-    """Return sets with the weights of samples at distances (N,) in the fit to all."""
-    system = problem.system(sets)
-    for samples, distance in zip(system.sets, distances, strict=True):
-        samples.weights = np.sqrt(weights_of(distance, problem.loss))
-    return system
 
 
 def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
@@ -332,11 +307,13 @@ def _leave_one_place_out(
     Where the sockets of a place are is unknown; it is fitted to the place's own pairs, by arm and
     tool of the others. Outliers keep the weight that they have in the fit to all.
     """
-    pairs = list(zip(problem.sets, robust.distances, strict=True))
+    pairs = list(zip(problem.sets, robust.system.sets, strict=True))
 
     def part(place: set[str], inside: bool) -> System:
-        chosen = [pair for pair in pairs if (pair[0].base in place) == inside]
-        return _weighted(problem, [pair[0] for pair in chosen], [pair[1] for pair in chosen])
+        chosen = [samples for each, samples in pairs if (each.base in place) == inside]
+        known = {samples.observations.base for samples in chosen}
+        apart = tuple(pair for pair in robust.system.separations if {*pair[:2]} <= known)
+        return replace(robust.system, sets=tuple(chosen), separations=apart)
 
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]

@@ -41,6 +41,7 @@ from visualization_msgs.msg import MarkerArray
 
 from calib_ros.errors import CalibrationError, advice_on
 from calib_ros.files.archive import Archive
+from calib_ros.files.cameras import cameras_of
 from calib_ros.files.waypoints import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
@@ -115,6 +116,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             chain, given.settings, self._on_sample, self._archive.remove
         )
         self.session.socket_distance = given.socket_distance
+        self.session.pictures.cameras = cameras_of(given.settings.sources)
         self._filer = Filer(given.history, given.serial, chain)
         self._last = 'nothing identified yet'
         self._progress = Progress('identifying')

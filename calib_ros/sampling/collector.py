@@ -74,6 +74,12 @@ class Collector:
         self.notes: Counter[str] = Counter()
 
     @property
+    def images(self) -> set[int]:
+        """Return the numbers of the images that wait for their time."""
+        found = [rows.values[:, 0] for key, rows in self._waiting.items() if key.images]
+        return {int(number) for numbers in found for number in numbers.tolist()}
+
+    @property
     def waiting(self) -> int:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
@@ -90,7 +96,7 @@ class Collector:
         positions = [
             (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
             for key, rows in self._waiting.items()
-            if not (key.distance or key.eye_in_hand)
+            if not (key.distance or key.eye_in_hand or key.images)
         ]
         return stamps[complete], joints[complete], positions
 
@@ -364,6 +370,8 @@ class Collector:
                 self.unused['poses: the arm had just stopped'] += early
             self._count_causes(motion.cause)
             if len(good):
+                if key.images and len(good) > 1:
+                    self.unused['poses: of a stop of which one image is used'] += len(good) - 1
                 self.maker.of_stop(
                     key,
                     rows.stamps[good],

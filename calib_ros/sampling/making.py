@@ -77,6 +77,9 @@ class Maker:
         sigma: float,
     ) -> None:
         """Make one sample of the measurements of a stop, which scatter by `sigma` [m]."""
+        if key.images:
+            self._of_images(key, stamps, values, motion, delay_ns)
+            return
         oriented = not np.isnan(values[:, QUAT]).any()
         rotations = se3.from_quat(values[:, QUAT]) if oriented else None
         if not np.isnan(values[:, COVARIANCE]).any():
@@ -101,6 +104,23 @@ class Maker:
             approach=motion.approach[0].copy(),  # a view would keep the whole stop
             delay=1e-9 * delay_ns,
             spread=mean.spread,
+        )
+
+    def _of_images(
+        self, key: StreamKey, stamps: Stamps, values: FloatArray, motion: Motion, delay_ns: int
+    ) -> None:
+        """Make a sample of the images of a stop, of which one will be looked at."""
+        middle = len(stamps) // 2
+        steps = unwrapped(motion.joints - motion.joints[0], self._revolute)
+        self._add(
+            key,
+            int(stamps[middle]),
+            values[middle : middle + 1],
+            position=np.full(3, np.nan),
+            joints=motion.joints[0] + steps.mean(axis=0),
+            approach=motion.approach[0].copy(),
+            delay=1e-9 * delay_ns,
+            images=tuple(values[:, 0].astype(int).tolist()),
         )
 
     def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
@@ -179,4 +199,5 @@ def _key(sample: Sample) -> StreamKey:
         sample.distance is not None,
         sample.eye_in_hand,
         sample.frame_id,
+        sample.view is not None,
     )
