@@ -54,7 +54,7 @@ class History:
             self._files, self._root = url_to_fs(str(place))
         except (ImportError, ValueError) as err:
             raise ConfigError(f'a history cannot be at {place}: {err}') from err
-        self._local = 'file' in _protocols(self._files)
+        self._local = is_local(self._files)
 
     def file(self, row: Row) -> bool:
         """Add a row; return False where it was there already."""
@@ -115,6 +115,8 @@ class History:
             return [str(each) for each in self._files.ls(folder, detail=False, refresh=True)]
         except FileNotFoundError:
             return []
+        except OSError as err:
+            raise InputError(f'the history {folder} cannot be read: {err}') from err
 
     def _read(self, serial: str, key: str) -> Any:
         import pyarrow.parquet as parquet
@@ -169,9 +171,9 @@ class History:
             return
 
 
-def _protocols(files: Any) -> tuple[str, ...]:
-    known = files.protocol
-    return (known,) if isinstance(known, str) else tuple(known)
+def is_local(files: Any) -> bool:
+    """Tell whether a file system of fsspec is that of this machine."""
+    return 'file' in ((files.protocol,) if isinstance(files.protocol, str) else files.protocol)
 
 
 @cache
@@ -235,10 +237,11 @@ def _rows_of(table: Any) -> list[Row]:
     for values_of in zip(*columns.values(), strict=True):
         record = dict(zip(columns, values_of, strict=True))
         size = len(record['names'])
-        if record['covariance'].size != size * size:
+        square = record['covariance']
+        if square.size != size * size or not np.isfinite(square).all():
             raise InputError(
-                f'the covariance of {record["serial"]} in the history has no {size} rows'
+                f'the covariance of {record["serial"]} in the history is not one of {size} names'
             )
-        record['covariance'] = record['covariance'].reshape(size, size)
+        record['covariance'] = square.reshape(size, size)
         rows.append(Row(**record))
     return rows

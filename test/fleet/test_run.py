@@ -9,6 +9,8 @@ from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, LostError, run
+from calib_ros.fleet.standing import standings
+from calib_ros.fleet.work import Outcome, Source, Task
 
 
 @pytest.fixture(scope='module')
@@ -21,6 +23,10 @@ def cluster():
 def plant(tmp_path):
     path = plants.write_plant(tmp_path, ('A', 'B'), 2)
     return read_plant(path)
+
+
+def echoed(task):
+    return Outcome(error=task.source.url, seconds=0.01)
 
 
 def keys(history):
@@ -66,6 +72,28 @@ def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     assert found.filed == 1
     assert str(bad) in found.errors['A'][str(bad)]
     assert 'nothing matches' in found.errors['B']['']
+
+
+def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
+    history = History(tmp_path / 'history')
+    run(plant, history, cluster)
+    row = next(tmp_path.glob('history/robot=A/*.parquet'))
+    row.write_bytes(row.read_bytes()[:500])
+    (tmp_path / 'nights/B/002.csv').write_text(plants.night(*plants.robot(1), 2))
+    found = run(plant, history, cluster)
+    assert found.filed == 1
+    assert row.name in found.errors['A']['']
+    first, second = standings(plant, history, found)
+    assert (first.robot.serial, first.state, first.last) == ('A', 'unreadable', None)
+    assert (second.robot.serial, second.state) == ('B', 'fine')
+
+
+def test_small_tasks_go_together_and_each_is_told_of(plant, cluster):
+    tasks = [Task(plant[0], Source(str(number))) for number in range(200)]
+    with running._client(cluster) as client:
+        done = list(running._done(client, tasks, echoed))
+    assert sorted(int(outcome.error) for _, outcome in done) == list(range(200))
+    assert all(task.source.url == outcome.error for task, outcome in done)
 
 
 def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeypatch):

@@ -431,6 +431,9 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         assert holds.success, holds.message
         assert 'the calibration holds: RMS 0.0' in holds.message
         assert f'{STOPS} samples taken since' in holds.message
+        agrees = cell.call('check')
+        assert agrees.success, agrees.message
+        assert 'agrees with what was measured: RMS 0.0' in agrees.message
         cell.call('clear')
         moved = pose_messages(recording.poses)
         for message in moved:
@@ -440,6 +443,9 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         assert not broken.success
         assert 'does not hold any more' in broken.message
         assert 'RMS 3.0' in broken.message
+        bumped = cell.call('check')
+        assert not bumped.success
+        assert 'does not fit any more, changed: base' in bumped.message
     filed = {(row.kind, row.verdict): row for row in History(history).rows('7')}
     holds, broken = (filed['validate', text] for text in ('holds', 'does not hold'))
     assert set(filed) == {
