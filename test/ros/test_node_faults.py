@@ -65,6 +65,10 @@ def part(recording, first, last):
     }
 
 
+def begun(folder):
+    return any(path.stat().st_size for path in folder.glob('*Z.csv'))
+
+
 def samples_in(folder):
     (path,) = folder.glob('*Z.csv')
     return read_journal(path, 6)[0]
@@ -112,7 +116,7 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
     folder = tmp_path / '.ros' / 'calib_ros'
     with cell_and_child() as (cell, child):
         cell.play(part(recording, 0.0, 12.0))
-        cell.spin_until(lambda: list(folder.glob('*Z.csv')))
+        cell.spin_until(lambda: begun(folder))
         cell.spin_until(lambda: len(samples_in(folder)) == 10)
         child.kill()
     (path,) = folder.glob('*Z.csv')
@@ -249,7 +253,7 @@ def test_a_full_disk(tmp_path, recording):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         status = cell.listen(String, '/calibration_node/status')
         cell.play(part(recording, 0.0, 6.0))
-        cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
+        cell.spin_until(lambda: begun(tmp_path))
         cell.spin_until(lambda: len(samples_in(tmp_path)) == 4)
         (path,) = tmp_path.glob('*Z.csv')
         _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
