@@ -109,6 +109,8 @@ class Verification(Shown):
         Whether the poses wanted are those of the program before its correction.
     fitted : tuple of str
         Frames that were fitted to the new measurements.
+    holds : bool or None
+        Whether the error agrees with the one of the calibration (`Calibration.holds`), if known.
 
     """
 
@@ -125,6 +127,7 @@ class Verification(Shown):
     common: float
     by_program: bool
     fitted: tuple[str, ...] = ()
+    holds: bool | None = None
 
     @property
     def configurations(self) -> int:
@@ -204,6 +207,7 @@ def verify(
         common,
         commanded is not None,
         fitted,
+        arm.holds(rms),
     )
 
 
@@ -375,6 +379,11 @@ def remarks(found: Verification) -> list[str]:
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {MOST}'
         lines.append(f'{enough} configurations with the same RMS error would decide')
+    if found.tolerance is None and found.holds is False:
+        lines.append(
+            'the calibration does not hold any more: the error is larger than it was then. Was '
+            'the tracker, the target or the robot moved?'
+        )
     if found.common < MOVED:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.escapes import to_cell
-from calib_ros.files.columns import check_quaternions, read_columns
+from calib_ros.files.columns import check_quaternions
+from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.waypoints import POSE, joint_columns
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3

@@ -80,8 +80,11 @@ class Fitted:
         self, noise: float, more: Sequence[str] = (), doubts: Mapping[str, float] | None = None
     ) -> Posterior:
         """Return what the data of the fit tell, with `more` effects considered."""
-        model, given = self.problem.model, self.problem.given
-        return posterior_of(self.chain, model, self.names, self.system, noise, given, more, doubts)
+        model, given, names = self.problem.model, self.problem.given, self.names
+        known = None if more else self.robust.fit.normal
+        return posterior_of(
+            self.chain, model, names, self.system, noise, given, more, doubts, known
+        )
 
 
 def excited_names(

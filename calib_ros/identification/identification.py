@@ -30,7 +30,7 @@ from calib_ros.identification.fitting import (
     require_enough,
     some,
 )
-from calib_ros.identification.leastsquares import minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, minimise, normal_equations
 from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Problem
@@ -365,8 +365,8 @@ def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, l
     if len(names) == len(free):
         return {}
     few = problem.system([some(each) for each in problem.sets])
-    factor = triangular_factor(chain, free, few, priors=False)
-    return identifiability.trades(factor, free, names)
+    normal = normal_equations(chain, free, System(few.sets))
+    return identifiability.trades(normal.matrix, free, names)
 
 
 def _outliers(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:

@@ -224,12 +224,10 @@ def factor_of_some(factor: FloatArray, which: Sequence[int]) -> FloatArray:
     return np.asarray(np.linalg.qr(factor[:, which], mode='r'))
 
 
-def triangular_factor(
-    chain: Chain, names: Sequence[str], system: System, priors: bool = True
-) -> FloatArray:
-    """Return R (P, P), upper triangular, with R^T R the normal matrix; without priors if asked."""
+def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
+    """Return R (P, P), upper triangular, with R^T R the normal matrix."""
     size = len(names)
-    factor = system.extra_rows(chain, names)[0] if priors else np.zeros((0, size))
+    factor = system.extra_rows(chain, names)[0]
     for samples in system.sets:
         for parts in samples.parts(chain, names):
             rows = [part[:-1].reshape(size, -1) for part in parts]

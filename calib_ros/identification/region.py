@@ -235,10 +235,9 @@ class _Judge:
         self._placed = len(frames)
         self._rows = shift[[row[name] for name in [*frames, *(names[k] for k in own)]]]
         self._offsets = posterior.offsets[own]
-        self._doubted = [
-            (weight, mean[own], covariance[np.ix_(own, own)])
-            for weight, mean, covariance in posterior.doubted
-        ]
+        weights, means, covariances = zip(*posterior.doubted, strict=True)
+        self._weights, self._means = np.array(weights), np.array(means)[:, own]
+        self._covariances = np.array(covariances)[:, own][:, :, own]
         self._freedom = freedom
 
     def products(self, which: Sequence[int] | NDArray[np.intp]) -> FloatArray:
@@ -255,12 +254,8 @@ class _Judge:
         left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
         slope = left @ self._offsets
         gain = float(slope @ self._offsets)
-        risk = 0.0
-        for weight, mean, covariance in self._doubted:
-            margin = float(slope @ mean) - 0.5 * gain
-            spread = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
-            if spread == 0.0:
-                risk += weight * (margin <= 0.0)
-            else:
-                risk += weight * float(special.stdtr(min(self._freedom, KNOWN), -margin / spread))
-        return risk
+        margins = self._means @ slope - 0.5 * gain
+        spreads = np.sqrt(np.maximum(self._covariances @ slope @ slope, 0.0))
+        with np.errstate(divide='ignore', invalid='ignore'):
+            risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
+        return float(self._weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

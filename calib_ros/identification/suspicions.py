@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import System, minimise, stacked, triangular_factor
+from calib_ros.identification.leastsquares import System, factor_of, minimise, stacked
 from calib_ros.identification.mistakes import NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
@@ -173,7 +173,7 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
     names: list[str] = [*parameters_of('base'), *parameters_of('tool')]
     system = System((Samples(poses, 1e-4, 1e-4 / 0.3),))
-    names = list(excited(triangular_factor(start, names, system), names))
+    names = list(excited(factor_of(start, names, system), names))
     near = minimise(start, names, system, tolerance=1e-2).chain
     away = near.forward(joints)[:, :3, 3] - poses.positions
     return float(np.sqrt((away**2).sum(axis=1).mean()))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,7 @@ class Comparison(Shown):
         """Return how many pairs are named as outliers and left out of the figures."""
         return int((~self.judged).sum())
 
-    @property
+    @cached_property
     def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after, without outliers."""
         return self.before.figures(self.judged), self.after.figures(self.judged)
@@ -136,7 +137,7 @@ class Comparison(Shown):
         groups = {'configuration': self.after.configurations, 'judged': self.judged}
         return as_frame(columns | groups)
 
-    @property
+    @cached_property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after with outliers."""
         everything = np.ones_like(self.judged)

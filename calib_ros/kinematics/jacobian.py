@@ -107,13 +107,13 @@ class ErrorModel:
         """
         layout, walk, base = self._layout, self.chain.walk, self.chain.frame(self._ends[0]).matrix
         count, samples = q.shape
-        phi = None
-        if layout.effects:
-            phi = effects.basis(self.chain, layout.effects, q, approach)
+        own = {name: value for name, value in self.chain.effects if name not in layout.effects}
+        names = (*layout.effects, *(name for name, value in own.items() if value))
+        phi = effects.basis(self.chain, names, q, approach)
         # frames before the joints, of the flange, of the world at the base, of the flange's axes
         # at the target
         frames = np.empty((count + 3, 4, 3, samples))
-        walk.frames(self.chain.effective(q, approach), base, frames[: count + 1])
+        walk.frames(effects.moved(self.chain, names, phi, q), base, frames[: count + 1])
         target = self.chain.at_the_tool(frames[count], self._ends[1])
         frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
         frames[count + 1, 3] += base[:3, 3, np.newaxis]
@@ -133,8 +133,8 @@ class ErrorModel:
         np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')
         for k in layout.still:
             (turn if k < self.rotations else shift)[k] = 0.0
-        if phi is not None:
-            phi *= walk.signs[layout.joints]
+        if layout.effects:
+            phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
             shift[layout.driven] *= phi[:, np.newaxis]
             turning = layout.driven < self.rotations
             turn[layout.driven[turning]] *= phi[turning, np.newaxis]

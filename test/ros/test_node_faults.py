@@ -37,7 +37,6 @@ from std_msgs.msg import String
 from calib_ros.errors import ConfigError
 from calib_ros.files.archive import Archive
 from calib_ros.files.tables import read_journal
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import inputs as inputs_module
 from calib_ros.ros import node as node_module
 from calib_ros.ros.advisor import Guide
@@ -118,28 +117,34 @@ def cell_and_child(**parameters):
 # Killed
 
 
-def test_a_killed_node_goes_on_with_all_its_samples(tmp_path, recording):
-    with cell_and_child(data_dir=tmp_path) as (cell, child):
+def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
+    monkeypatch, tmp_path, recording
+):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.delenv('ROS_HOME', raising=False)
+    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
+    folder = tmp_path / '.ros' / 'calib_ros'
+    with cell_and_child() as (cell, child):
         cell.play(part(recording, 0.0, 12.0))
-        cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 10)
+        cell.spin_until(lambda: list(folder.glob('*Z.csv')))
+        cell.spin_until(lambda: len(samples_in(folder)) == 10)
         child.kill()
-    (path,) = tmp_path.glob('*Z.csv')
+    (path,) = folder.glob('*Z.csv')
     with path.open('a') as file:
         file.write('1700000000,0.1,0.')  # a row that a crash of the machine cut off
-    with cell_and_child(data_dir=tmp_path, resume='true') as (cell, child):
+    with cell_and_child(resume='true') as (cell, child):
         output = child.wait_for('ready to calibrate')
         assert 'was cut off and is left out' in output
         assert f'resumed 10 samples of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 20)
+        cell.spin_until(lambda: len(samples_in(folder)) == 20)
         answer = cell.call('identify')
         assert answer.success, answer.message
         assert '22 samples' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
     expected.finish()
     survived = [s for s in expected.samples if not 10.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
-    for kept, sample in zip(samples_in(tmp_path), survived, strict=True):
+    for kept, sample in zip(samples_in(folder), survived, strict=True):
         assert kept.stamp_ns == sample.stamp_ns
         np.testing.assert_array_equal(kept.joints, sample.joints)
         np.testing.assert_array_equal(kept.position, sample.position)
@@ -157,11 +162,11 @@ os.fsync = slow
 """
 SLOW_IDENTIFICATION = """
 import time
-from calib_ros.ros import node
+from calib_ros.ros import identifying, node
 def identify_model(problem, model, progress):
     print('identifying', flush=True)
     time.sleep(60.0)
-node.identify_model = identify_model
+identifying.identify_model = identify_model
 close = node.CalibrationNode.close
 def noisy(self):
     print('joining', flush=True)
@@ -178,44 +183,33 @@ sys.exit(main())
 def test_killed_while_it_saves(journal):
     with cell_and_child(data_dir=journal, resume='true') as (cell, child):
         assert cell.call('identify').success
-        assert cell.call('save').success
-        (earlier,) = journal.glob('*Z.yaml')
-        whole = earlier.read_text()
+        for _ in range(4):
+            assert cell.call('save').success
+        cell.start_call('save')
         child.kill()
+    saved = sorted(journal.glob('*Z.yaml'))
+    assert len(saved) >= 4
+    (whole,) = {path.read_text() for path in saved}
     command = ('-c', SLOW_SAVE + RUN)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
         assert cell.call('identify').success
         cell.start_call('save')
         child.wait_for('in the middle of saving')
         child.kill()
-    assert list(journal.glob('*Z.yaml')) == [earlier]
-    assert earlier.read_text() == whole
+    assert sorted(journal.glob('*Z.yaml')) == saved
+    assert {path.read_text() for path in saved} == {whole}
     with Cell(chain='ur10e', data_dir=str(journal)) as cell:
         loaded = cell.call('load')
         assert loaded.success, loaded.message
-        assert str(earlier) in loaded.message
+        assert str(saved[-1]) in loaded.message
 
 
-def test_killed_in_a_loop_of_saves(journal):
-    with cell_and_child(data_dir=journal, resume='true') as (cell, child):
-        assert cell.call('identify').success
-        for _ in range(12):
-            assert cell.call('save').success
-        cell.start_call('save')
-        child.kill()
-    saved = list(journal.glob('*Z.yaml'))
-    assert len(saved) >= 12
-    assert len({path.read_text() for path in saved}) == 1
-    assert load_chain(saved[-1]).joint_names == true_arm().joint_names
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ended_while_an_identification_runs(journal, number):
+def test_ended_while_an_identification_runs(journal):
     command = ('-c', SLOW_IDENTIFICATION + RUN)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
         cell.start_call('identify')
         child.wait_for('identifying')
-        child.process.send_signal(number)
+        child.process.send_signal(signal.SIGTERM)
         child.process.send_signal(signal.SIGINT)  # a second one harms nothing
         child.wait_for('joining')
         child.process.send_signal(signal.SIGINT)
@@ -233,45 +227,24 @@ def test_the_last_stop_is_kept_at_the_end(tmp_path, recording):
 # The first run
 
 
-@contextmanager
-def fresh_home(monkeypatch, tmp_path):
-    monkeypatch.setenv('HOME', str(tmp_path))
-    monkeypatch.delenv('ROS_HOME', raising=False)
-    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
-    yield tmp_path / '.ros' / 'calib_ros'
-
-
-@pytest.mark.parametrize(('number', 'default'), [(signal.SIGKILL, True), (signal.SIGTERM, False)])
-def test_the_first_run_of_an_account_loses_nothing(
-    monkeypatch, tmp_path, recording, default, number
-):
-    with fresh_home(monkeypatch, tmp_path) as folder:
-        given = {}
-        if not default:
-            folder = tmp_path / 'not' / 'yet' / 'there'
-            given = {'data_dir': folder}
-        with cell_and_child(**given) as (cell, child):
-            status = cell.listen(String, '/calibration_node/status')
-            cell.play(part(recording, 0.0, 12.0))
-            cell.spin_until(lambda: status and '; 10 samples' in status[-1].data)
-            if number == signal.SIGKILL:
-                child.kill()
-            else:
-                assert child.end(number) == 0, child.output
-            assert 'memory only' not in child.output
-        kept = samples_in(folder)
-        assert len(kept) == (10 if number == signal.SIGKILL else 12)
-        with cell_and_child(resume='true', **given) as (_, child):
-            assert f'resumed {len(kept)} samples' in child.wait_for('ready to calibrate')
+def test_a_folder_that_is_not_there_yet_is_made(tmp_path, recording):
+    folder = tmp_path / 'not' / 'yet' / 'there'
+    with cell_and_child(data_dir=folder) as (cell, child):
+        status = cell.listen(String, '/calibration_node/status')
+        cell.play(part(recording, 0.0, 12.0))
+        cell.spin_until(lambda: status and '; 10 samples' in status[-1].data)
+        assert child.end(signal.SIGTERM) == 0, child.output
+        assert 'memory only' not in child.output
+        assert 'Traceback' not in child.output
     expected = direct(recording)
     expected.finish()
-    for one, other in zip(kept, expected.samples[: len(kept)], strict=True):
+    for one, other in zip(samples_in(folder), expected.samples[:12], strict=True):
         assert one.stamp_ns == other.stamp_ns
         np.testing.assert_array_equal(one.position, other.position)
 
 
-@pytest.mark.parametrize('folder', ['/proc/nope', '/dev/null/nope'])
-def test_a_node_that_could_keep_no_samples_does_not_start(folder):
+def test_a_node_that_could_keep_no_samples_does_not_start():
+    folder = '/proc/nope'
     with Child(chain='ur10e', data_dir=folder) as child:
         assert child.end() == 1
     lines = [line for line in child.output.splitlines() if 'calibration_node:' in line]
@@ -781,5 +754,5 @@ def test_a_negative_time_does_not_end_the_node(tmp_path, recording):
 def test_what_comes_out_after_the_end_is_no_error(tmp_path, capfd):
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         node = cell.node
-    node._guarded(node._status.publish)(String())
+    node._boundary.guarded(node._status.publish)(String())
     assert 'internal error' not in capfd.readouterr().err
