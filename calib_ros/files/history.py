@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import io
 import secrets
-from collections.abc import Sequence
 from dataclasses import fields
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -221,21 +219,14 @@ def _conformed(table: Any, key: str) -> Any:
 
 def _rows_of(table: Any) -> list[Row]:
     """Return the rows of a table."""
-    columns: dict[str, Sequence[Any]] = {}
-    for each in fields(Row):
-        column = table.column(each.name).combine_chunks()
-        kind = str(each.type)
-        if kind == 'FloatArray':
-            ends = np.asarray(column.offsets)
-            values = np.asarray(column.values)
-            columns[each.name] = [values[a:b].copy() for a, b in pairwise(ends)]
-        elif kind.startswith('tuple'):
-            columns[each.name] = [tuple(value or ()) for value in column.to_pylist()]
-        else:
-            columns[each.name] = column.to_pylist()
     rows = []
-    for values_of in zip(*columns.values(), strict=True):
-        record = dict(zip(columns, values_of, strict=True))
+    for record in table.drop_columns(['key']).to_pylist():
+        for each in fields(Row):
+            value = record[each.name]
+            if str(each.type) == 'FloatArray':
+                record[each.name] = np.array(value or (), dtype=float)
+            elif str(each.type).startswith('tuple'):
+                record[each.name] = tuple(value or ())
         size = len(record['names'])
         square = record['covariance']
         if square.size != size * size or not np.isfinite(square).all():

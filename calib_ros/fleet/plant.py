@@ -178,20 +178,18 @@ def _settings(given: Mapping[str, Any], where: str) -> Settings:
     values: dict[str, Any] = {}
     for name, value in given.items():
         default, place = getattr(Settings, name), f'{where}: {name}'
-        if isinstance(default, tuple):
-            entries = value if isinstance(value, list) else [value]
-            if not all(isinstance(entry, str) for entry in entries):
-                raise ConfigError(f'{place} must be a list of texts, not {value!r:.100}')
-            values[name] = tuple(entries)
-        elif isinstance(default, str):
-            if not isinstance(value, str):
-                raise ConfigError(f'{place} must be text, not {value!r:.100}')
-            values[name] = value
-        else:
+        if isinstance(default, int | float):
             number = parse_number(value, place)
-            if isinstance(default, int) and number != int(number):
+            if isinstance(default, int) and number % 1.0:
                 raise ConfigError(f'{place} must be a whole number, not {number:g}')
-            values[name] = int(number) if isinstance(default, int) else number
+            values[name] = type(default)(number)
+            continue
+        many = isinstance(default, tuple)
+        entries = value if many and isinstance(value, list) else [value]
+        if not all(isinstance(entry, str) for entry in entries):
+            kind = 'a list of texts' if many else 'text'
+            raise ConfigError(f'{place} must be {kind}, not {value!r:.100}')
+        values[name] = tuple(entries) if many else value
     try:
         return Settings(**values)
     except ConfigError as err:

@@ -125,7 +125,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
 
     def by_robot(value: Callable[[Standing, Row], float | None]) -> dict[str, float | None]:
         labels = (each.robot.serial.translate(ESCAPES) for each in found)
-        values = (each.last and value(each, each.last) for each in found)
+        values = (value(each, each.last) if each.last else None for each in found)
         return {f'{{serial="{label}"}}': x for label, x in zip(labels, values, strict=True)}
 
     def changed(one: Standing, _: Row) -> float | None:
