@@ -126,6 +126,8 @@ def _add_detections(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.report import words
+
     if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
@@ -142,7 +144,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             write_files(folder, made)
     if history is not None:
         _file(history, found, options)
-    for warning in (*found.warnings, *found.result.remarks):
+    for warning in (*found.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.escapes import to_cell
-from calib_ros.files.columns import check_quaternions, read_columns
+from calib_ros.files.columns import check_quaternions
+from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.waypoints import POSE, joint_columns
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
@@ -43,7 +44,6 @@ MOST = 100
 """Columns and rows of a board."""
 HEADER = ('image', 'corner', 'u', 'v')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
-HALF = np.pi / 2
 POSED = 'flange_pose'
 """Name of the virtual arm."""
 
@@ -228,15 +228,16 @@ def posed_arm() -> Chain:
 
     It takes the place of an arm of which only the flange's poses are known.
     """
+    half = np.pi / 2
     return Chain(
         POSED,
         'standard',
         (
-            Joint('flange_z', 'prismatic', theta=HALF, alpha=HALF),
-            Joint('flange_x', 'prismatic', theta=HALF, alpha=HALF),
-            Joint('flange_y', 'prismatic', alpha=-HALF),
-            Joint('flange_rx', alpha=HALF),
-            Joint('flange_ry', theta=HALF, alpha=HALF),
+            Joint('flange_z', 'prismatic', theta=half, alpha=half),
+            Joint('flange_x', 'prismatic', theta=half, alpha=half),
+            Joint('flange_y', 'prismatic', alpha=-half),
+            Joint('flange_rx', alpha=half),
+            Joint('flange_ry', theta=half, alpha=half),
             Joint('flange_rz'),
         ),
     )

@@ -105,7 +105,8 @@ class Journal:
         found = os.pread(self._file, len(expected), 0)
         if not expected.startswith(found):
             raise InputError(
-                f'{self.path} has not the columns of a journal of this robot: move it away'
+                f"{self.path} does not have this robot's columns: move it, or choose another "
+                'data_dir'
             )
         if found != expected:
             os.ftruncate(self._file, 0)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.files.columns import TextColumns, regular
+from calib_ros.files.csv_columns import TextColumns, regular
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, read_bytes
 

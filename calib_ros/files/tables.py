@@ -21,7 +21,8 @@ import numpy as np
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.escapes import to_cell
-from calib_ros.files.columns import Columns, MadeColumns, columns_of
+from calib_ros.files.columns import Columns, MadeColumns
+from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER
 from calib_ros.files.measurements import (

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.files.columns import check_quaternions, read_columns
+from calib_ros.files.columns import check_quaternions
+from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import POSITION, QUATERNION
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain

@@ -62,7 +62,7 @@ class Explained:
         """Return the mistake and the option to give."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
         return (
-            f'{" -- or ".join(whats)} (typical error so {1e3 * self.so:.2f} mm, as given '
+            f'{" -- or ".join(whats)} (typical error then {1e3 * self.so:.2f} mm, as given '
             f'{1e3 * self.given:.4g} mm)'
         )
 

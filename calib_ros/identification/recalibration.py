@@ -57,8 +57,6 @@ GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
 PER_METRE = SIZES['rad'] / SIZES['m']
 """Angles [rad] grow by so much more than lengths [m]."""
-WORSE = 1.5
-"""Errors of new poses up to this many times those of the earlier calibration do not contradict."""
 FREE = 10.0
 """Size [m, rad] that is as good as any."""
 MOST_FOLDS = 20
@@ -94,9 +92,9 @@ class Recalibration(Shown):
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
-        return self.unexplained > FALSE and self.after.rms_mm <= max(
-            self.before.rms_mm, WORSE * 1e3 * (self.calibration.residual or 0.0)
-        )
+        better = self.after.rms_mm <= self.before.rms_mm
+        agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
+        return self.unexplained > FALSE and bool(agrees)
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values."""
