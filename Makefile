@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test fuzz mutants lint oldest screenshots docs clean
+.PHONY: demo prepared test fuzz mutants lint oldest screenshots docs clean
 
 demo: $(VENV)/commands
 	$(BIN)/calib_ros demo --out demo --force
@@ -14,8 +14,10 @@ demo: $(VENV)/commands
 	@echo '  calib_ros robots           # is your arm among these?'
 	@echo '  calib_ros identify demo/bag --chain ur10e'
 
-test: $(VENV)/installed $(VENV)/tf2_msgs/installed $(VENV)/mocap4r2_msgs/installed
-	$(BIN)/python -m pytest -n auto $(PYTEST_ARGUMENTS)
+prepared: $(VENV)/installed $(VENV)/tf2_msgs/installed $(VENV)/mocap4r2_msgs/installed
+
+test: prepared
+	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST_ARGUMENTS)
 
 FUZZ_SECONDS ?= 600
 fuzz: $(VENV)/installed
@@ -61,13 +63,16 @@ define install
 	touch $@
 endef
 
-# What the commands need without ROS, and all that the tests need besides.
-$(VENV)/commands: setup.py pyproject.toml
+$(BIN)/python:
 	$(PYTHON) -m venv $(VENV) || { echo 'needs venv: apt install python3-venv'; exit 1; }
+
+# What the commands need without ROS; what the tests need holds all of it.
+$(VENV)/commands: setup.py pyproject.toml | $(BIN)/python
 	$(call install,$(COMMANDS))
 
-$(VENV)/installed: $(VENV)/commands
+$(VENV)/installed: setup.py pyproject.toml | $(BIN)/python
 	$(call install,$(TESTS))
+	touch $(VENV)/commands
 
 # Packages of messages that ROS has and PyPI has not.
 $(VENV)/%_msgs/installed: $(VENV)/installed test/messages.cmake test/%_msgs/msg/*.msg

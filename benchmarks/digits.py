@@ -27,7 +27,7 @@ from scipy import linalg
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identifiability import independent
-from calib_ros.identification.leastsquares import System, triangular_factor
+from calib_ros.identification.leastsquares import System, stacked, triangular_factor
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
@@ -74,7 +74,7 @@ def digits(chain, joints, rng):
     system = System((samples,))
     names = chain.parameter_names
     names = independent(triangular_factor(chain, names, system), names)
-    rows = samples.rows_of(chain, names).reshape(-1, len(names) + 1)
+    rows = stacked(system.rows_of(chain, names))
     columns, residual = rows[:, :-1], rows[:, -1]
     truth = exact_step(columns, residual)
     scale = np.linalg.norm(columns, axis=0)

@@ -7,7 +7,8 @@
 nights: 200 robots x 30 nights x 60 poses (0.05 mm, 0.2 mrad). Five robots are bumped in some night
 but the first three: one parameter of the arm moves by 0.1 mm or 0.2 mrad. Found: the joint named
 within two nights. A second run has nothing to do. workers: throughput of one and two workers on
-tables of 3,000 poses. scheduler: time for each task that does nothing. kills: ten runs in which a
+tables of 12,000 poses, over a second each, beside that of one and two processes without dask: what
+the machine can do. scheduler: its time and the client's for each task. kills: ten runs in which a
 worker, then the client is killed with SIGKILL; the history must hold each result once.
 """
 
@@ -18,7 +19,11 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
+from concurrent.futures import ProcessPoolExecutor
 from datetime import timedelta
+from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -37,11 +42,12 @@ from calib_ros.fleet.page import write_report
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, run
 from calib_ros.fleet.standing import standings
-from calib_ros.fleet.work import Outcome, Task, sources
+from calib_ros.fleet.work import Outcome, Task, sources, work
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.kinematics.chain_file import load_chain
 
 POSES, BEFORE = 60, 3
+PEERS = ('processes', 'workers')
 
 
 def bumps_of(serials, nights, number, rng):
@@ -57,12 +63,27 @@ def bumps_of(serials, nights, number, rng):
     return found
 
 
-def nights_part(folder, robots, nights, number, workers):
+def archived(plant):
+    """Put the tables of a plant into an archive, from which workers fetch them by its URL."""
+    place = plant.parent / 'nights.zip'
+    with zipfile.ZipFile(place, 'w') as archive:
+        for path in (plant.parent / 'nights').rglob('*.csv'):
+            archive.write(path, path.relative_to(plant.parent))
+    content = json.loads(plant.read_text())
+    for robot in content['robots']:
+        robot['measured'] = f'zip://{robot["measured"]}::file://{place}'
+    plant.write_text(json.dumps(content))
+
+
+def nights_part(folder, robots, nights, number, cluster):
     """Return what two runs over a plant find and take."""
     serials = [f'R{k:03}' for k in range(robots)]
     bumps = bumps_of(serials, nights, number, np.random.default_rng(1))
-    plant = read_plant(plants.write_plant(folder, serials, nights, POSES, bumps))
-    history, out, cluster = History(folder / 'history'), folder / 'report', Cluster('', workers)
+    written = plants.write_plant(folder, serials, nights, POSES, bumps)
+    if cluster.address:
+        archived(written)
+    plant = read_plant(written)
+    history, out = History(folder / 'history'), folder / 'report'
     spans, parts = [], {}
     for name in ('first', 'second'):
         begin = time.monotonic()
@@ -108,43 +129,67 @@ def nights_part(folder, robots, nights, number, workers):
     }
 
 
-def workers_part(folder, tables, poses):
-    """Return how many large tables one and two workers do in a second."""
+def cpu(task):
+    """Do a task; its time is that of the processor."""
+    begin = time.process_time()
+    return work(task)._replace(seconds=time.process_time() - begin)
+
+
+def by_processes(number, tasks):
+    """Return what processes that know nothing of each other make of tasks, and the time."""
+    with ProcessPoolExecutor(number, get_context('spawn')) as pool:
+        list(pool.map(cpu, tasks[:number]))  # they import what they need
+        begin = time.monotonic()
+        return list(pool.map(cpu, tasks)), time.monotonic() - begin
+
+
+def by_workers(number, tasks):
+    """Return what workers of dask make of tasks, and the time."""
+    with running._client(Cluster('', number)) as client:
+        list(running._done(client, tasks[:number], cpu))
+        begin = time.monotonic()
+        found = [outcome for _, outcome in running._done(client, tasks, cpu)]
+        return found, time.monotonic() - begin
+
+
+def workers_part(folder, tables, poses, rounds):
+    """Return how many large tables one and two workers do in a second, and plain processes."""
     plant = read_plant(plants.write_plant(folder, ['R'], tables, poses))
     tasks = [Task(plant[0], source) for source in sources(plant[0])]
-    speed = {}
-    for workers in (1, 2):
-        with running._client(Cluster('', workers)) as client:
-            list(running._done(client, tasks[:workers]))  # they import what they need
-            begin = time.monotonic()
-            outcomes = [outcome for _, outcome in running._done(client, tasks)]
-            speed[workers] = len(tasks) / (time.monotonic() - begin)
-    task = float(np.median([outcome.seconds for outcome in outcomes]))
+    speed, cost = {}, {}
+    for _ in range(rounds):
+        for number, way in product((1, 2), (by_processes, by_workers)):
+            outcomes, span = way(number, tasks)
+            key = f'{way.__name__[3:]}_{number}'
+            speed.setdefault(key, []).append(len(tasks) / span)
+            cost.setdefault(key, []).append(np.mean([each.seconds for each in outcomes]))
+    per_second = {key: float(np.median(values)) for key, values in speed.items()}
+    gain = {key: per_second[f'{key}_2'] / per_second[f'{key}_1'] for key in PEERS}
     return {
-        'one_per_s': speed[1],
-        'two_per_s': speed[2],
-        'gain': speed[2] / speed[1],
-        'task_s': task,
+        'per_second': per_second,
+        'task_cpu_s': {key: float(np.median(values)) for key, values in cost.items()},
+        'gain': gain['workers'],
+        'gain_of_processes': gain['processes'],
+        'of_ceiling': per_second['workers_2'] / per_second['processes_2'],
     }
 
 
 def nothing(_):
-    """Do a task that does nothing."""
-    return Outcome()
+    """Take as long as a small table, without a processor."""
+    time.sleep(0.1)
+    return Outcome(seconds=0.1)
 
 
 def scheduler_part(folder, count):
-    """Return the time of a task that does nothing, from client to worker and back."""
+    """Return the time of client and scheduler for each of many tasks of 0.1 s."""
     plant = read_plant(plants.write_plant(folder, ['R'], 1))
     tasks = [Task(plant[0], sources(plant[0])[0])] * count
     with running._client(Cluster('', 2)) as client:
         list(running._done(client, tasks[:50], nothing))
-        begin, cpu = time.monotonic(), time.process_time()
+        begin, spent = time.monotonic(), time.process_time()
         list(running._done(client, tasks, nothing))
-        return {
-            'task_ms': 1e3 * (time.monotonic() - begin) / count,
-            'task_cpu_ms': 1e3 * (time.process_time() - cpu) / count,  # client and scheduler
-        }
+        span, spent = time.monotonic() - begin, time.process_time() - spent
+        return {'cpu_ms': 1e3 * spent / count, 'idle_share': 1.0 - 0.1 * count / 2 / span}
 
 
 def kills_part(folder, times, robots, nights):
@@ -196,15 +241,22 @@ def main():
     parser.add_argument('--part', choices=('nights', 'workers', 'scheduler', 'kills'))
     parser.add_argument('--robots', type=int, help='for the nights')
     parser.add_argument('--workers', type=int, default=0, help='for the nights')
+    parser.add_argument('--scheduler', default='', help='for the nights, from an archive by URL')
     options = parser.parse_args()
     quick = options.quick
     robots, nights, bumped = (10, 8, 2) if quick else (200, 30, 5)
     parts = {
         'nights': lambda folder: nights_part(
-            folder, options.robots or robots, nights, bumped, options.workers
+            folder,
+            options.robots or robots,
+            nights,
+            bumped,
+            Cluster(options.scheduler, options.workers),
         ),
-        'workers': lambda folder: workers_part(folder, 6 if quick else 20, 3000),
-        'scheduler': lambda folder: scheduler_part(folder, 500 if quick else 3000),
+        'workers': lambda folder: workers_part(
+            folder, 4 if quick else 8, 12_000, 1 if quick else 5
+        ),
+        'scheduler': lambda folder: scheduler_part(folder, 200 if quick else 1000),
         'kills': lambda folder: kills_part(folder, 1 if quick else 10, 3, 6),
     }
     found = {}

@@ -53,13 +53,7 @@ def problem_of(name, session, chain_name):
     """Return the problem of a data set, with its held-out rows."""
     chain = load_chain(DATA / name / chain_name)
     table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
-    return Problem(
-        chain,
-        table.fitted[0],
-        table.held_out,
-        more=table.fitted[1:],
-        separations=tuple((*pair, 0.05) for pair in table.pairs),
-    )
+    return table.problem(chain)
 
 
 def changed(problem, change):

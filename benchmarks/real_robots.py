@@ -30,7 +30,7 @@ from scipy import linalg
 from scipy.spatial.distance import cdist
 
 from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
@@ -62,13 +62,7 @@ def problem_of(name, session, chain_name):
     """Return the problem of a data set, with its held-out rows."""
     chain = load_chain(DATA / name / chain_name)
     table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
-    return Problem(
-        chain,
-        table.fitted[0],
-        table.held_out,
-        more=table.fitted[1:],
-        separations=tuple((*pair, 0.05) for pair in table.pairs),
-    )
+    return table.problem(chain)
 
 
 def row(label, figures, result, seconds):

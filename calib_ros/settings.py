@@ -43,6 +43,9 @@ class Settings:
         'standard deviation of a measured orientation without its own covariance [rad]',
         1e-9,
     )
+    sigma_pixel: float = _setting(
+        0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
+    )
     max_gap: float = _setting(
         0.1, 'longest time between the two joint samples that bracket a pose [s]', 0.0
     )
@@ -76,7 +79,8 @@ class Settings:
     sources: tuple[str, ...] = _setting(
         (),
         'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
-        'target, eye_in_hand, validation; of /tf with parent and child',
+        'target, eye_in_hand, validation; of /tf with parent and child; of images with board, '
+        'info, lens',
     )
     joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
     wanted_accuracy: float = _setting(
@@ -117,8 +121,8 @@ class Settings:
         for text in self.priors:
             name, _, sigma = text.partition('=')
             priors[name] = parse_number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
-        names = ['sigma_position', 'sigma_orientation', 'fixed', 'folds', 'largest_length']
-        names += ['largest_angle', 'largest_error', 'loss']
+        names = ['sigma_position', 'sigma_orientation', 'sigma_pixel', 'fixed', 'folds']
+        names += ['largest_length', 'largest_angle', 'largest_error', 'loss']
         named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
         chosen = {name: getattr(self, name) for name in names}
         return chosen | {'priors': priors, 'effects': named}

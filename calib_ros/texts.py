@@ -8,17 +8,13 @@ with any number of digits. The stream of its events is looked at before anything
 
 from __future__ import annotations
 
-import csv
 import io
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-
-Row: TypeAlias = Mapping[str, str | None]
 
 LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""
@@ -89,40 +85,6 @@ def csv_lines(text: str, where: str) -> io.StringIO:
             f'{where} has a line of {longest} characters, more than {LONGEST_LINE}: is it a table?'
         )
     return io.StringIO(text, newline='')
-
-
-def read_rows(text: str, path: Path) -> tuple[Sequence[str], list[tuple[int, Row]]]:
-    """Return the header of a table, and its rows with their lines; cells may be missing.
-
-    Raises
-    ------
-    InputError
-        When it is no table, has more columns or rows than any, or cells that no column or
-        several columns could be meant with.
-
-    """
-    reader = csv.DictReader(csv_lines(text, str(path)), strict=True)
-    rows: list[tuple[int, Row]] = []
-    try:
-        header = reader.fieldnames or []
-        if len(header) > MOST_COLUMNS:
-            raise InputError(f'{path} has {len(header)} columns, more than {MOST_COLUMNS}')
-        twice = [name for name, count in Counter(header).items() if name and count > 1]
-        if twice:
-            raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
-        for row in reader:
-            if any(row.pop(None, ())):
-                raise InputError(
-                    f'{path}, line {reader.line_num}: more values than the {len(header)} columns'
-                )
-            if len(rows) == MOST_ROWS:
-                raise InputError(
-                    f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
-                )
-            rows.append((reader.line_num, row))
-    except csv.Error as err:
-        raise InputError(f'cannot read {path}: {err}') from err
-    return header, rows
 
 
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import re
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,15 +65,14 @@ def parse_numbers(
     return np.array([parse_number(item, where, error) for item in value])
 
 
-def cell_number(text: str | None, where: str, largest: float = LARGEST) -> float:
-    """Return the number in a cell of a table; None where the row ends before it."""
+def cell_number(text: str, where: str, largest: float = LARGEST) -> float:
+    """Return the number in a cell of a table."""
     try:
-        number = float(text or 'blank')
+        number = float(text)
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        found = 'the row ends before it' if text is None else f'not {text!r}'
-        raise InputError(f'{where} must be a number, {found}')
+        raise InputError(f'{where} must be a number, not {text!r}')
     if abs(number) > largest:
         raise InputError(f'{where} must be at most {largest:g}, not {number:g}')
     return number
@@ -87,24 +87,39 @@ def cell_integer(text: str, where: str) -> int:
 
 
 def covariance_fault(covariance: NDArray[np.float64]) -> str:
-    """Return what is wrong with a covariance (6, 6) of a measured pose; empty when nothing is.
+    """Return what is wrong with a covariance (6, 6) of a measured pose; empty when nothing is."""
+    return str(covariance_faults(covariance[np.newaxis])[0])
+
+
+def covariance_faults(covariances: NDArray[np.float64]) -> NDArray[np.str_]:
+    """Return what is wrong with each of some covariances (N, 6, 6) of measured poses.
 
     Zeros alone mean that none was measured. Zeros in all that concerns the rotation mean that it
     was not measured, or that its covariance is not known (trackers of positions).
     """
-    if not np.isfinite(covariance).all():
-        return 'covariance with NaN or infinite values'
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-15):
-        return 'covariance not symmetric'
-    if not covariance.any():
-        return ''
-    known = covariance if covariance[3:].any() else covariance[:3, :3]
-    variances = np.diag(known)
-    if (variances <= 0.0).any():
-        return 'covariance not positive definite'
-    sigmas = np.sqrt(variances)
-    if sigmas.min() < SMALLEST_SIGMA or sigmas.max() > LARGEST_SIGMA:
-        return f'covariance with a sigma not within {SMALLEST_SIGMA:g} and {LARGEST_SIGMA:g}'
-    if np.linalg.eigvalsh(known / np.outer(sigmas, sigmas))[0] <= DEPENDENT:
-        return 'covariance not positive definite'
-    return ''
+    found = np.full(len(covariances), '', dtype='U60')
+
+    def refuse(wrong: Any, fault: str) -> None:
+        found[wrong & (found == '')] = f'covariance {fault}'
+
+    refuse(~np.isfinite(covariances).all(axis=(1, 2)), 'with NaN or infinite values')
+    full = np.where((found == '')[:, np.newaxis, np.newaxis], covariances, np.eye(6))
+    other = np.swapaxes(full, 1, 2)
+    alike = np.abs(full - other) <= 1e-15 + 1e-6 * np.abs(other)
+    refuse(~alike.all(axis=(1, 2)), 'not symmetric')
+    still = ~full[:, 3:].any(axis=(1, 2))
+    full[still, 3:, 3:] = np.eye(3)
+    full[still & ~full[:, :3].any(axis=(1, 2))] = np.eye(6)
+    variances = np.diagonal(full, axis1=1, axis2=2)
+    refuse((variances <= 0.0).any(axis=1), 'not positive definite')
+    full[found != ''] = np.eye(6)
+    sigmas = np.sqrt(np.diagonal(full, axis1=1, axis2=2))
+    believed = (sigmas >= SMALLEST_SIGMA) & (sigmas <= LARGEST_SIGMA)
+    limits = f'{SMALLEST_SIGMA:g} and {LARGEST_SIGMA:g}'
+    refuse(~believed.all(axis=1), f'with a sigma not within {limits}')
+    normed = full / sigmas[:, :, np.newaxis] / sigmas[:, np.newaxis, :]
+    mixed = np.flatnonzero((normed * (1.0 - np.eye(6))).any(axis=(1, 2)))
+    definite = np.ones(len(found), dtype=bool)
+    definite[mixed] = np.linalg.eigvalsh(normed[mixed])[:, 0] > DEPENDENT
+    refuse(~definite, 'not positive definite')
+    return found

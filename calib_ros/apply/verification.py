@@ -97,6 +97,8 @@ class Verification(Shown):
         The configuration that each measurement belongs to; `configurations` counts them.
     rms, lower, upper : float
         RMS position error [m] over poses like these, and its limits.
+    freedom : float
+        Degrees of freedom of that error.
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
@@ -107,6 +109,8 @@ class Verification(Shown):
         Whether the poses wanted are those of the program before its correction.
     fitted : tuple of str
         Frames that were fitted to the new measurements.
+    holds : bool or None
+        Whether the error agrees with the one of the calibration (`Calibration.holds`), if known.
 
     """
 
@@ -117,11 +121,13 @@ class Verification(Shown):
     rms: float
     lower: float
     upper: float
+    freedom: float
     verdict: Verdict
     needed: int | None
     common: float
     by_program: bool
     fitted: tuple[str, ...] = ()
+    holds: bool | None = None
 
     @property
     def configurations(self) -> int:
@@ -183,7 +189,8 @@ def verify(
     lost = sum(LOST[frame] for frame in fitted)
     rms = _rms(moments, lost)
     numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
-    lower, upper = rms_limits(rms, freedom_of(moments) * (numbers - lost), confidence)
+    freedom = freedom_of(moments) * (numbers - lost)
+    lower, upper = rms_limits(rms, freedom, confidence)
     verdict, needed = _decided(tolerance, lower, upper, numbers)
     common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
     return Verification(
@@ -194,11 +201,13 @@ def verify(
         rms,
         float(lower[0]),
         float(upper[0]),
+        float(freedom[0]),
         verdict,
         needed,
         common,
         commanded is not None,
         fitted,
+        arm.holds(rms),
     )
 
 
@@ -370,6 +379,11 @@ def remarks(found: Verification) -> list[str]:
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {MOST}'
         lines.append(f'{enough} configurations with the same RMS error would decide')
+    if found.tolerance is None and found.holds is False:
+        lines.append(
+            'the calibration does not hold any more: the error is larger than it was then. Was '
+            'the tracker, the target or the robot moved?'
+        )
     if found.common < MOVED:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '

@@ -98,7 +98,7 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
 
 def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image]]:
     """Yield the images of a folder by their names, of a bag by their stamps."""
-    from calib_ros.files.images import SUFFIXES, decoded, files_of, grey
+    from calib_ros.files.images import SUFFIXES, files_of, image_of
 
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
@@ -114,11 +114,7 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
     from calib_ros.files.bags import pictures
 
     for stamp, message in pictures(options.images, options.topic):
-        if hasattr(message, 'format'):
-            yield str(stamp), decoded(message.data.tobytes())
-        else:
-            size = (message.height, message.width, message.step)
-            yield str(stamp), grey(message.data, *size, message.encoding)
+        yield str(stamp), image_of(message)
 
 
 COMMANDS = (

@@ -59,7 +59,7 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.atomic import write_file
     from calib_ros.files.foreign import Foreign, as_csv
     from calib_ros.files.layouts import Layout
-    from calib_ros.files.tables import table_of
+    from calib_ros.files.tables import check_table
     from calib_ros.kinematics.chain_file import load_chain
 
     refuse_others(options.table, 'import', 'table')
@@ -68,7 +68,7 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
     foreign = foreign_of(options, chain) or Foreign(Layout(), chain)
     with screen.work(f'converting {options.table.name}'):
         columns, notes = foreign.convert(options.table)
-        table_of(columns, options.table)  # refuses what no table of ours may hold
+        check_table(columns)
         text = as_csv(columns)
     for note in notes:
         screen.warn(note, 'note')

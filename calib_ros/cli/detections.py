@@ -8,16 +8,13 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from calib_ros.cli.inputs import SIGMA_TOUCH, Loaded, table
+from calib_ros.cli.inputs import Loaded, table
 from calib_ros.errors import InputError
 
 if TYPE_CHECKING:
     from calib_ros.cli.screen import Screen
     from calib_ros.kinematics.chain import Chain
     from calib_ros.settings import Settings
-
-SIGMA_PIXEL = 0.3
-"""Standard deviation [px] of a corner, if it is not given."""
 
 
 def detected(
@@ -34,7 +31,7 @@ def detected(
     )
     from calib_ros.identification.problem import Problem
     from calib_ros.identification.reasons import Reason, Rule
-    from calib_ros.kinematics.chain import Frame
+    from calib_ros.sampling.problems import with_lenses
 
     for name in ('board', 'places'):
         if getattr(options, name) is None:
@@ -54,14 +51,13 @@ def detected(
         more, warnings = [*rows.fitted], (*warnings, *rows.warnings)
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
-    if seen.camera not in chain.frame_names:
-        chain = chain.with_frame(seen.camera, Frame())
-    camera = chain.frame(seen.camera)
-    lens = camera.lens if options.intrinsics is None else read_lens(options.intrinsics)
+    known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
+    lens = known if options.intrinsics is None else read_lens(options.intrinsics)
     if lens is not None:
-        lens = replace(lens, fixed=options.lens != 'fitted')
-    chain = chain.with_frame(seen.camera, replace(camera, lens=lens))
+        chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
     given = settings.for_problem()
+    if options.sigma_touch is not None:
+        given['sigma_touch'] = options.sigma_touch
     if posed:
         given['fixed'] = (*given['fixed'], *(f'{name}.*' for name in chain.joint_names))
     problem = Problem(
@@ -69,8 +65,6 @@ def detected(
         seen,
         rows.held_out if options.csv is not None else None,
         more=more,
-        sigma_pixel=SIGMA_PIXEL if options.sigma_pixel is None else options.sigma_pixel,
-        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
         **given,
     )
     reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'

@@ -50,7 +50,7 @@ LAYOUT = (
     *('rotation_vector', 'inverse', 'shift', 'separator', 'decimal', 'sheet', 'joints'),
 )
 """Options of tables of others."""
-DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens', 'sigma_pixel')
+DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
 OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
@@ -123,10 +123,11 @@ def _add_detections(parser: argparse.ArgumentParser) -> None:
     )
     add('--intrinsics', type=Path, metavar='FILE', help='camera_info, by camera_calibration')
     add('--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given')
-    add('--sigma-pixel', type=float, metavar='PX', help='of a corner, 0.3 if not given')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.report import words
+
     if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
@@ -143,7 +144,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             write_files(folder, made)
     if history is not None:
         _file(history, found, options)
-    for warning in (*found.warnings, *found.result.remarks):
+    for warning in (*found.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))

@@ -23,10 +23,6 @@ if TYPE_CHECKING:
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.settings import Settings
 
-SIGMA_TOUCH = 1e-4
-"""Standard deviation [m] of heights over touched planes, if it is not given."""
-"""Distance [m] between two sockets of a place, if it is not given."""
-
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
@@ -97,21 +93,10 @@ def of_table(
     options: argparse.Namespace, chain: Chain, settings: Settings, screen: Screen
 ) -> Loaded:
     """Return what is to be fitted of a table."""
-    from calib_ros.identification.problem import Problem
-    from calib_ros.sampling.sample import SOCKETS
-
     found = table(options, options.csv, chain, settings, screen, options.eye_in_hand)
-    sockets = SOCKETS if options.socket_distance is None else options.socket_distance
-    problem = Problem(
-        chain,
-        found.fitted[0],
-        found.held_out,
-        more=found.fitted[1:],
-        separations=tuple((*pair, sockets) for pair in found.pairs),
-        world_frame=found.world_frame,
-        sigma_touch=SIGMA_TOUCH if options.sigma_touch is None else options.sigma_touch,
-        **settings.for_problem(),
-    )
+    given = {'sockets': options.socket_distance, 'sigma_touch': options.sigma_touch}
+    given = {name: value for name, value in given.items() if value is not None}
+    problem = found.problem(chain, **given, **settings.for_problem())
     samples = {
         'samples': sum(map(len, found.fitted)),
         'held_out': sum(map(len, found.held_out)),

@@ -32,7 +32,7 @@ NOT_ACCEPTED = 3
 Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
 SETTINGS = {
     'the fit': ('model', 'fixed', 'priors', 'loss', 'folds'),
-    'how the device measures': ('sigma_position', 'sigma_orientation', 'frame_id'),
+    'how the device measures': ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'frame_id'),
     'what is not accepted': ('largest_length', 'largest_angle', 'largest_error'),
     'bags: what is read': ('joint_topics', 'sources', 'joint_names', 'delay'),
     'bags: how samples are taken': (

@@ -182,7 +182,7 @@ def _tests(
     found = iso_9283_poses(design, rng, visibility)
     words = (
         f'P1 to P5 of ISO 9283 in a cube of {found.edge:.3f} m, one orientation: go to them in '
-        'turn, 30 times, and measure. Collisions are not looked at'
+        'turn, 30 times, and measure. Collisions are not checked'
     )
     return found.joints, words, None
 

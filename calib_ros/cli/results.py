@@ -75,7 +75,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     screen.table(_rows(result))
     for each in advice(result.refusals):
         screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
-    for note in words.notes(result):
+    for note in words.notes(result) if result.accepted else ():
         screen.bullet(note)
     for line in words.cameras_in_words(result):
         screen.bullet(line)
@@ -87,6 +87,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
 
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     before, after = (result.validation or result.fitted).figures
+    proof = '' if result.validation else '; on the poses fitted, which proves nothing'
     samples = f'{len(result.fitted.judged)}'
     if result.outliers:
         samples += f', {len(result.outliers)} outliers carry no weight'
@@ -99,13 +100,16 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
         second = ('orientation error', turn)
     if before.rms_px is not None and after.rms_px is not None:
         second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
+    valid = 'nowhere, because it is not accepted'
+    if result.accepted and result.region is not None:
+        valid = result.region.in_words().removeprefix('valid ')
     return (
         ('robot', f'{result.chain.name}, {fitted} fitted'),
         ('samples', samples),
-        ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm'),
+        ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm{proof}'),
         second,
         ('judged by', result.validated_by),
-        ('valid', result.region.in_words().removeprefix('valid ') if result.region else 'nowhere'),
+        ('valid', valid),
     )
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import InputError, UnknownNameError, shortened
+from calib_ros.files.cameras import cameras_of
 from calib_ros.files.salvage import (
     NOT_CLOSED,
     Salvage,
@@ -23,11 +24,11 @@ from calib_ros.files.salvage import (
     salvage,
     unpacked_files,
 )
-from calib_ros.files.stored import LARGEST_MESSAGE, read
+from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
-from calib_ros.sampling.messages import BODIES, JOINT_STATE
+from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.topics import Reading, check_joints, choose
 
@@ -36,7 +37,8 @@ if TYPE_CHECKING:
 
 BATCH = 2000
 """Messages that are decoded at once."""
-PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+MOST_AT_ONCE = 50_000_000
+"""Bytes from which fewer are: images."""
 ALLOW = 'take the rest all the same with --largest-loss'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|is there already')
@@ -108,6 +110,7 @@ def replay(
     """
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
+    session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
     with unpacked_files(path) as folder:
         return _replay(path, folder, session, told)
 
@@ -292,14 +295,25 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     return store.deserialize_cdr
 
 
-def _is_message(data: object) -> bool:
+def _is_message(stream: Stream, data: object) -> bool:
     """Tell whether it may be a message: a file may hold anything."""
-    return isinstance(data, bytes) and len(data) <= LARGEST_MESSAGE
+    return isinstance(data, bytes) and len(data) <= largest(stream)
 
 
 def _decodable(messages_on: Reading) -> Reading:
     """Leave out what cannot be a message; `_feed` tells of it."""
-    return lambda streams: (each for each in messages_on(streams) if _is_message(each[1]))
+    return lambda streams: (each for each in messages_on(streams) if _is_message(*each))
+
+
+def _extend(batch: list[tuple[Stream, bytes]], messages: Iterator[tuple[Stream, bytes]]) -> bool:
+    """Add messages to a batch, up to an error; return whether they have ended."""
+    size = 0
+    for each in itertools.islice(messages, BATCH):
+        batch.append(each)
+        size += len(each[1]) if isinstance(each[1], bytes) else 0
+        if size > MOST_AT_ONCE:
+            return False
+    return len(batch) < BATCH
 
 
 def _feed(
@@ -313,11 +327,10 @@ def _feed(
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
         try:
-            batch.extend(itertools.islice(messages, BATCH))  # up to an error
-            ended = len(batch) < BATCH
+            ended = _extend(batch, messages)
         except Exception as err:  # see `replay`
             problem, ended = str(err) or type(err).__name__, True
-        usable = [each for each in batch if _is_message(each[1])]
+        usable = [each for each in batch if _is_message(*each)]
         problems = feed(session, usable, deserialise)
         count += len(usable) - len(problems)
         if len(usable) < len(batch):

@@ -26,22 +26,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.escapes import from_cell, to_cell
+from calib_ros.escapes import to_cell
+from calib_ros.files.columns import check_quaternions
+from calib_ros.files.csv_columns import read_columns
+from calib_ros.files.waypoints import POSE, joint_columns
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import (
-    LARGEST_TABLE,
-    Row,
-    decoded,
-    parse_yaml,
-    read_bytes,
-    read_rows,
-    read_text,
-)
-from calib_ros.values import QUATERNION_TOLERANCE, cell_integer, cell_number, parse_number
+from calib_ros.texts import parse_yaml, read_text
+from calib_ros.values import parse_number
 
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
@@ -49,7 +44,6 @@ MOST = 100
 """Columns and rows of a board."""
 HEADER = ('image', 'corner', 'u', 'v')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
-HALF = np.pi / 2
 POSED = 'flange_pose'
 """Name of the virtual arm."""
 
@@ -151,19 +145,25 @@ def read_lens(path: Path) -> Lens:
     content = parse_yaml(read_text(path, what='intrinsics '), str(path))
     if not isinstance(content, dict):
         raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
-    model = content.get('distortion_model', DISTORTED[0])
+    return lens_of(
+        content.get('distortion_model', DISTORTED[0]),
+        _numbers(content, ('camera_matrix', 'k', 'K'), path),
+        _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False),
+        str(path),
+    )
+
+
+def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
+    """Return the lens of a camera matrix (9) row by row, and its distortion k1 k2 p1 p2 k3."""
     if model not in DISTORTED:
-        raise ConfigError(f'{path}: distortion_model must be plumb_bob, not {model!r}')
-    matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
+        raise ConfigError(f'{where}: distortion_model must be plumb_bob, not {model!r}')
     if len(matrix) != 9:
-        raise ConfigError(f'{path}: camera_matrix must hold 9 numbers, not {len(matrix)}')
-    fx, skew, cx, *rest = matrix
-    _, fy, cy = rest[:3]
+        raise ConfigError(f'{where}: camera_matrix must hold 9 numbers, not {len(matrix)}')
+    fx, skew, cx, _, fy, cy = matrix[:6]
     if skew or fx <= 0.0 or fy <= 0.0:
-        raise ConfigError(f'{path}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
-    distortion = _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False)
+        raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
     if any(distortion[5:]):
-        raise ConfigError(f'{path}: of distortion only k1 k2 p1 p2 k3 are known')
+        raise ConfigError(f'{where}: of distortion only k1 k2 p1 p2 k3 are known')
     k1, k2, p1, p2, k3 = (*distortion[:5], *(0.0,) * (5 - len(distortion[:5])))
     return Lens(fx, fy, cx, cy, k1, k2, p1, p2, k3)
 
@@ -204,34 +204,23 @@ class Detections:
 
 def read_detections(path: Path, board: Board) -> Detections:
     """Read a table of corners of a board."""
-    header, rows = _table(path, HEADER)
-    del header
-    most = len(board.corners)
-    names: dict[str, int] = {}
-    seen: dict[tuple[int, int], int] = {}
-    image, corner, pixels = [], [], []
-    for line, row in rows:
-        where = f'{path}, line {line}'
-        name = from_cell(row.get('image') or '')
-        number = cell_integer(row.get('corner') or '', f'{where}: corner')
-        if not 0 <= number < most:
-            raise InputError(
-                f'{where}: corner must be from 0 to {most - 1} on this board, not {number}'
-            )
-        key = (names.setdefault(name, len(names)), number)
-        if key in seen:
-            raise InputError(f'{where}: corner {number} of image {name} is there already')
-        seen[key] = line
-        image.append(key[0])
-        corner.append(number)
-        pixels.append([cell_number(row.get(k), f'{where}: {k}') for k in 'uv'])
+    found = read_columns(path, HEADER)
+    image, names = found.labels('image')
+    corner, most = found.integers('corner'), len(board.corners)
+    for row in np.flatnonzero((corner < 0) | (corner >= most))[:1].tolist():
+        raise InputError(
+            f'{found.where(row, "corner")} must be from 0 to {most - 1} on this board, not '
+            f'{corner[row]}'
+        )
+    _, first = np.unique(image * most + corner, return_index=True)
+    for row in np.setdiff1d(np.arange(len(image)), first)[:1].tolist():
+        raise InputError(
+            f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]} is there '
+            'already'
+        )
     order = np.argsort(image, kind='stable')
-    return Detections(
-        tuple(names),
-        np.array(image, dtype=np.intp)[order],
-        np.array(corner, dtype=np.intp)[order],
-        np.array(pixels)[order],
-    )
+    pixels = found.block(('u', 'v'))
+    return Detections(tuple(names), image[order], corner[order], pixels[order])
 
 
 def posed_arm() -> Chain:
@@ -239,15 +228,16 @@ def posed_arm() -> Chain:
 
     It takes the place of an arm of which only the flange's poses are known.
     """
+    half = np.pi / 2
     return Chain(
         POSED,
         'standard',
         (
-            Joint('flange_z', 'prismatic', theta=HALF, alpha=HALF),
-            Joint('flange_x', 'prismatic', theta=HALF, alpha=HALF),
-            Joint('flange_y', 'prismatic', alpha=-HALF),
-            Joint('flange_rx', alpha=HALF),
-            Joint('flange_ry', theta=HALF, alpha=HALF),
+            Joint('flange_z', 'prismatic', theta=half, alpha=half),
+            Joint('flange_x', 'prismatic', theta=half, alpha=half),
+            Joint('flange_y', 'prismatic', alpha=-half),
+            Joint('flange_rx', alpha=half),
+            Joint('flange_ry', theta=half, alpha=half),
             Joint('flange_rz'),
         ),
     )
@@ -271,31 +261,24 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
 
     A table with `image` and q1 ... qn, or with the flange's pose x y z qx qy qz qw.
     """
-    header, rows = _table(path, ('image',))
-    names = [f'q{k + 1}' for k in range(joints)]
-    posed = 'q1' not in header
-    if posed:
-        names = ['x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
-    missing = [name for name in names if name not in header]
+    found = read_columns(path, ('image',))
+    image, names = found.labels('image')
+    if len(names) < len(image):
+        row = int(np.argmax(np.bincount(image)[image] > 1))
+        raise InputError(f'{found.where(row, "image")} {names[image[row]]} is there twice')
+    posed = 'q1' not in found.header
+    columns = POSE if posed else joint_columns(joints)
+    missing = [name for name in columns if name not in found.header]
     if missing:
         raise InputError(
-            f'{path}: {", ".join(missing)} missing: give q1 ... q{joints}, or x y z qx qy qz qw '
-            'of the flange'
+            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or x y z qx qy qz '
+            'qw of the flange'
         )
-    found: dict[str, FloatArray] = {}
-    for line, row in rows:
-        where = f'{path}, line {line}'
-        name = from_cell(row.get('image') or '')
-        if name in found:
-            raise InputError(f'{where}: image {name} is there already')
-        found[name] = np.array([cell_number(row.get(k), f'{where}: {k}') for k in names])
-        if posed and abs(float(np.linalg.norm(found[name][3:])) - 1.0) > QUATERNION_TOLERANCE:
-            raise InputError(f'{where}: qx qy qz qw must have length 1')
-    if posed and found:
-        values = np.array(list(found.values()))
-        places = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
-        found = dict(zip(found, places, strict=True))
-    return found, posed
+    values = found.block(columns)
+    if posed:
+        check_quaternions(found, values[:, 3:])
+        values = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
+    return dict(zip(names, values, strict=True)), posed
 
 
 def observed(
@@ -316,14 +299,3 @@ def observed(
     points = board.corners[found.corner[kept]]
     seen = Observations.from_pixels(joints, found.pixels[kept], points, image, on_flange)
     return seen, warnings
-
-
-def _table(path: Path, needed: Sequence[str]) -> tuple[Sequence[str], list[tuple[int, Row]]]:
-    data = read_bytes(path, LARGEST_TABLE, InputError)
-    header, rows = read_rows(decoded(data, str(path), InputError), path)
-    missing = [name for name in needed if name not in header]
-    if missing:
-        raise InputError(f'{path}: column {", ".join(missing)} missing')
-    if not rows:
-        raise InputError(f'{path} has no rows')
-    return header, rows

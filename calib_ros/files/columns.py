@@ -1,209 +1,179 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns: numbers of all rows at once.
-
-What is made here is exactly what reading row by row makes, or nothing: where a table is not as
-regular as most are (quotes, rows that end early, a cell that is no number), None is returned, and
-whoever asked reads row by row and names the fault.
-"""
+"""A table by columns: numbers of all rows at once. What is wrong is said with its line."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.errors import InputError
+from calib_ros.escapes import from_cell
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import MOST_COLUMNS, Row
+from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, cell_number
 
 Lines = NDArray[np.intp]
-NEWLINE = 10
-IRREGULAR = ('"', '\r', '\0')
-"""What cells are not cut at separators alone with."""
-WIDEST, FEW = 40, 100
-"""Characters of a text, and how many different ones, that are told apart all at once."""
+Codes = tuple[NDArray[np.intp], list[str]]
+"""The number (N,) of each row's text, and the texts in order of appearance."""
 
 
 @dataclass(frozen=True, eq=False)
-class TextColumns:
-    """The columns of a regular text.
+class Columns:
+    """The columns of a table: of the file at `path`, with the `lines` (N,) of the rows."""
 
-    Attributes
-    ----------
-    header : tuple of str
-    lines : (N,)
-        Line of each row in the file.
-
-    """
-
+    path: Path
     header: tuple[str, ...]
     lines: Lines
-    _rows: Sequence[str]
-    _separator: str
-    _bytes: NDArray[np.uint8]
-    _ends: NDArray[np.int32]
-    """Where each cell ends (N, C) in the bytes; it begins one after the end of the one before."""
 
-    def blank(self, name: str) -> NDArray[np.bool_]:
-        """Return (N,) which cells of a column are empty."""
-        return self._empty[:, self.header.index(name)]
+    def where(self, row: int, name: str) -> str:
+        """Return the place of a cell in words."""
+        return f'{self.path}, line {self.lines[row]}: {name}'
 
-    def numbers(self, names: Sequence[str]) -> FloatArray | None:
-        """Return the numbers (N, len(names)), NaN for empty cells; None where one is no number.
+    def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:
+        """Return the numbers (N, len(names)), NaN for empty cells.
 
-        Many columns at once take hardly longer than one.
+        Many columns at once take hardly longer than one. Errors name them as they are `called`.
+
+        Raises
+        ------
+        InputError
+            When a cell is no number.
+
         """
-        columns = [self.header.index(name) for name in names]
-        blank = self._empty[:, columns]
-        some = np.flatnonzero(~blank.all(axis=0))
-        if not len(some):
-            return np.full(blank.shape, np.nan)
-        rows = self._filled if blank[:, some].any() else self._rows
-        use = [columns[k] for k in some.tolist()]
-        try:
-            read = np.loadtxt(rows, delimiter=self._separator, usecols=use, ndmin=2, comments=None)
-        except (ValueError, OverflowError):
-            return None
-        found = read
-        if len(some) < len(names):
-            found = np.full(blank.shape, np.nan)
-            found[:, some] = read
-        return found if (np.isfinite(found) | blank).all() else None
+        found = self._numbers(names)
+        if found is not None:
+            return found
+        parsed = np.full((len(self.lines), len(names)), np.nan)
+        first: tuple[int, int, str] | None = None
+        for k, name in enumerate(names):
+            texts = self.texts(name)
+            for row, text in enumerate(texts[: first[0]] if first else texts):
+                try:
+                    parsed[row, k] = float(text) if text else np.nan
+                except ValueError:
+                    parsed[row, k] = np.inf
+                if text and not np.isfinite(parsed[row, k]):
+                    first = (row, k, text)
+                    break
+        if first is not None:
+            row, k, text = first
+            cell_number(text, self.where(row, (called or names)[k]))
+        return parsed
 
-    def integers(self, name: str) -> NDArray[np.int64] | None:
-        """Return the integers (N,) of a column as written; None where one is not."""
+    def block(
+        self,
+        names: Sequence[str],
+        largest: float = LARGEST,
+        values: FloatArray | None = None,
+        needed: NDArray[np.bool_] | bool = True,
+    ) -> FloatArray:
+        """Return numbers (N, len(names)) of which each row has all or, if not `needed`, none.
+
+        `values` are the numbers of the columns where they are known.
+
+        Raises
+        ------
+        InputError
+            When a row has some of them only, or one beyond the largest.
+
+        """
+        found = self.numbers(names) if values is None else values
+        nothing = np.isnan(found)
+        lacking = nothing.any(axis=1)
+        if lacking.any():
+            lacking &= needed | ~nothing.all(axis=1)
+        if lacking.any():
+            row = int(lacking.argmax())
+            cell_number('', self.where(row, names[int(nothing[row].argmax())]))
+        if max(-np.nanmin(found, initial=0.0), np.nanmax(found, initial=0.0)) > largest:
+            row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
+            cell_number(repr(found[row, k]), self.where(row, names[k]), largest)
+        return found
+
+    def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """Return the integers (N,) of a column, for empty cells those given if any are.
+
+        Raises
+        ------
+        InputError
+            When a cell holds no integer of 64 bits.
+
+        """
         texts = self.texts(name)
         try:
             found = np.array([int(text) for text in texts], dtype=np.int64)
+            if list(map(str, found.tolist())) == texts:
+                return found
         except (ValueError, OverflowError):
-            return None
-        return found if list(map(str, found.tolist())) == texts else None
+            pass
+        numbers = [
+            int(blank[row])
+            if blank is not None and not text
+            else cell_integer(text, self.where(row, name))
+            for row, text in enumerate(texts)
+        ]
+        return np.array(numbers, dtype=np.int64)
+
+    def labels(self, name: str) -> Codes:
+        """Return the number of each row's name, and the names; empty ones without the column."""
+        if name not in self.header:
+            return np.zeros(len(self.lines), dtype=np.intp), ['']
+        numbers, found = self.codes(name)
+        place, names = numbered([from_cell(each) for each in found])
+        return place[numbers], names
+
+    def blank(self, name: str) -> NDArray[np.bool_]:
+        """Return (N,) which cells of a column are empty."""
+        raise NotImplementedError
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
-        k = self.header.index(name)
-        return [row.split(self._separator, k + 1)[k] for row in self._rows]
+        raise NotImplementedError
 
-    def codes(self, name: str) -> tuple[NDArray[np.intp], list[str]]:
-        """Return the number (N,) of each row's text, and the texts in order of appearance."""
-        starts, ends = self._spans(name)
-        width = int((ends - starts).max(initial=0))
-        if width == 0:
-            return np.zeros(len(starts), dtype=np.intp), ['']
-        if width > WIDEST:
-            return _numbered(self.texts(name))
-        place = starts[:, np.newaxis] + np.arange(width, dtype=np.int32)
-        beyond = place >= ends[:, np.newaxis]
-        place[beyond] = 0
-        cells = self._bytes[place]
-        cells[beyond] = 0
-        words = np.ascontiguousarray(cells).view(f'S{width}').ravel()
-        numbers = np.full(len(words), -1, dtype=np.intp)
-        known: list[str] = []
-        first = 0
-        while len(known) < FEW:
-            word = words[first]
-            numbers[words == word] = len(known)
-            known.append(bytes(word).decode())
-            rest = numbers[first:] < 0
-            if not rest.any():
-                return numbers, known
-            first += int(np.argmax(rest))
-        return _numbered(self.texts(name))
+    def select(self, rows: NDArray[np.generic] | slice) -> Columns:
+        """Return some of the rows, by a mask, by indices or by a slice."""
+        raise NotImplementedError
 
-    def _spans(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return where the cells of a column begin and end (N,)."""
-        k, width = self.header.index(name), len(self.header)
-        flat = self._ends
-        return flat[k:-1:width] + np.int32(1), flat[k + 1 :: width]
+    def codes(self, name: str) -> Codes:
+        """Return the number of each row's text, and the texts."""
+        return numbered(self.texts(name))
 
-    @cached_property
-    def _empty(self) -> NDArray[np.bool_]:
-        """Return which cells (N, C) are empty."""
-        return np.asarray(np.diff(self._ends) == 1).reshape(-1, len(self.header))
-
-    @cached_property
-    def _filled(self) -> list[str]:
-        """Return the rows with NaN in empty cells."""
-        sep = self._separator
-        text = '\n' + '\n'.join(self._rows) + '\n'
-        for _ in range(2):  # neighbours share a separator
-            text = text.replace(sep + sep, f'{sep}nan{sep}')
-        text = text.replace(f'\n{sep}', f'\nnan{sep}').replace(f'{sep}\n', f'{sep}nan\n')
-        return text[1:-1].split('\n')
-
-
-def regular(
-    text: str, separator: str = ',', header: Sequence[str] = (), above: int = 0
-) -> TextColumns | None:
-    """Return the columns of a text, None where it is not regular.
-
-    Its first line is the header unless one is given; `above` are lines of the file before it.
-    """
-    if '\r' in text:
-        text = text.replace('\r\n', '\n')
-    if not text or any(each in text for each in IRREGULAR):
-        return None
-    rows = text.split('\n')
-    if not rows[-1]:
-        rows.pop()
-    lines = np.arange(above + 1, above + 1 + len(rows))
-    whole = '' not in rows
-    if not whole:
-        lines = lines[[bool(row) for row in rows]]
-        rows = [row for row in rows if row]
-    if not header:
-        if not rows:
-            return None
-        header, lines = rows[0].split(separator), lines[1:]
-        rows, whole = rows[1:], False
-    width = len(header)
-    if not rows or len(set(header)) < width or width > MOST_COLUMNS:
-        return None
-    body = text if whole and text.endswith('\n') else '\n'.join(rows) + '\n'
-    flat = np.frombuffer(f'\n{body}'.encode(), dtype=np.uint8)
-    ends = np.flatnonzero((flat == ord(separator)) | (flat == NEWLINE)).astype(np.int32)
-    if len(ends) != width * len(rows) + 1 or not (flat[ends[::width]] == NEWLINE).all():
-        return None
-    return TextColumns(tuple(header), lines, rows, separator, flat, ends)
-
-
-def _numbered(texts: Sequence[str]) -> tuple[NDArray[np.intp], list[str]]:
-    """Return the number (N,) of each text, and the different ones in order of appearance."""
-    known: dict[str, int] = {}
-    numbers = [known.setdefault(text, len(known)) for text in texts]
-    return np.array(numbers, dtype=np.intp), list(known)
+    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+        """Return the numbers of columns, None where a cell may be none."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
-class MadeColumns:
-    """Columns that were computed: numbers (N,), NaN where there is none, and texts."""
+class MadeColumns(Columns):
+    """Columns that were computed, `values` (N,) with NaN where there is none, or cut by csv."""
 
-    lines: Lines
     values: Mapping[str, FloatArray]
     words: Mapping[str, Sequence[str]]
+    header: tuple[str, ...] = field(init=False)
 
-    @property
-    def header(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-        return (*self.words, *self.values)
+    def __post_init__(self) -> None:
+        """Name the columns."""
+        object.__setattr__(self, 'header', (*self.words, *self.values))
+
+    def select(self, rows: NDArray[np.generic] | slice) -> MadeColumns:
+        """Return some of the rows, by a mask, by indices or by a slice."""
+        index = np.arange(len(self.lines))[rows].tolist()
+        return replace(
+            self,
+            lines=self.lines[rows],
+            values={name: value[rows] for name, value in self.values.items()},
+            words={name: [words[k] for k in index] for name, words in self.words.items()},
+        )
 
     def blank(self, name: str) -> NDArray[np.bool_]:
         """Return (N,) where a column holds nothing."""
         if name in self.words:
-            return np.array([not word for word in self.words[name]])
+            return np.array([not word for word in self.words[name]], dtype=bool)
         return np.isnan(self.values[name])
-
-    def numbers(self, names: Sequence[str]) -> FloatArray | None:
-        """Return the numbers (N, len(names)), NaN where there is none."""
-        return np.column_stack([self.values[name] for name in names])
-
-    def integers(self, name: str) -> NDArray[np.int64] | None:
-        """Return the integers (N,) of a column."""
-        return np.array([int(word) for word in self.words[name]], dtype=np.int64)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -211,15 +181,31 @@ class MadeColumns:
             return list(self.words[name])
         return ['' if value != value else repr(value) for value in self.values[name].tolist()]
 
-    def codes(self, name: str) -> tuple[NDArray[np.intp], list[str]]:
-        """Return the number (N,) of each row's text, and the texts in order of appearance."""
-        return _numbered(self.texts(name))
+    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+        if set(names) & set(self.words):
+            return None
+        return np.column_stack([self.values[name] for name in names])
 
-    def rows(self) -> list[tuple[int, Row]]:
-        """Return the rows with their lines."""
-        columns = [self.texts(name) for name in self.header]
-        cells = zip(*columns, strict=True)
-        return [
-            (line, dict(zip(self.header, row, strict=True)))
-            for line, row in zip(self.lines.tolist(), cells, strict=True)
-        ]
+
+def numbered(texts: Sequence[str]) -> Codes:
+    """Return the number of each text, and the different ones."""
+    known: dict[str, int] = {}
+    numbers = [known.setdefault(text, len(known)) for text in texts]
+    return np.array(numbers, dtype=np.intp), list(known)
+
+
+def check_quaternions(columns: Columns, quat: FloatArray) -> None:
+    """Refuse quaternions (N, 4) of rows that are not of length 1, but for NaN."""
+    lengths = np.sqrt(np.einsum('ni,ni->n', quat, quat))
+    for row in np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)[:1].tolist():
+        raise InputError(
+            f'{columns.where(row, "quaternion")} qx qy qz qw has length {lengths[row]:.6g}, '
+            'expected 1'
+        )
+
+
+def lines_in_words(lines: Sequence[int]) -> str:
+    """Return which lines of a file, the first ones by their numbers."""
+    shown = ', '.join(map(str, lines[:5]))
+    more = f' and {len(lines) - 5} more' if len(lines) > 5 else ''
+    return f'line{"s" if len(lines) > 1 else ""} {shown}{more}'

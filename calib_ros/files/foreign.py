@@ -8,16 +8,16 @@ import csv
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.bulk import COVARIANCE
-from calib_ros.files.columns import MadeColumns
+from calib_ros.files.columns import MadeColumns, lines_in_words
 from calib_ros.files.layouts import (
     ANGLES,
+    COVARIANCE,
     IN_TURN,
     LENGTHS,
     NUMBERS,
@@ -43,8 +43,6 @@ UNITS = {
     'inches': 'in',
     **{unit: unit for unit in LENGTHS},
 }
-MOST_LINES = 5
-"""Lines that a note names."""
 
 
 def refuse_separator(path: Path, header: Sequence[str]) -> None:
@@ -86,13 +84,13 @@ class Foreign:
                 )
             values = {**joints, **values}
             notes += [*log.notes, f'row by row, {self.log} holds the joint values of {path}']
-        made = MadeColumns(lines, values, words)
+        made = MadeColumns(path, lines, values, words)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         made, left_out = _measured_only(made)
         if left_out:
             notes.append(left_out)
-        return finished(made, self.layout, path), tuple(f'{path}: {note}' for note in notes)
+        return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 
 
 def as_csv(columns: MadeColumns) -> str:
@@ -169,7 +167,7 @@ class _Table:
                 )
             else:
                 absent.append(f'{ours} ({", ".join(missing)})')
-        if 0 < len(absent) <= MOST_LINES:  # `q*=A*` stands for as many as there are
+        if 0 < len(absent) <= 5:  # `q*=A*` stands for as many as there are
             self.notes.append(f'it has no {", ".join(absent)}: left out')
         lower = [name.lower() for name in self._sheet.header]
         guessed = []
@@ -211,10 +209,9 @@ class _Table:
         names = list(dict.fromkeys(n for each in self._expressions.values() for n in each.names))
         numbers = [self._sheet.number(name) for name in names]
         ids = [each for each in numbers if each is not None]
-        read = self._sheet.columns.numbers(ids) if ids else np.zeros((len(self.lines), 0))
-        if read is None:
-            self._refuse(names, ids)
-        assert read is not None
+        read = np.zeros((len(self.lines), 0))
+        if ids:
+            read = self._sheet.columns.numbers(ids, names)
         columns = dict(zip(names, read.T, strict=True))
         units = self._units()
         found = {}
@@ -225,20 +222,6 @@ class _Table:
                 raise InputError(f'{self._path}, line {line}: {ours} = {each.text} is infinite')
             found[ours] = value
         return found
-
-    def _refuse(self, names: Sequence[str], ids: Sequence[str]) -> None:
-        """Name the first cell that is no number."""
-        for name, number in zip(names, ids, strict=True):
-            for line, cell in zip(self.lines, self._sheet.columns.texts(number), strict=True):
-                try:
-                    good = not cell or bool(np.isfinite(float(cell)))
-                except ValueError:
-                    good = False
-                if not good:
-                    raise InputError(
-                        f'{self._path}, line {line}: {name} must be a number, not {cell!r}'
-                    )
-        raise InputError(f'{self._path}: a number in {", ".join(names)} cannot be read')
 
     def _units(self) -> tuple[str, str, str]:
         """Return the units of lengths, angles and joint values."""
@@ -299,33 +282,21 @@ def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')
-    here = slice(max(0, -shift), count - max(0, shift))
+    here = made.select(slice(max(0, -shift), count - max(0, shift)))
     there = slice(max(0, shift), count - max(0, -shift))
     moved = {
-        name: value[there if name[0] in 'qsva' and name[1:].isdigit() else here]
-        for name, value in made.values.items()
+        name: made.values[name][there]
+        for name in made.values
+        if name[0] in 'qsva' and name[1:].isdigit()
     }
-    return MadeColumns(made.lines[here], moved, {k: v[here] for k, v in made.words.items()})
+    return replace(here, values={**here.values, **moved})
 
 
 def _measured_only(made: MadeColumns) -> tuple[MadeColumns, str]:
     """Return the rows in which anything was measured, and what is left out, in words."""
     measured = [made.values[name] for name in MEASURED if name in made.values]
-    if not measured:
-        return made, ''
-    good = ~np.isnan(np.column_stack(measured)).all(axis=1)
+    good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
     if good.all():
         return made, ''
-    kept: list[bool] = np.asarray(good).tolist()
-    lines = made.lines[~good].tolist()
-    shown = ', '.join(map(str, lines[:MOST_LINES]))
-    more = f' and {len(lines) - MOST_LINES} more' if len(lines) > MOST_LINES else ''
-    values = {name: value[good] for name, value in made.values.items()}
-    words = {
-        name: [word for word, keep in zip(texts, kept, strict=True) if keep]
-        for name, texts in made.words.items()
-    }
-    return (
-        MadeColumns(made.lines[good], values, words),
-        f'nothing was measured in line{"s" if len(lines) > 1 else ""} {shown}{more}: left out',
-    )
+    lines = lines_in_words(made.lines[~good].tolist())
+    return made.select(good), f'nothing was measured in {lines}: left out'

@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
+from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.pictures import Refusal
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 FEWEST = 6
@@ -31,8 +33,6 @@ BENT = 5.0
 """Distance [px] from where the other corners say up to which lens and board may bend a board."""
 BENT_SHARE = 0.1
 """The same as a share of the distance between corners."""
-LARGEST_IMAGE = 200_000_000
-"""Bytes of a file."""
 Image = NDArray[np.uint8]
 
 
@@ -103,17 +103,32 @@ def files_of(folder: Path) -> Iterator[tuple[str, Image]]:
         if path.stat().st_size > LARGEST_IMAGE:
             yield path.name, np.zeros((0, 0), dtype=np.uint8)
         else:
-            yield path.name, decoded(path.read_bytes())
+            yield path.name, decoded(np.fromfile(path, dtype=np.uint8))
 
 
-def decoded(data: bytes) -> Image:
+def decoded(data: NDArray[np.uint8]) -> Image:
     """Return a compressed image in grey; without pixels where it is none."""
     cv2 = opencv()
     try:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         image = None
     return np.zeros((0, 0), dtype=np.uint8) if image is None else np.asarray(image)
+
+
+def image_of(message: Any) -> Image:
+    """Return a sensor_msgs/Image or CompressedImage in grey.
+
+    Raises
+    ------
+    InputError
+        For an encoding or a size that cannot be used.
+
+    """
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    if hasattr(message, 'format'):
+        return decoded(data)
+    return grey(data, message.height, message.width, message.step, message.encoding)
 
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
@@ -126,22 +141,29 @@ def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: 
 
     """
     cv2 = opencv()
-    codes = {
-        **dict.fromkeys(('mono8', '8UC1'), None),
-        **dict.fromkeys(('rgb8',), cv2.COLOR_RGB2GRAY),
-        **dict.fromkeys(('bgr8', '8UC3'), cv2.COLOR_BGR2GRAY),
-        'rgba8': cv2.COLOR_RGBA2GRAY,
-        'bgra8': cv2.COLOR_BGRA2GRAY,
+    known = {  # channels, and how they become grey; OpenCV names a Bayer pattern by its second row
+        'mono8': (1, None),
+        '8UC1': (1, None),
+        'rgb8': (3, cv2.COLOR_RGB2GRAY),
+        'bgr8': (3, cv2.COLOR_BGR2GRAY),
+        '8UC3': (3, cv2.COLOR_BGR2GRAY),
+        'rgba8': (4, cv2.COLOR_RGBA2GRAY),
+        'bgra8': (4, cv2.COLOR_BGRA2GRAY),
+        'bayer_rggb8': (1, cv2.COLOR_BayerBG2GRAY),
+        'bayer_bggr8': (1, cv2.COLOR_BayerRG2GRAY),
+        'bayer_gbrg8': (1, cv2.COLOR_BayerGR2GRAY),
+        'bayer_grbg8': (1, cv2.COLOR_BayerGB2GRAY),
     }
-    if encoding not in codes:
-        raise UnknownNameError('encoding of images', encoding, codes)
-    channels = 1 if codes[encoding] is None else 4 if 'a' in encoding else 3
+    if encoding not in known:
+        raise UnknownNameError('encoding of images', encoding, known)
+    channels, code = known[encoding]
     if step < width * channels or len(data) < height * step or height < 1 or width < 1:
         raise InputError(f'an image of {width} x {height} px holds {len(data)} bytes only')
     rows = data[: height * step].reshape(height, step)[:, : width * channels]
-    if channels == 1:
+    if code is None:
         return np.ascontiguousarray(rows)
-    return np.asarray(cv2.cvtColor(rows.reshape(height, width, channels), codes[encoding]))
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows).reshape(shape), code))
 
 
 class Detector:
@@ -171,21 +193,24 @@ class Detector:
         if board.type == 'charuco':
             self._corners = self._charuco()
 
-    def of(self, image: Image) -> tuple[NDArray[np.intp], FloatArray] | str:
+    def of(self, image: Image) -> tuple[NDArray[np.intp], FloatArray] | Refusal:
         """Return numbers (K,) and pixels (K, 2) of the corners, or why the image is not used."""
         if not image.size:
-            return 'it is no image that OpenCV can read'
+            return Refusal('that cannot be decoded', 'it is no image that OpenCV can read')
         corners, ids = self._markers(image, self._dictionary)
         width = _edge_width(self._cv2, image)
         if width > BLURRED:
-            return f'it is blurred: its sharpest edges are {width:.0f} px wide'
+            reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
+            return Refusal('blurred', reason)
         if not len(ids):
-            return f'it shows no marker of {self._board.dictionary}{self._others(image)}'
+            reason = f'it shows no marker of {self._board.dictionary}{self._others(image)}'
+            return Refusal('without the board', reason)
         foreign = ids[ids >= self._count]
         if len(foreign) > len(ids) // 2:
-            return (
+            return Refusal(
+                'of another board',
                 f'it shows another board: marker {int(foreign[0])}, and this board has 0 to '
-                f'{self._count - 1}'
+                f'{self._count - 1}',
             )
         own = ids < self._count
         number, pixels = self._corners(
@@ -193,17 +218,19 @@ class Detector:
         )
         whole = len(self._board.corners)
         if len(number) < self._fewest:
-            return (
+            return Refusal(
+                'with too little of the board',
                 f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, and '
-                f'{len(ids)} markers: is it a part of the board only, or another board?'
+                f'{len(ids)} markers: is it a part of the board only, or another board?',
             )
         points = self._board.corners[number, :2]
         apart = _off_a_plane(points, pixels)
         spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
         if apart > max(BENT, BENT_SHARE * spacing):
-            return (
+            return Refusal(
+                'whose corners do not fit the board',
                 f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, square'
-                ' and marker those of this board, and is it flat?'
+                ' and marker those of this board, and is it flat?',
             )
         return number, pixels
 
@@ -300,9 +327,9 @@ def detect(
     image, corner, pixels, refused = [], [], [], []
     for name, picture in images:
         found = detector.of(picture)
-        if isinstance(found, str):
-            refused.append(Refused(name, found))
-            heard(f'{name}: not used, {found}')
+        if isinstance(found, Refusal):
+            refused.append(Refused(name, found.reason))
+            heard(f'{name}: not used, {found.reason}')
             continue
         heard(f'{name}: {len(found[0])} corners')
         image.append(np.full(len(found[0]), len(names)))

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files.tables import SOCKET, cells, columns
+from calib_ros.files.tables import LATER, cells, columns
 from calib_ros.sampling.sample import Sample
 
 
@@ -43,7 +43,7 @@ class Journal:
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._width: int | None = None  # of a journal without columns for sockets
+        self._width: int | None = None  # of a journal without the later columns
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         try:
             self._lock()
@@ -61,12 +61,13 @@ class Journal:
             When the disk is full, say; what was written before is whole.
 
         """
-        if sample.socket and self._width:
+        row = cells(sample)
+        if self._width and any(row[self._width :]):
             raise OSError(
-                f'{self.path} is of an earlier version, without columns for sockets: call '
-                '~/clear to begin another'
+                f'{self.path} is of an earlier version, without columns for sockets or images: '
+                'call ~/clear to begin another'
             )
-        self._write(cells(sample))
+        self._write(row)
 
     def remove(self, sample: Sample) -> None:
         """Write that a sample was taken back."""
@@ -95,13 +96,17 @@ class Journal:
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""
         expected = ','.join(header).encode() + b'\n'
-        before = ','.join(header[: -len(SOCKET)]).encode() + b'\n'
-        if os.pread(self._file, len(before), 0) == before:
-            expected, self._width = before, len(header) - len(SOCKET)
+        width = len(header)
+        for names in reversed(LATER):
+            width -= len(names)
+            before = ','.join(header[:width]).encode() + b'\n'
+            if os.pread(self._file, len(before), 0) == before:
+                expected, self._width = before, width
         found = os.pread(self._file, len(expected), 0)
         if not expected.startswith(found):
             raise InputError(
-                f'{self.path} has not the columns of a journal of this robot: move it away'
+                f"{self.path} does not have this robot's columns: move it, or choose another "
+                'data_dir'
             )
         if found != expected:
             os.ftruncate(self._file, 0)

@@ -28,6 +28,8 @@ ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}
 """Radians in units of angle."""
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
+UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
 TURNS = ('rx', 'ry', 'rz')
 """Angles about x, y, z of three different letters, or a rotation vector."""
 IN_TURN = ('r1', 'r2', 'r3')

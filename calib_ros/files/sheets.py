@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.files.columns import TextColumns, regular
+from calib_ros.files.csv_columns import TextColumns, regular
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, read_bytes
 
@@ -110,7 +110,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         if decimal == ',':
             body = body.replace(',', '.')
         numbers = [f'#{k + 1}' for k in range(width)]
-        columns = regular(body, separator, numbers, start - 1)
+        columns = regular(path, body, separator, numbers, start - 1)
         if columns is None:
             rows = _cells(path, text, separator)
             first = next(k for k, (line, _) in enumerate(rows) if line >= start)
@@ -297,7 +297,8 @@ def _ragged(
     if decimal == ',':
         filled = [[cell.replace(',', '.') for cell in row] for row in filled]
     names = [f'#{k + 1}' for k in range(width)]
-    found = regular('\n'.join(SEPARATOR.join(row) for row in filled), SEPARATOR, names)
+    text = '\n'.join(SEPARATOR.join(row) for row in filled)
+    found = regular(path, text, SEPARATOR, names)
     if found is None:
         raise InputError(f'cannot read {path}: it holds quotes or zeros within cells')
     return replace(found, lines=np.array([line for line, _ in rows], dtype=np.intp))

@@ -20,6 +20,7 @@ from calib_ros.files.mcap import (
     unpacked_size,
 )
 from calib_ros.sampling.intake import Stream
+from calib_ros.sampling.messages import PICTURES
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -30,6 +31,13 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 """What the library does not promise: without them, it is asked for the messages itself."""
 LARGEST_MESSAGE = 65_536
 """Bytes of a message; a joint state of a thousand joints has fewer."""
+LARGEST_IMAGE = 200_000_000
+"""Bytes of an image, as a message or a file."""
+
+
+def largest(stream: Stream) -> int:
+    """Return how many bytes a message of a stream may have."""
+    return LARGEST_IMAGE if stream.type in PICTURES else LARGEST_MESSAGE
 
 
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
@@ -49,7 +57,7 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
         )
     found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
     if reader.compression_mode == 'message':
-        return ((stream, unpacked(data, 'zstd', LARGEST_MESSAGE)) for stream, data in found)
+        return ((stream, unpacked(data, 'zstd', largest(stream))) for stream, data in found)
     return found
 
 

@@ -12,31 +12,39 @@ standard deviations are those about the device's axes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.bulk import COVARIANCE, UPPER
-from calib_ros.files.columns import MadeColumns
-from calib_ros.files.layouts import IN_TURN, POSITION, QUATERNION, SIGMAS, TURNS, Layout
+from calib_ros.files.columns import MadeColumns, check_quaternions
+from calib_ros.files.layouts import (
+    COVARIANCE,
+    IN_TURN,
+    POSITION,
+    QUATERNION,
+    SIGMAS,
+    TURNS,
+    UPPER,
+    Layout,
+)
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.values import QUATERNION_TOLERANCE
 
 
-def finished(made: MadeColumns, layout: Layout, path: Path) -> MadeColumns:
+def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
     """Return the columns with quaternions for rotations, covariances for standard deviations."""
-    values, words = dict(made.values), dict(made.words)
+    path, values, words = made.path, dict(made.values), dict(made.words)
     time = values.pop('time', None)
     if time is not None:
         if np.isnan(time).any() or np.abs(time).max(initial=0.0) > 9e9:
             line = made.lines[int(np.argmax(~(np.abs(time) <= 9e9)))]
             raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
         words['stamp_ns'] = [str(round(each * 1e9)) for each in time.tolist()]
-    rotation, axes = _rotations(values, layout, path, made)
+    rotation, axes = _rotations(values, layout, made)
     sigmas = [values.pop(name, None) for name in SIGMAS]
     for name in (*TURNS, *IN_TURN):
         values.pop(name, None)
@@ -61,39 +69,41 @@ def finished(made: MadeColumns, layout: Layout, path: Path) -> MadeColumns:
     if covariance is not None:
         rows, columns = np.transpose(UPPER)
         values |= dict(zip(COVARIANCE, covariance[:, rows, columns].T, strict=True))
-    return MadeColumns(made.lines, values, words)
+    return replace(made, values=values, words=words)
 
 
 def _rotations(
-    values: dict[str, FloatArray], layout: Layout, path: Path, made: MadeColumns
+    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns that standard deviations are
     about; None where there are none.
     """
     if set(QUATERNION) & set(values):
-        return _from_quaternions(values, layout, path, made)
+        return _from_quaternions(values, layout, made)
     three = [name for name in (TURNS, IN_TURN) if set(name) & set(values)]
     if not three:
         for name in ('euler', 'rotation_vector', 'quaternion'):
             if getattr(layout, name):
                 raise ConfigError(
-                    f'{path}: {name.replace("_", " ")} is given, but no columns: --columns '
+                    f'{made.path}: {name.replace("_", " ")} is given, but no columns: --columns '
                     'rx=NAME,ry=NAME,rz=NAME (or qx, qy, qz, qw)'
                 )
         return None, None
     names = three[0]
     missing = [name for name in names if name not in values]
     if missing or len(three) > 1:
-        raise ConfigError(f'{path}: give rx, ry, rz or r1, r2, r3, all three; missing {missing}')
+        raise ConfigError(
+            f'{made.path}: give rx, ry, rz or r1, r2, r3, all three; missing {missing}'
+        )
     angles = np.column_stack([values[name] for name in names])
-    _require_whole(angles, path, made, ', '.join(names))
+    _require_whole(angles, made, ', '.join(names))
     if layout.rotation_vector:
         rotation = se3.exp_rotation(angles)
         return rotation, _left_jacobians(angles)
     if not layout.euler:
         raise ConfigError(
-            f'{path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, zyx, ...) or '
-            '--rotation-vector'
+            f'{made.path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, '
+            'zyx, ...) or --rotation-vector'
         )
     letters = layout.euler
     if names == TURNS:
@@ -116,31 +126,27 @@ def _rotations(
 
 
 def _from_quaternions(
-    values: dict[str, FloatArray], layout: Layout, path: Path, made: MadeColumns
+    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
 ) -> tuple[FloatArray, FloatArray]:
     """Return rotations, and the device's axes."""
     missing = [name for name in QUATERNION if name not in values]
     if missing:
-        raise ConfigError(f'{path}: a quaternion has four columns, missing {", ".join(missing)}')
+        raise ConfigError(
+            f'{made.path}: a quaternion has four columns, missing {", ".join(missing)}'
+        )
     quat = np.column_stack([values[name] for name in QUATERNION])
     if layout.quaternion == 'wxyz':
         quat = quat[:, [1, 2, 3, 0]]
-    _require_whole(quat, path, made, 'qx, qy, qz, qw')
-    length = np.linalg.norm(quat, axis=1)
-    wrong = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
-    if len(wrong):
-        raise InputError(
-            f'{path}, line {made.lines[wrong[0]]}: quaternion qx qy qz qw has length '
-            f'{length[wrong[0]]:.6g}, expected 1'
-        )
+    _require_whole(quat, made, 'qx, qy, qz, qw')
+    check_quaternions(made, quat)
     return se3.from_quat(quat), np.tile(np.eye(3), (len(quat), 1, 1))
 
 
-def _require_whole(values: FloatArray, path: Path, made: MadeColumns, names: str) -> None:
+def _require_whole(values: FloatArray, made: MadeColumns, names: str) -> None:
     nothing = np.isnan(values).any(axis=1)
     if nothing.any():
-        line = made.lines[int(np.argmax(nothing))]
-        raise InputError(f'{path}, line {line}: {names} must be numbers, not blank')
+        row = int(np.argmax(nothing))
+        raise InputError(f'{made.where(row, names)} must be numbers, not blank')
 
 
 def _left_jacobians(vectors: FloatArray) -> FloatArray:

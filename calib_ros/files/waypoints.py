@@ -14,16 +14,17 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import InputError
+from calib_ros.files.columns import check_quaternions
+from calib_ros.files.csv_columns import read_columns
+from calib_ros.files.layouts import POSITION, QUATERNION
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import limits
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, read_rows, read_text
-from calib_ros.values import QUATERNION_TOLERANCE, cell_number
 
 BEYOND = 1e-3
 """How far [rad or m] an arm may stand beyond a limit."""
-POSE = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
+POSE = (*POSITION, *QUATERNION)
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
@@ -37,9 +38,9 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
     """
     columns = joint_columns(len(chain.joints))
-    values, lines, header = _read(path, columns)
-    surplus = f'q{len(columns) + 1}'
-    if surplus in header:
+    found = read_columns(path, columns)
+    values, surplus = found.block(columns), f'q{len(columns) + 1}'
+    if surplus in found.header:
         raise InputError(
             f'{path} has a column {surplus}, but "{chain.name}" has {len(columns)} joints only'
         )
@@ -47,7 +48,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     beyond = (values < lower - BEYOND) | (values > upper + BEYOND)
     for k, i in np.argwhere(beyond).tolist():
         raise InputError(
-            f'{path}, line {lines[k]}: {columns[i]} {values[k, i]:.6g} is beyond the limits of '
+            f'{found.where(k, columns[i])} {values[k, i]:.6g} is beyond the limits of '
             f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
         )
     return values
@@ -62,13 +63,9 @@ def read_poses(path: Path) -> FloatArray:
         For a missing column, no row, a value that is no number, or a quaternion that is none.
 
     """
-    numbers, lines, _ = _read(path, POSE)
-    length = np.linalg.norm(numbers[:, 3:], axis=1)
-    for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE).tolist():
-        raise InputError(
-            f'{path}, line {lines[k]}: quaternion qx qy qz qw has length {length[k]:.6g}, '
-            'expected 1'
-        )
+    found = read_columns(path, POSE)
+    numbers = found.block(POSE)
+    check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
 
 
@@ -89,21 +86,3 @@ def csv_of(columns: Sequence[str], values: FloatArray) -> str:
         for row in values.tolist()
     )
     return '\n'.join([','.join(columns), *rows]) + '\n'
-
-
-def _read(path: Path, columns: Sequence[str]) -> tuple[FloatArray, list[int], Sequence[str]]:
-    """Return the values (N, C) of some columns, the line of each row, and the header."""
-    header, rows = read_rows(read_text(path, LARGEST_TABLE, InputError), path)
-    missing = [name for name in columns if name not in header]
-    if missing:
-        raise InputError(
-            f'{path} has no column {", ".join(missing)}; expected {", ".join(columns)}; found '
-            f'{", ".join(header) or "nothing"}'
-        )
-    if not rows:
-        raise InputError(f'{path} has no rows')
-    numbers = [
-        [cell_number(row[name], f'{path}, line {line}: {name}') for name in columns]
-        for line, row in rows
-    ]
-    return np.array(numbers), [line for line, _ in rows], header

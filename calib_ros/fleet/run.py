@@ -10,11 +10,11 @@ running; the next run does the rest.
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 from urllib.parse import quote
@@ -28,10 +28,21 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
-AHEAD = 20
-"""Tasks for each worker that the scheduler knows of: enough to keep it busy, few to lose."""
+AHEAD = 3
+"""Pieces of work for each worker that the scheduler knows of: none waits for more."""
+SPAN = 2.0
+"""Time [s] that a piece of several tasks takes: much to dask's 4 ms for it, little to lose."""
 PATIENCE = 60.0
 """Time [s] for a scheduler and its first worker to answer."""
+DASK = {
+    'distributed.worker.profile.enabled': False,
+    'distributed.admin.tick.interval': '1s',
+    'distributed.admin.system-monitor.interval': '2s',
+    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**28,
+    'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2**25,
+}
+"""Settings of dask: it watches itself less, which takes more than its work, and workers keep what
+memory [bytes] they need again: to get it anew costs a third of a large task's time."""
 NEVER = datetime.fromtimestamp(0, timezone.utc)
 Told: TypeAlias = Callable[[str, float], None]
 
@@ -98,7 +109,9 @@ def run(
         client = None
         for plan in (_new, _without_page):
             tasks = [task for robot in robots for task in plan(robot, history, out, found)]
-            if tasks and client is None:
+            if not tasks:
+                continue
+            if client is None:
                 client = stack.enter_context(_client(cluster))
                 told(f'dashboard: {client.dashboard_link}', 0.0)
             for number, (task, outcome) in enumerate(_done(client, tasks), 1):
@@ -112,23 +125,20 @@ def page_path(out: Path, row: Row) -> Path:
     return out / 'robots' / quote(row.serial, safe='') / f'{row.key}.html'
 
 
-def results(robot: Robot, history: History) -> tuple[Row, ...]:
-    """Return the identifications of a robot by its settings of today, in order of time."""
-    return tuple(
-        row
-        for row in history.rows(robot.serial)
-        if row.kind == 'identify' and row.settings == robot.settings_hash
-    )
+def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return the identifications among rows of a robot that are by its settings of today."""
+    hashed = robot.settings_hash
+    return tuple(row for row in rows if row.kind == 'identify' and row.settings == hashed)
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
     """Return the sources of a robot whose results are not filed; the last one has a page."""
     try:
-        there = sources(robot)
+        there, rows = sources(robot), results(robot, history.rows(robot.serial))
     except CalibrationError as err:
         found.note(robot.serial, '', str(err))
         return []
-    rows = [row for row in results(robot, history) if row.software == calib_ros.__version__]
+    rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
     last = max(there, key=lambda each: (each.modified or NEVER, each.name))
     return [
@@ -145,14 +155,14 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
 
 def _without_page(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
     """Return the source of a robot's newest result if that has no page yet."""
-    rows = results(robot, history)
-    if out is None or not rows or page_path(out, rows[-1]).exists():
+    names = found.errors.get(robot.serial, {})
+    if out is None or '' in names:
         return []
-    with suppress(CalibrationError):  # it was told of before
-        names = found.errors.get(robot.serial, {})
-        there = [each for each in sources(robot) if each.name not in names]
-        return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
-    return []
+    rows = results(robot, history.rows(robot.serial))
+    if not rows or rows[-1].source in names or page_path(out, rows[-1]).exists():
+        return []
+    there = sources(robot)
+    return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
 
 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
@@ -180,11 +190,12 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         from distributed import Client, LocalCluster
     except ImportError:
         raise ConfigError(MISSING) from None
+    logging.getLogger('distributed.client').setLevel(logging.CRITICAL)  # LostError says it
     with ExitStack() as stack:
         if cluster.address:
             where: Any = cluster.address
         else:
-            stack.enter_context(dask.config.set({'distributed.worker.profile.enabled': False}))
+            stack.enter_context(dask.config.set(DASK))
             where = stack.enter_context(
                 LocalCluster(
                     n_workers=cluster.workers or None,
@@ -216,28 +227,40 @@ def _version() -> str:
 def _done(
     client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks with what became of them, as they are done."""
-    if not tasks:
-        return
+    """Yield tasks with what became of them, as they are done: some at once, for dask's sake."""
     from distributed import as_completed
 
-    waiting = iter(tasks)
-    running: dict[str, Task] = {}
+    workers = max(1, len(client.nthreads()))
+    waiting, alone = deque(tasks), deque[Task]()
+    running: dict[str, tuple[Task, ...]] = {}
+    seconds, count = 0.0, 0
 
-    def submitted(count: int) -> list[Any]:
-        chosen = list(islice(waiting, count))
-        futures = client.map(work, chosen, pure=False) if chosen else []
+    def submitted() -> list[Any]:
+        chosen: list[tuple[Task, ...]] = []
+        while (waiting or alone) and len(running) + len(chosen) < AHEAD * workers:
+            fair = len(waiting) // (2 * workers)
+            fit = SPAN * count / max(seconds, 1e-9)
+            most = 1 if alone else max(1, min(fair, int(min(fit, len(waiting)))))
+            source = alone or waiting
+            chosen.append(tuple(source.popleft() for _ in range(most)))
+        futures = client.map(_all, chosen, [work] * len(chosen), pure=False) if chosen else []
         running.update(zip((future.key for future in futures), chosen, strict=True))
         return list(futures)
 
-    ahead = AHEAD * max(1, len(client.nthreads()))
-    completed = as_completed(submitted(ahead), client.loop, with_results=True, raise_errors=False)
-    for future, result in completed:
+    completed = as_completed(submitted(), client.loop, with_results=True, raise_errors=False)
+    for future, outcomes in completed:
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are filed, run again')
-        task = running.pop(future.key)
-        if len(running) <= ahead // 2:  # many at once cost the scheduler less
-            completed.update(submitted(ahead - len(running)))
-        if future.status == 'error':
-            result = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
-        yield task, result
+        done = running.pop(future.key)
+        if future.status == 'error' and len(done) > 1:  # which of them ends a worker?
+            alone.extend(done)
+            outcomes = ()
+        elif future.status == 'error':
+            outcomes = (Outcome(error=f'its worker ended: {shortened(str(future.exception()))}'),)
+        seconds, count = seconds + sum(each.seconds for each in outcomes), count + len(outcomes)
+        completed.update(submitted())
+        yield from zip(done, outcomes, strict=False)
+
+
+def _all(tasks: Sequence[Task], work: Callable[[Task], Outcome]) -> tuple[Outcome, ...]:
+    return tuple(work(task) for task in tasks)

@@ -46,6 +46,8 @@ from calib_ros.shown import Shown
 
 Model: TypeAlias = Literal['corrected', 'nominal']
 MODELS: tuple[Model, ...] = get_args(Model)
+HOLDS = 1.5
+"""Largest RMS error of new poses, in that of the calibration, at which nothing has changed."""
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
 
@@ -189,6 +191,10 @@ class Calibration(Shown):
                 'the calibration.yaml of an identification, or ask for the nominal model'
             )
         return left
+
+    def holds(self, rms: float) -> bool | None:
+        """Tell whether the RMS error [m] of new poses agrees with the one before, if known."""
+        return None if self.residual is None else rms <= HOLDS * self.residual
 
     def commanded_by(self, model: Model) -> Chain:
         """Return the chain by which a model turns poses into joint values."""

@@ -11,10 +11,12 @@ that matrix is well conditioned.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from calib_ros.identification.samples import Samples
@@ -23,6 +25,8 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
+Folds: TypeAlias = Sequence[NDArray[np.intp]]
+"""The number (N,) of the fold of every sample, set by set."""
 STEP_TOLERANCE = 1e-6
 """The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
 larger, in RMS residuals)."""
@@ -97,6 +101,20 @@ class System(Shown):
                         rows[i, column[name]] = sign * apart[k] / length
         return rows / SEPARATION_SIGMA, residual
 
+    def select(self, chosen: Sequence[NDArray[np.generic]]) -> System:
+        """Return the samples chosen by masks or indices, set by set, with their weights."""
+        pairs = zip(self.sets, chosen, strict=True)
+        return replace(self, sets=tuple(samples.select(index) for samples, index in pairs))
+
+    def weighted(self, weights: Sequence[FloatArray | None]) -> System:
+        """Return the samples with weights (N,) set by set; None for all ones."""
+        pairs = zip(self.sets, weights, strict=True)
+        return replace(self, sets=tuple(samples.weighted(each) for samples, each in pairs))
+
+    def rows_of(self, chain: Chain, names: Sequence[str]) -> list[FloatArray]:
+        """Return (P + 1, c, N) the weighted rows of each set, the residual last."""
+        return [samples.rows_of(chain, names) for samples in self.sets]
+
     @property
     def count(self) -> int:
         """Return the number of samples."""
@@ -108,17 +126,37 @@ class System(Shown):
         return sum(samples.rows for samples in self.sets)
 
 
+def stacked(rows: Sequence[FloatArray]) -> FloatArray:
+    """Return the rows (P, c, N) of all sets as one, (R, P)."""
+    return np.concatenate([each.reshape(len(each), -1) for each in rows], axis=1).T
+
+
+def owners(rows: Sequence[FloatArray]) -> NDArray[np.intp]:
+    """Return (R,) the number of the sample, over all sets, of each row of `stacked`."""
+    ends = np.cumsum([each.shape[2] for each in rows]).tolist()
+    numbers = [np.arange(end - each.shape[2], end) for end, each in zip(ends, rows, strict=True)]
+    return np.concatenate(
+        [np.tile(each, of.shape[1]) for each, of in zip(numbers, rows, strict=True)]
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Normal:
     """Normal equations H dx = g at one chain, and the sum of squared weighted residuals there.
 
-    `parts` holds the shares of H by position and by orientation.
+    `products` (2, P + 1, P + 1) are those of the measured rows with each other, by position and by
+    orientation, the residual last.
     """
 
     matrix: FloatArray
     gradient: FloatArray
     cost: float
-    parts: tuple[FloatArray, FloatArray]
+    products: FloatArray
+
+    @property
+    def parts(self) -> FloatArray:
+        """Return the shares (2, P, P) of H by position and by orientation."""
+        return self.products[:, :-1, :-1]
 
     def factor(self) -> FloatArray | None:
         """Return R (P, P) with R^T R = H; None where H has lost too many digits for it."""
@@ -138,34 +176,42 @@ class Normal:
 
 def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Normal:
     """Return the normal equations (P, P), (P,) and the sum of squared weighted residuals."""
-    size = len(names) + 1
-    by_position, by_orientation = np.zeros((2, size, size))
-    order = np.arange(size)
-    for samples in system.sets:
-        for shift, turn, model in samples.blocks(chain, names):
-            by_position += shift @ shift.T
-            if len(turn):
-                products, last = turn @ turn.T, len(turn) - 1
-                by_orientation[:last, :last] += products[:-1, :-1]
-                by_orientation[:last, -1] += products[:-1, -1]
-                by_orientation[-1, -1] += products[-1, -1]
-            order[:-1] = model.order
-    by_orientation[-1, :-1] = by_orientation[:-1, -1]
-    by_position, by_orientation = (
-        part[order[:, np.newaxis], order] for part in (by_position, by_orientation)
-    )
-    total = by_position + by_orientation
+    products = products_of(chain, names, system)[0]
+    total = products.sum(axis=0)
     extra, residual = system.extra_rows(chain, names)
     if len(extra):
-        total[:-1, :-1] += extra.T @ extra
-        total[:-1, -1] += extra.T @ residual
-        total[-1, -1] += residual @ residual
-    return Normal(
-        total[:-1, :-1],
-        total[:-1, -1],
-        float(total[-1, -1]),
-        (by_position[:-1, :-1], by_orientation[:-1, :-1]),
-    )
+        rows = np.column_stack([extra, residual])
+        total += rows.T @ rows
+    return Normal(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), products)
+
+
+def products_of(
+    chain: Chain, names: Sequence[str], system: System, folds: Folds | None = None
+) -> FloatArray:
+    """Return (K, 2, P + 1, P + 1) the products of measured rows by fold; K = 1 without folds.
+
+    By position and by orientation, the residual last.
+    """
+    size = len(names) + 1
+    count = 1 if folds is None else 1 + max(int(each.max(initial=0)) for each in folds)
+    found = np.zeros((count, 2, size, size))
+    order = np.arange(size)
+    for number, samples in enumerate(system.sets):
+        for which, shift, turn, model in samples.blocks(chain, names):
+            last = len(turn) - 1
+            for k, (by_position, by_orientation) in enumerate(found):
+                inside = slice(None) if folds is None else folds[number][which] == k
+                rows = shift[..., inside].reshape(size, -1)
+                by_position += rows @ rows.T
+                if last >= 0:
+                    rows = turn[..., inside].reshape(last + 1, -1)
+                    products = rows @ rows.T
+                    by_orientation[:last, :last] += products[:-1, :-1]
+                    by_orientation[:last, -1] += products[:-1, -1]
+                    by_orientation[-1, -1] += products[-1, -1]
+            order[:-1] = model.order
+    found[:, 1, -1, :-1] = found[:, 1, :-1, -1]
+    return np.asarray(found[:, :, order[:, np.newaxis], order])
 
 
 def factor_of(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
@@ -181,21 +227,14 @@ def factor_of_some(factor: FloatArray, which: Sequence[int]) -> FloatArray:
     return np.asarray(np.linalg.qr(factor[:, which], mode='r'))
 
 
-def triangular_factor(
-    chain: Chain, names: Sequence[str], system: System, priors: bool = True
-) -> FloatArray:
-    """Return R (P, P), upper triangular, with R^T R the normal matrix; without priors if asked."""
+def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
+    """Return R (P, P), upper triangular, with R^T R the normal matrix."""
     size = len(names)
-    factor = system.extra_rows(chain, names)[0] if priors else np.zeros((0, size))
+    factor = system.extra_rows(chain, names)[0]
     for samples in system.sets:
-        for shift, turn, model in samples.blocks(chain, names):
-            known, wide = len(factor), shift.shape[1]
-            columns = np.zeros((size, known + wide + turn.shape[1]))
-            columns[:, :known] = factor.T
-            columns[:, known : known + wide] = shift[model.order]
-            if len(turn):
-                rotational = model.order < model.rotations
-                columns[rotational, known + wide :] = turn[model.order[rotational]]
+        for parts in samples.parts(chain, names):
+            rows = [part[:-1].reshape(size, -1) for part in parts]
+            columns = np.concatenate([factor.T, *rows], axis=1)
             factor = np.triu(lapack.dgeqrf(columns.T, 32 * size, overwrite_a=True)[0][:size])
     if len(factor) < size:
         factor = np.concatenate([factor, np.zeros((size - len(factor), size))])
@@ -238,11 +277,11 @@ def minimise(
     iteration = 0
     while iteration < iterations and stalled < STALLED:
         iteration += 1
-        step = _solve(normal, 0.0)
+        step = _solve(normal.matrix, normal.gradient)
         left = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
         settled = left < tolerance * max(1.0, normal.rms(system))
         if damping > 0.0 and not settled:
-            step = _solve(normal, damping)
+            step = _solve(normal.matrix, normal.gradient, damping)
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
             return Fit(chain, normal, iteration, True)
@@ -271,45 +310,38 @@ def minimise(
 
 
 def without_each(
-    chain: Chain,
-    names: Sequence[str],
-    systems: Sequence[System],
-    others: Callable[[int], System],
+    chain: Chain, names: Sequence[str], system: System, folds: Folds
 ) -> Iterator[Chain]:
-    """Yield the chain fitted to all systems but one, for each one in turn.
+    """Yield the chain fitted to all samples but those of one fold, for each one in turn.
 
     `chain` is the fit to all of them. One Gauss-Newton step from there, with the normal equations
-    of all less those of the one, visits every sample only once. Where that step is too long to be
-    trusted, the fit is done on `others(k)`, all samples but those of system k.
+    of all less those of the fold, visits every sample only once. Where that step is too long to be
+    trusted, the fit is done on the samples.
     """
-    if not names:
-        yield from [chain] * len(systems)
-        return
-    curved = [
-        k for k, name in enumerate(names) if not Parameter(name).of_lens
-    ]  # pixels are linear in a lens
-    parts = [normal_equations(chain, names, System(system.sets)) for system in systems]
-    extra, residual = systems[0].extra_rows(chain, names)  # the same in every part
-    matrix = np.sum([part.matrix for part in parts], axis=0) + extra.T @ extra
-    gradient = np.sum([part.gradient for part in parts], axis=0) + extra.T @ residual
-    for k, part in enumerate(parts):
-        rest = Normal(matrix - part.matrix, gradient - part.gradient, 0.0, part.parts)
-        step = _solve(rest, 0.0)
+    curved = [k for k, name in enumerate(names) if not Parameter(name).of_lens]  # pixels are not
+    parts = products_of(chain, names, system, folds).sum(axis=1)
+    extra = np.column_stack(system.extra_rows(chain, names))
+    rest = parts.sum(axis=0) + extra.T @ extra - parts
+    for k, normal in enumerate(rest):
+        step = _solve(normal[:-1, :-1], normal[:-1, -1])
         if np.abs(step[curved]).max(initial=0.0) > SMALL_STEP:
-            yield minimise(chain, names, others(k), tolerance=1e-3).chain
+            few = system.select([numbers != k for numbers in folds])
+            yield minimise(chain, names, few, tolerance=1e-3).chain
         else:
             yield chain.with_offsets(dict(zip(names, step, strict=True)))
 
 
-def _solve(normal: Normal, damping: float) -> FloatArray:
+def _solve(matrix: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:
     """Return the damped step; a matrix that rounding made singular is damped a little more."""
-    size = np.arange(len(normal.matrix))
-    scale = 1.0 / np.sqrt(np.maximum(normal.matrix[size, size], 1e-300))
-    matrix = normal.matrix * scale * scale[:, np.newaxis]
-    unit = matrix[size, size]
+    size = np.arange(len(matrix))
+    if not len(size):
+        return gradient
+    scale = 1.0 / np.sqrt(np.maximum(matrix[size, size], 1e-300))
+    scaled = matrix * scale * scale[:, np.newaxis]
+    unit = scaled[size, size]
     while True:
-        matrix[size, size] = unit + damping
-        _, step, failed = lapack.dposv(matrix, scale * normal.gradient)
+        scaled[size, size] = unit + damping
+        _, step, failed = lapack.dposv(scaled, scale * gradient)
         if not failed:
             return np.asarray(scale * step)
         damping = max(10.0 * damping, 1e-14)

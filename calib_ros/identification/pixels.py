@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.samples import BLOCK, Samples, seen_residuals
+from calib_ros.identification.samples import BLOCK, Block, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import View, at_the_board, require_lens, view
@@ -33,7 +33,7 @@ BOUNDED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class _Block:
+class _Images:
     """Some images, linearised.
 
     `columns` (6 + K + 1, 2, C) are the weighted derivatives of all points by twist and lens, the
@@ -78,10 +78,8 @@ class PixelSamples(Samples):
         """Return the number of rows of a sample."""
         return 2
 
-    def blocks(
-        self, chain: Chain, names: Sequence[str]
-    ) -> Iterator[tuple[FloatArray, FloatArray, ErrorModel]]:
-        """Yield rows (P + 1, R) with the normal matrix of all points, a block at a time."""
+    def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
+        """Yield rows (P + 1, R, images) with the normal matrix of all points, by blocks."""
         for block in self._linearised(chain, names):
             size, _, points = block.columns.shape
             images = block.twist.shape[2]
@@ -90,13 +88,13 @@ class PixelSamples(Samples):
             stacked = np.zeros((images, int(number.max()) + 1, 2, size))
             stacked[block.owner, number] = block.columns.transpose(2, 1, 0)
             factor = np.asarray(np.linalg.qr(stacked.reshape(images, -1, size), mode='r'))
-            rows = np.empty((len(block.twist) + 1, images, factor.shape[1]))
+            rows = np.empty((len(block.twist) + 1, factor.shape[1], images))
             arm = factor[:, :, :6] @ block.twist.transpose(2, 1, 0)
-            rows[:-1] = arm.transpose(2, 0, 1)
+            rows[:-1] = arm.transpose(2, 1, 0)
             for k, row in enumerate(block.lens):
-                rows[row] = factor[:, :, 6 + k]
-            rows[-1] = factor[:, :, -1]
-            yield rows.reshape(len(rows), -1), np.zeros((0, 0)), block.model
+                rows[row] = factor[:, :, 6 + k].T
+            rows[-1] = factor[:, :, -1].T
+            yield block.part.start + first, rows, np.zeros((0, 0, 0)), block.model
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the rows (P + 1, 2, C) of all points, a block at a time."""
@@ -121,7 +119,7 @@ class PixelSamples(Samples):
         By the chain at which rows were asked for last; robust weights are taken to be one.
         """
         assert self._shifts is not None
-        return np.asarray(np.einsum('nk,nkc->nc', residuals.reshape(-1, 2), self._shifts))
+        return np.asarray(np.einsum('kn,nkc->nc', residuals.reshape(2, -1), self._shifts))
 
     def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Return the residuals in sigma (N, 2), and NaN (N, 3) in place of an orientation."""
@@ -144,7 +142,7 @@ class PixelSamples(Samples):
         )
         yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
-    def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Block]:
+    def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Images]:
         """Yield blocks of whole images with about four BLOCKs of points."""
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
@@ -183,7 +181,7 @@ class PixelSamples(Samples):
             twist = np.zeros((len(names), 6, len(images)))
             twist[:, :3] = shift[:-1]
             twist[: model.rotations, 3:] = turn[:-1]
-            yield _Block(part, owner, columns, twist, [row[n] for n in own], seen, model)
+            yield _Images(part, owner, columns, twist, [row[n] for n in own], seen, model)
             first = last
 
 

@@ -70,6 +70,20 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     return seen.inverted() if observations.on_flange else seen
 
 
+def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> FloatArray:
+    """Return the covariances (M, 6, 6) of poses (M, 4, 4) of the board, for noise of 1 px.
+
+    Of x, y, z [m] and the rotation about the camera's axes [rad], to first order.
+    """
+    assert observations.points is not None
+    index = observations.images
+    axes = [poses[index, :3, k].T for k in range(3)]
+    rows = view(lens, axes, poses[index, :3, 3].T, observations.points.T, False).by_twist
+    outer = np.einsum('pkc,rkc->cpr', rows, rows).reshape(-1, 36)
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    return np.linalg.inv(np.add.reduceat(outer, begins).reshape(-1, 6, 6))
+
+
 def resect(observations: Observations, lens: Lens) -> BoardPoses:
     """Return the pose of the board in the camera for every image."""
     assert observations.points is not None

@@ -53,9 +53,13 @@ NOISE_FREE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Robust:
-    """A robust fit: the fit itself, and the distances (N,) of all samples of each set."""
+    """A robust fit: the fit itself, and the distances (N,) of all samples of each set.
+
+    `system` has the weights with which it was made.
+    """
 
     fit: Fit
+    system: System
     distances: tuple[FloatArray, ...]
     settled: bool
     iterations: int
@@ -73,45 +77,34 @@ class Robust:
 
 
 def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
-    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious.
-
-    The weights of the sets are left as they were used last.
-    """
+    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious."""
     first = robust_fit(chain, names, system, loss)
     suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
     if loss != 'redescending' or not suspicious:
         return first
-    weights = [samples.weights for samples in system.sets]
     second = reweighted(trimmed_start(chain, names, system), names, system, loss)
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
     if sums[1] < SHRUNK**2 * sums[0]:
         return replace(second, iterations=first.iterations + second.iterations)
-    for samples, weight in zip(system.sets, weights, strict=True):
-        samples.weights = weight
     return first
 
 
 def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
-    """Fit the named parameters, giving gross errors no weight.
-
-    The weights of the sets are left as they were used last.
-    """
+    """Fit the named parameters, giving gross errors no weight."""
     if loss not in LOSSES:
         raise UnknownNameError('loss', loss, LOSSES)
-    for samples in system.sets:
-        samples.weights = None
     fit = minimise(chain, names, system)
     iterations = fit.iterations
     distances = distances_of(fit.chain, names, system)
     if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
-        return Robust(fit, distances, True, iterations, loss)
+        return Robust(fit, system, distances, True, iterations, loss)
     if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # led away from a good start
         fit = replace(fit, chain=chain)
         distances = distances_of(chain, names, system)
     for _ in range(REWEIGHTINGS):
         before = distances
-        _weigh(system, [np.minimum(1.0, 1.0 / np.maximum(d, 1e-12)) for d in distances])
-        fit = minimise(fit.chain, names, system, iterations=2)
+        bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
+        fit = minimise(fit.chain, names, bounded, iterations=2)
         iterations += fit.iterations
         distances = distances_of(fit.chain, names, system)
         if all(
@@ -132,8 +125,7 @@ def reweighted(
     """Fit with the weights of a loss from a start that is good enough to tell gross errors.
 
     With the distances (N,) of all samples by a `simpler` model, samples that it explains are no
-    gross errors: a richer model has to explain them as well. The weights of the sets are left as
-    they were used last.
+    gross errors: a richer model has to explain them as well.
     """
 
     def judged(chain: Chain) -> tuple[FloatArray, ...]:
@@ -154,14 +146,14 @@ def reweighted(
         )
         if settled:
             break
-        _weigh(system, weights)
+        system = system.weighted(weights)
         fit = minimise(chain, names, system, tolerance=1e-3)
         chain, iterations = fit.chain, iterations + fit.iterations
         distances = judged(chain)
         if not fit.converged:  # nor will the next one
             break
     fit = minimise(chain, names, system)
-    return Robust(fit, distances, settled, iterations + fit.iterations, loss)
+    return Robust(fit, system, distances, settled, iterations + fit.iterations, loss)
 
 
 def weights_of(distance: FloatArray, loss: str) -> FloatArray:
@@ -171,11 +163,6 @@ def weights_of(distance: FloatArray, loss: str) -> FloatArray:
     if loss == 'huber':
         return np.minimum(1.0, INNER / np.maximum(distance, 1e-12))
     return np.clip((OUTER - distance) / (OUTER - INNER), 0.0, 1.0)
-
-
-def _weigh(system: System, weights: Sequence[FloatArray]) -> None:
-    for samples, weight in zip(system.sets, weights, strict=True):
-        samples.weights = np.sqrt(weight)
 
 
 def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[FloatArray, ...]:

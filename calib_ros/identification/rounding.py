@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -74,7 +75,7 @@ def _step(values: FloatArray) -> float:
     if len(different) < 3:
         return 0.0
     for step in sorted(STEPS, reverse=True):
-        if _are_multiples(different, step):
+        if _are_multiples(different[:3], step) and _are_multiples(different, step):
             return 0.0 if _are_multiples(different, WIDER * step) else step
     return 0.0
 
@@ -111,10 +112,8 @@ def may_be_rounding(
     chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
     system = problem.system(sets)
     wanted = list(dict.fromkeys([*frames, *arm, *levels]))
-    parts = [samples.rows_of(chain, wanted) for samples in system.sets]
-    each = np.concatenate([np.full(len(part), part.shape[1]) for part in parts])
-    owner = np.repeat(np.arange(len(joints)), each)
-    rows = np.concatenate([part.reshape(-1, part.shape[2]) for part in parts])
+    parts = system.rows_of(chain, wanted)
+    owner, rows = owners(parts), stacked(parts)
     basis = linalg.qr(rows[:, : len(frames)], mode='economic', check_finite=False)[0]
     columns = rows[:, len(frames) : len(frames) + len(arm)] * [_usual(name) for name in arm]
     alike = []

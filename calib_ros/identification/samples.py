@@ -13,7 +13,9 @@ have a module of their own (`pixels.py`).
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,7 @@ from calib_ros.kinematics.lens import at_the_board, require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 
 BLOCK = 1024
+Block: TypeAlias = tuple[slice | NDArray[np.intp], FloatArray, FloatArray, ErrorModel]
 
 
 class Samples:
@@ -66,23 +69,29 @@ class Samples:
         few.weights = None if self.weights is None else self.weights[index]
         return few
 
-    def blocks(
-        self, chain: Chain, names: Sequence[str]
-    ) -> Iterator[tuple[FloatArray, FloatArray, ErrorModel]]:
+    def weighted(self, weights: FloatArray | None) -> Samples:
+        """Return the samples with weights (N,) of a robust loss; None for all ones."""
+        found = copy.copy(self)
+        found.weights = None if weights is None else np.sqrt(weights)
+        return found
+
+    def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
         """Yield weighted rows of Jacobian and residual, a block of samples at a time.
 
         Yields
         ------
-        shift : (P + 1, rows)
-            Weighted derivative of the residual, transposed; the last row is the residual.
-        turn : (P_rotational + 1, 3 B) or (0, 0)
+        which : slice or (B,)
+            The samples; of what shares rows the first.
+        shift : (P + 1, c, B)
+            Weighted derivative of the residual; the last row is the residual.
+        turn : (P_rotational + 1, 3, B) or (0, 0, 0)
             The same of the orientation where it is kept apart: rotational parameters only.
         model : ErrorModel
             Knows the order of the parameters in the rows.
 
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
-        nothing = np.zeros((0, 0))
+        nothing = np.zeros((0, 0, 0))
         joints, velocity = self.moving(chain)
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
@@ -100,15 +109,12 @@ class Samples:
                 if self.oriented:
                     turn *= self.weights[part]
             if self.whitening is not None:
-                yield self._whitened(shift, turn, part), nothing, model
+                yield part, self._whitened(shift, turn, part), nothing, model
                 continue
             shift /= self.sigmas[0]
-            flat = shift.reshape(len(shift), -1)
-            if not self.oriented:
-                yield flat, nothing, model
-                continue
-            turn /= self.sigmas[1]
-            yield flat, turn.reshape(len(turn), -1), model
+            if self.oriented:
+                turn /= self.sigmas[1]
+            yield part, shift, turn if self.oriented else nothing, model
 
     def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
         """Return joint values (n, N) at the device's delay, and velocities where it has one."""
@@ -125,16 +131,15 @@ class Samples:
         Parameters stand in the order of their names, the residual last. Where orientation is
         whitened together with the position, or not measured, there is one part only.
         """
-        for shift, turn, model in self.blocks(chain, names):
+        for _, shift, turn, model in self.blocks(chain, names):
             order = [*model.order, len(names)]
-            found = [shift[order]]
-            if len(turn):
-                full = np.zeros((len(names) + 1, turn.shape[1]))
-                full[: model.rotations] = turn[:-1]
-                full[-1] = turn[-1]
-                found.append(full[order])
-            count = shift.shape[1] // self.width
-            yield tuple(part.reshape(len(part), -1, count) for part in found)
+            if not len(turn):
+                yield (shift[order],)
+                continue
+            full = np.zeros((len(names) + 1, *turn.shape[1:]))
+            rotational = np.flatnonzero(model.order < model.rotations)
+            full[rotational], full[-1] = turn[model.order[rotational]], turn[-1]
+            yield shift[order], full
 
     @property
     def width(self) -> int:
@@ -142,26 +147,26 @@ class Samples:
         return 1 if self.distances is not None else 6 if self.whitening is not None else 3
 
     def rows_of(self, chain: Chain, names: Sequence[str]) -> FloatArray:
-        """Return (N, 6, 3 or 1, P + 1) the weighted rows sample by sample, the residual last."""
+        """Return (P + 1, c, N) the weighted rows sample by sample, the residual last."""
         found = [np.concatenate(parts, axis=1) for parts in self.parts(chain, names)]
-        return np.concatenate(found, axis=2).transpose(2, 1, 0)
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=2)
 
     def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
-        """Return (P + 1, 6 B): position and orientation rows mixed by each sample's whitening."""
+        """Return (P + 1, 6, B): position and orientation rows mixed by each sample's whitening."""
         assert self.whitening is not None
         full = np.zeros((len(shift), 6, shift.shape[2]))
         full[:, :3] = shift
         full[: len(turn) - 1, 3:] = turn[:-1]
         full[-1, 3:] = turn[-1] if self.oriented else 0.0
         mixed = np.einsum('rsb,psb->prb', self.whitening[:, :, part], full, optimize=True)
-        return np.ascontiguousarray(mixed).reshape(len(shift), -1)
+        return np.ascontiguousarray(mixed)
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
-        """Return position errors (N, 3) [m] of weighted residuals (rows,), sample by sample.
+        """Return position errors (N, 3) [m] of weighted residuals (rows,).
 
-        Of distances the error is the first component.
+        They stand component by component, as rows do; of distances the error is the first.
         """
-        rows = residuals.reshape(self.count, -1)
+        rows = residuals.reshape(-1, self.count).T
         if self.whitening is not None:  # lower triangular, so that position is not mixed
             mixing = self.whitening[:3, :3].transpose(2, 0, 1)
             return np.asarray(np.linalg.solve(mixing, rows[:, :3, np.newaxis])[..., 0])

@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.drift import inverse_root, slow_cosines
+from calib_ros.identification.fitting import SOME
 from calib_ros.identification.observations import stops
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.identification.robust import Robust, weights_of
+from calib_ros.identification.robust import NOISE_FREE, Robust, weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
@@ -43,14 +44,10 @@ PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST = 3
 """Stops before and after a step: fewer are gross errors."""
-MOST = 500
-"""Samples that are looked at; of more, evenly spread ones."""
 BY_CHANCE = 1e-3
 """Probability of so large a share at any place of white residuals; few samples need more."""
 SINGULAR = 1e-8
 """Eigenvalue of scaled normal equations from which a direction counts."""
-NOISE_FREE = 1e-6
-"""RMS residual [sigma] below which nothing but rounding is left."""
 ROWS_NS = 10**15
 """Whole seconds below that are the numbers of rows, in place of stamps."""
 
@@ -170,28 +167,25 @@ class _Scan:
         self._chain = robust.fit.chain
         self._groups = _groups(problem)
         self._fitted = len(names)
-        added = dict.fromkeys(name for group in self._groups for name in group.names)
-        self._names = [*names, *(name for name in added if name not in names)]
-        share = -(-sum(map(len, problem.sets)) // MOST)
+        self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
+        self._names = [*names, *(name for name in self._added if name not in names)]
+        share = -(-robust.system.count // SOME)
         self._chosen = [np.arange(0, len(each), share) for each in problem.sets]
-        pairs = list(zip(problem.sets, self._chosen, strict=True))
-        self._sets = sets = [each.select(index) for each, index in pairs]
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
         self._oriented = any(kind.oriented for kind in problem.kinds)
-        system = problem.system(sets)
-        self._equations = np.array([float(samples.rows) for samples in system.sets])
-        self._rows, self._weights = [], []
+        far = [d[index] for d, index in zip(robust.distances, self._chosen, strict=True)]
+        self._weights = [weights_of(each, robust.loss) for each in far]
         bounded = 'none' if robust.loss == 'none' else 'huber'
-        for samples, far, index in zip(system.sets, robust.distances, self._chosen, strict=True):
-            samples.weights = np.sqrt(weights_of(far[index], bounded))
-            self._rows.append(samples.rows_of(self._chain, self._names))
-            self._weights.append(weights_of(far[index], robust.loss))
+        few = robust.system.select(self._chosen).weighted([weights_of(d, bounded) for d in far])
+        self._equations = np.array([float(samples.rows) for samples in few.sets])
+        self._rows = few.rows_of(self._chain, self._names)
+        self._sets = sets = [samples.observations for samples in few.sets]
         order = np.argsort(np.concatenate([each.stamps_ns for each in sets]), kind='stable')
         number = np.empty(len(order), dtype=np.intp)
         number[order] = stops(np.concatenate([each.joints for each in sets])[order])
         self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
         self.stops = int(number.max(initial=-1)) + 1
-        extra, offset = system.extra_rows(self._chain, names)
+        extra, offset = few.extra_rows(self._chain, names)
         whole = np.array([_product(rows) for rows in self._rows])
         matrix = whole.sum(axis=0)[: self._fitted]
         normal = matrix[:, : self._fitted] + extra.T @ extra
@@ -204,14 +198,15 @@ class _Scan:
     def best(self, places: NDArray[np.intp], least: float) -> _Found | None:
         """Return the best step at one of the stops, if it explains more than the least share."""
         products = self._to_the_end(places)
-        cross = self._root.T @ products[:, : self._fitted, :-1]
-        matrix = products[:, :-1, :-1] - np.swapaxes(cross, 1, 2) @ cross
-        vector = products[:, :-1, -1] - self._known @ cross
-        scale = 1.0 / np.sqrt(np.maximum(np.einsum('bii->bi', products[:, :-1, :-1]), 1e-300))
+        own = products[:, :, [self._names.index(name) for name in self._added]]
+        cross = products[:, :, : self._fitted] @ self._root
+        matrix = own - cross @ np.swapaxes(cross, 1, 2)
+        vector = products[:, :, -1] - cross @ self._known
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum('bii->bi', own), 1e-300))
         found: _Found | None = None
         lowest = np.inf
         for group in self._groups:
-            columns = [self._names.index(name) for name in group.names]
+            columns = [self._added.index(name) for name in group.names]
             size = scale[:, columns]
             own = matrix[:, columns][:, :, columns] * size[:, :, np.newaxis] * size[:, np.newaxis]
             values, axes = np.linalg.eigh(own)
@@ -238,15 +233,20 @@ class _Scan:
         return found
 
     def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
-        """Return (B, K + 1, K + 1) the products of the rows from each of the stops to the end."""
-        size = len(self._names) + 1
-        found = np.zeros((len(places), size, size))
+        """Return (B, K, P + 1) the products of what may have moved with all columns.
+
+        From each of the stops to the end.
+        """
+        own = [self._names.index(name) for name in self._added]
+        found = np.zeros((len(places), len(own), len(self._names) + 1))
         for rows, numbers in zip(self._rows, self._numbers, strict=True):
             part = np.searchsorted(places, numbers, side='right')
             order = np.argsort(part, kind='stable')
-            bounds = np.searchsorted(part[order], np.arange(1, len(places) + 2))
+            bounds = np.searchsorted(part[order], np.arange(1, len(places) + 2)).tolist()
+            ordered = rows[:, :, order]
             for k, (first, last) in enumerate(pairwise(bounds)):
-                found[k] += _product(rows[order[first:last]])
+                flat = ordered[:, :, first:last].reshape(len(rows), -1)
+                found[k] += flat[own] @ flat.T
         return np.asarray(np.cumsum(found[::-1], axis=0)[::-1])
 
     def drifts(self, found: _Found) -> bool:
@@ -255,16 +255,11 @@ class _Scan:
         if not len(slow):
             return False
         columns = [self._names.index(name) for name in found.group.names]
-        size = len(self._names)
         matrix = np.zeros((self._fitted + len(columns) * len(slow) + 1,) * 2)
         for rows, numbers in zip(self._rows, self._numbers, strict=True):
-            moving = (
-                slow[:, numbers].T[:, np.newaxis, :, np.newaxis] * rows[:, :, np.newaxis, columns]
-            )
-            wide = moving.reshape(*rows.shape[:2], -1)
-            matrix += _product(
-                np.concatenate([rows[:, :, : self._fitted], wide, rows[:, :, size:]], axis=2)
-            )
+            moving = rows[columns][:, np.newaxis] * slow[:, np.newaxis, numbers]
+            wide = moving.reshape(-1, *rows.shape[1:])
+            matrix += _product(np.concatenate([rows[: self._fitted], wide, rows[-1:]]))
         cross = self._root.T @ matrix[: self._fitted, self._fitted : -1]
         own = matrix[self._fitted : -1, self._fitted : -1]
         root = inverse_root(own - cross.T @ cross, np.diag(own))
@@ -323,6 +318,6 @@ def _groups(problem: Problem) -> list[_Group]:
 
 
 def _product(rows: FloatArray) -> FloatArray:
-    """Return (K, K) the products of the columns of rows (N, c, K) with each other."""
-    flat = rows.reshape(-1, rows.shape[2])
-    return np.asarray(flat.T @ flat)
+    """Return (K, K) the products of rows (K, c, N) with each other."""
+    flat = rows.reshape(len(rows), -1)
+    return np.asarray(flat @ flat.T)

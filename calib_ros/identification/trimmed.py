@@ -17,7 +17,6 @@ Half means half of every set of observations, and somewhat more: with P paramete
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -67,11 +66,8 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
             if np.array_equal(masks, before):
                 break
         last, half = half, masks[np.argmin(sums)]
-        for samples, part in zip(few.sets, halves.parts, strict=True):
-            samples.weights = half[part].astype(float)
-        chain = minimise(chain, names, few, tolerance=1e-3).chain
-        for samples in few.sets:
-            samples.weights = None
+        best = few.weighted([half[part].astype(float) for part in halves.parts])
+        chain = minimise(chain, names, best, tolerance=1e-3).chain
         if np.array_equal(half, last):
             break
         linear = _Linear(chain, names, few)
@@ -89,15 +85,9 @@ def trimmed_sum(chain: Chain, system: System) -> float:
 
 
 def _thinned(system: System) -> System:
-    """Return a part of the samples, without weights."""
+    """Return a part of the samples."""
     most = max(SUBSET // len(system.sets), LEAST)
-    sets = []
-    for samples in system.sets:
-        index = np.arange(0, samples.count, -(-samples.count // most))
-        few = samples.select(index)
-        few.weights = None
-        sets.append(few)
-    return replace(system, sets=tuple(sets))
+    return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
 
 
 def _need(names: Sequence[str], system: System) -> float:
@@ -145,16 +135,16 @@ class _Linear:
     """The model linearised at a chain, for fits to many masks (S, N) at once."""
 
     def __init__(self, chain: Chain, names: Sequence[str], system: System) -> None:
-        parts = [samples.rows_of(chain, names) for samples in system.sets]
+        parts = system.rows_of(chain, names)
         width = max(part.shape[1] for part in parts)
         rows = np.concatenate(
-            [np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0))) for part in parts]
-        )
-        columns, self._residual = rows[..., :-1], rows[..., -1]
+            [np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0))) for part in parts], axis=2
+        ).transpose(2, 1, 0)
+        columns, self._residual = rows[..., :-1], np.ascontiguousarray(rows[..., -1])
         extra, offset = system.extra_rows(chain, names)
         size = np.sqrt((columns**2).sum(axis=(0, 1)) + (extra**2).sum(axis=0))
         scale = 1.0 / np.where(size > 0.0, size, 1.0)
-        self._columns, extra = columns * scale, extra * scale
+        self._columns, extra = np.ascontiguousarray(columns * scale), extra * scale
         self._matrices = np.einsum('ncp,ncq->npq', self._columns, self._columns, optimize=True)
         self._gradients = np.einsum('ncp,nc->np', self._columns, self._residual)
         self._matrix = extra.T @ extra + RIDGE * np.eye(len(names))

@@ -4,8 +4,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from calib_ros.identification.leastsquares import System, minimise, without_each
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.region import KNOWN
-from calib_ros.identification.robust import OUTLIER, Robust, distances_of, weights_of
+from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -121,7 +122,7 @@ class Comparison(Shown):
         """Return how many pairs are named as outliers and left out of the figures."""
         return int((~self.judged).sum())
 
-    @property
+    @cached_property
     def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after, without outliers."""
         return self.before.figures(self.judged), self.after.figures(self.judged)
@@ -136,7 +137,7 @@ class Comparison(Shown):
         groups = {'configuration': self.after.configurations, 'judged': self.judged}
         return as_frame(columns | groups)
 
-    @property
+    @cached_property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after with outliers."""
         everything = np.ones_like(self.judged)
@@ -156,7 +157,12 @@ def residuals(chain: Chain, observations: Observations) -> Residuals:
     return Residuals(position, orientation, observations.configurations, pixels)
 
 
-def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
+def compare(
+    before: Chain,
+    after: Chain,
+    sets: Sequence[Observations],
+    judged: NDArray[np.bool_] | None = None,
+) -> Comparison:
     """Return the residuals of all sets, one after the other, by both chains."""
     parts = [(residuals(before, each), residuals(after, each)) for each in sets]
     numbers = np.concatenate(numbered(sets))
@@ -164,7 +170,7 @@ def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Compar
     return Comparison(
         _joined([first for first, _ in parts], numbers, index),
         _joined([second for _, second in parts], numbers, index),
-        np.ones(len(numbers), dtype=bool),
+        np.ones(len(numbers), dtype=bool) if judged is None else judged,
     )
 
 
@@ -223,42 +229,38 @@ def _cross_validate(
     if folds < 2:
         return None, 'nothing: too few configurations to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
-    firsts = np.cumsum([0, *(len(each) for each in problem.sets)])
-
-    def part(fold: int, inside: bool) -> tuple[list[NDArray[np.intp]], System]:
-        chosen = [np.flatnonzero((group % folds == fold) == inside) for group in groups]
-        sets = [each.select(index) for each, index in zip(problem.sets, chosen, strict=True)]
-        pairs = zip(robust.distances, chosen, strict=True)
-        return chosen, _weighted(problem, sets, [distances[index] for distances, index in pairs])
-
-    def training(fold: int) -> System:
-        return part(fold, inside=False)[1]
-
-    order, judging, systems = [], [], []
-    for fold in range(folds):
-        left_out, system = part(fold, inside=True)
-        systems.append(system)
-        judging.append([samples.observations for samples in system.sets])
-        order += [out + first for out, first in zip(left_out, firsts[:-1], strict=True)]
-    parts = [
-        compare(first, second, sets)
-        for first, second, sets in zip(
-            without_each(before, frames, systems, training),
-            without_each(after, names, systems, training),
-            judging,
-            strict=True,
-        )
-    ]
-    index = np.argsort(np.concatenate(order))
-    whole = np.concatenate(groups)
+    numbers = [group % folds for group in groups]
+    chains = zip(
+        without_each(before, frames, robust.system, numbers),
+        without_each(after, names, robust.system, numbers),
+        strict=True,
+    )
+    first, second = left_out(chains, problem.sets, groups, numbers)
     return (
-        Comparison(
-            _joined([part.before for part in parts], whole, index),
-            _joined([part.after for part in parts], whole, index),
-            ~robust.outliers,
-        ),
+        Comparison(first, second, ~robust.outliers),
         f'{folds}-fold cross-validation over {count} distinct configurations{said}',
     )
+
+
+def left_out(
+    chains: Iterable[tuple[Chain, Chain]],
+    sets: Sequence[Observations],
+    groups: Sequence[NDArray[np.intp]],
+    folds: Sequence[NDArray[np.intp]],
+) -> tuple[Residuals, Residuals]:
+    """Return the residuals of every fold by two chains of its own, before and after.
+
+    `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
+    """
+    pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
+    for k, pair in enumerate(chains):
+        for each, numbers in zip(sets, folds, strict=True):
+            out = each.select(np.flatnonzero(numbers == k))
+            for side, chain in zip(pieces, pair, strict=True):
+                side.append(residuals(chain, out))
+    index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
+    before, after = (_joined(side, np.concatenate(groups), index) for side in pieces)
+    return before, after
 
 
 def _repeated(problem: Problem) -> NDArray[np.bool_]:
@@ -268,16 +270,6 @@ def _repeated(problem: Problem) -> NDArray[np.bool_]:
     numbers = numbered((*problem.sets, *problem.judging))
     count = len(problem.sets)
     return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
-
-
-def _weighted(
-    problem: Problem, sets: Sequence[Observations], distances: Sequence[FloatArray]
-) -> System:
-    """Return sets with the weights of samples at distances (N,) in the fit to all."""
-    system = problem.system(sets)
-    for samples, distance in zip(system.sets, distances, strict=True):
-        samples.weights = np.sqrt(weights_of(distance, problem.loss))
-    return system
 
 
 def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
@@ -332,11 +324,13 @@ def _leave_one_place_out(
     Where the sockets of a place are is unknown; it is fitted to the place's own pairs, by arm and
     tool of the others. Outliers keep the weight that they have in the fit to all.
     """
-    pairs = list(zip(problem.sets, robust.distances, strict=True))
+    pairs = list(zip(problem.sets, robust.system.sets, strict=True))
 
     def part(place: set[str], inside: bool) -> System:
-        chosen = [pair for pair in pairs if (pair[0].base in place) == inside]
-        return _weighted(problem, [pair[0] for pair in chosen], [pair[1] for pair in chosen])
+        chosen = [samples for each, samples in pairs if (each.base in place) == inside]
+        known = {samples.observations.base for samples in chosen}
+        apart = tuple(pair for pair in robust.system.separations if {*pair[:2]} <= known)
+        return replace(robust.system, sets=tuple(chosen), separations=apart)
 
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]

@@ -180,7 +180,7 @@ class Chain(Shown):
         owner, kind = self._split(name)
         if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
             return self.value(name) - nominal.value(name)
-        reference = nominal.frame(Parameter(name).owner)
+        reference = nominal.frame(name.partition('.')[0])
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
@@ -189,7 +189,7 @@ class Chain(Shown):
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""
-        return Parameter(parameter).owner in self._frames
+        return parameter.partition('.')[0] in self._frames
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with another base or tool frame, which may be a new one."""
@@ -220,14 +220,13 @@ class Chain(Shown):
         A + dA leaves SE(3).
         """
         by_owner: dict[str, dict[str, float]] = {}
-        known = self._all_parameters
         for name, offset in offsets.items():
-            if name not in known:
+            if name not in self._all_parameters:
                 raise UnknownNameError('parameter', name, self.parameter_names)
-            named = Parameter(name)
             if not math.isfinite(offset):
                 raise ConfigError(f'the offset of {name} must be a finite number')
-            by_owner.setdefault(named.owner, {})[named.kind] = float(offset)
+            owner, _, kind = name.partition('.')
+            by_owner.setdefault(owner, {})[kind] = float(offset)
         joints = []
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
@@ -271,15 +270,8 @@ class Chain(Shown):
 
     def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the joint values (n, B) that the effects make of those reported (n, B)."""
-        if not self.effects:
-            return q
-        names = tuple(name for name, _ in self.effects)
-        phi = effects.basis(self, names, q, approach)
-        q = q.copy()
-        for (name, value), row in zip(self.effects, phi, strict=True):
-            if value:
-                q[self.joint_names.index(Parameter(name).owner)] += value * row
-        return q
+        names = tuple(name for name, value in self.effects if value)
+        return effects.moved(self, names, effects.basis(self, names, q, approach), q)
 
     def trace(
         self, q: FloatArray, base: str = 'base', tool: str = 'tool'
@@ -300,9 +292,7 @@ class Chain(Shown):
 
     def ends(self, q: FloatArray) -> FloatArray:
         """Return the frames (n, 4, 3, B) at the ends of the links: axes and origin [m]."""
-        found = np.empty((2, len(q) + 1, 4, 3, q.shape[1]))
-        self.walk.frames(q, self.frame('base').matrix, found[0], found[1])
-        return found[1, :-1]
+        return self.walk.along(q, self.frame('base').matrix)[1]
 
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw joint values (count, n) within the limits, +-180 degrees or +-0.5 m by default."""
@@ -322,8 +312,8 @@ class Chain(Shown):
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
         if name not in self._all_parameters:
             raise UnknownNameError('parameter', name, self.parameter_names)
-        named = Parameter(name)
-        return self._joints.get(named.owner) or self.frame(named.owner), named.kind
+        owner, _, kind = name.partition('.')
+        return self._joints.get(owner) or self.frame(owner), kind
 
     @cached_property
     def _all_parameters(self) -> frozenset[str]:

@@ -37,7 +37,7 @@ RULES: dict[Rule, Advice] = {
         'From one pose on, one joint reads differently than before. Measurements from before '
         'describe an arm that no longer exists.',
         (
-            'Check the mastering (zero position) of the joint named below.',
+            'Check the mastering (zero position) of the joint that is named.',
             'Keep only what was measured after the slip, or measure again.',
         ),
     ),
@@ -68,7 +68,7 @@ RULES: dict[Rule, Advice] = {
     Rule.EXCITATION: Advice(
         'Some joints hardly moved',
         'An error of a joint shows only when that joint moves. The poses say nothing about '
-        'the parameters named below.',
+        'the parameters that are named.',
         (
             f'Add poses {SPREAD}. `calib_ros plan` chooses them.',
             'If a joint cannot move, hold its parameters with --fixed.',
@@ -111,7 +111,9 @@ RULES: dict[Rule, Advice] = {
         (
             'Compare the error before with the accuracy of the measuring device. If they '
             'are alike, the arm needs no calibration that this device can measure.',
-            f'Else measure more poses, {SPREAD}.',
+            'If it is much larger, check that the arm stood still at each pose, that the target '
+            'is fixed to the flange, and the device to the floor.',
+            f'Measure more poses, {SPREAD}.',
             'Try --model auto: the error may come from gears or gravity.',
         ),
     ),
@@ -185,7 +187,7 @@ RULES: dict[Rule, Advice] = {
         'The recording is damaged. What is missing could be just the poses that matter.',
         (
             'Copy the recording again from the computer that made it.',
-            'If what is left is enough, run with the --largest-loss named below.',
+            'If what is left is enough, run with the --largest-loss that is named.',
         ),
     ),
     Rule.DROPPED: Advice(
@@ -195,13 +197,13 @@ RULES: dict[Rule, Advice] = {
         (
             'Make the clocks of robot and measuring device agree (NTP or PTP).',
             'Record both from the same computer.',
-            'If what is left is enough, run with the --largest-loss named below.',
+            'If what is left is enough, run with the --largest-loss that is named.',
         ),
     ),
     Rule.MISTAKE: Advice(
         'Something in the input is not what it seems',
-        'As given, the measurements do not fit this arm. With the change named below they do.',
-        ('Check whether it is so. If it is, run again with the option named below.',),
+        'As given, the measurements do not fit this arm. With the change that is named they do.',
+        ('Check whether it is so. If it is, run again with the option that is named.',),
     ),
     Rule.POSED: Advice(
         'The joint values were not measured',
@@ -211,6 +213,15 @@ RULES: dict[Rule, Advice] = {
 }
 
 
+WRONG_ARM = {Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR}
+"""Where the description does not fit the arm, its lengths are of no scale either."""
+
+
 def advice(reasons: Sequence[Reason]) -> tuple[Advice, ...]:
-    """Return each refusal in plain words."""
-    return tuple(replace(RULES[each.rule], refusal=str(each)) for each in reasons)
+    """Return the refusals in plain words, those of one rule together."""
+    found: dict[Rule, list[str]] = {}
+    for each in reasons:
+        found.setdefault(each.rule, []).append(str(each))
+    if found.keys() & WRONG_ARM:
+        found.pop(Rule.SCALE, None)
+    return tuple(replace(RULES[rule], refusal='; '.join(texts)) for rule, texts in found.items())

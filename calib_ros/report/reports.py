@@ -12,6 +12,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Rule
 from calib_ros.identification.validation import CONFIDENCE
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
@@ -75,7 +76,7 @@ def identification_report(
             rows=tuple(accuracy),
         ),
         steps=_steps(result, limits, tolerance),
-        remarks=(*warnings, *result.remarks),
+        remarks=(*warnings, *words.remarks(result)),
         identity=identity_of(
             result.chain,
             origin,
@@ -101,6 +102,7 @@ def _verdict(
             (
                 f'Why: {"; ".join(each.heading for each in advice(result.refusals))}.',
                 'No correction was written or published. The figures below show what was tried.',
+                *_left(result),
             ),
         )
     how = (
@@ -120,6 +122,16 @@ def _verdict(
     return Verdict(
         'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text, both
     )
+
+
+def _left(result: Identification) -> Iterator[str]:
+    """Yield in figures that a correction brought nothing."""
+    if result.validation is not None and any(each.rule is Rule.GAIN for each in result.refusals):
+        before, after = result.validation.figures
+        yield (
+            f'The usual error was {before.rms_mm:.3f} mm; with the best correction found it '
+            f'would be {after.rms_mm:.3f} mm.'
+        )
 
 
 def _steps(

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from calib_ros.apply.verification import Verification
+from calib_ros.apply.verification import Verification, remarks
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report.advice import SPREAD
@@ -55,10 +55,6 @@ def verification_report(
     wanted: tuple[str, ...] = (
         () if found.tolerance is None else (f'Tolerance: {1e3 * found.tolerance:g} mm.',)
     )
-    enough = f'About {found.needed}' if found.needed else 'Not even 10,000'
-    if found.verdict == 'UNDECIDED':
-        wanted += (f'{enough} configurations with the same error would decide.',)
-    notes = _assumed(found)
     state = STATES[found.verdict]
     return Report(
         kind='Verification of a calibrated arm',
@@ -72,7 +68,7 @@ def verification_report(
             rows=tuple(accuracy_rows('measured', found.comparison)),
         ),
         steps=NEXT[found.verdict],
-        remarks=(*warnings, *notes),
+        remarks=(*warnings, *remarks(found)),
         identity=identity_of(
             chain, origin, poses, ('Configurations', str(found.configurations)), table_hash(chain)
         ),
@@ -85,19 +81,6 @@ def verification_report(
         inputs=origin.inputs,
         settings=origin.settings,
     )
-
-
-def _assumed(found: Verification) -> tuple[str, ...]:
-    """Return what a verification assumes."""
-    notes = []
-    if found.fitted:
-        notes.append(f'Fitted to these measurements, for both: {" and ".join(found.fitted)}.')
-    if not found.by_program:
-        notes.append(
-            'This is about the calibration. Whether its correction arrives at the arm shows only '
-            'with the program as it was before (--commanded).'
-        )
-    return tuple(notes)
 
 
 def _by_configuration(found: Verification) -> list[Section]:

@@ -24,8 +24,6 @@ from calib_ros.kinematics.chain_file import dump_yaml
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 
-HOLDS = 1.5
-"""A calibration whose error on new samples has grown by more does not hold."""
 MOST_OUTLIERS = 5
 """Outliers that an answer names."""
 WEAK = 0.01
@@ -55,11 +53,16 @@ def summary(
     if result.region is not None:
         text += f'; {result.region.in_words()}'
     text = '; '.join((text, *notes(result)))
-    if more := (*warnings, *result.remarks):
+    if more := (*warnings, *remarks(result)):
         text += f'; note: {"; ".join(more)}'
     if result.accepted:
         return f'accepted: {text}'
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
+
+
+def remarks(result: Identification) -> list[str]:
+    """Return the remarks on a result that do not say the same as why it was refused."""
+    return [each for each in result.remarks if each not in map(str, result.refusals)]
 
 
 def notes(result: Identification) -> list[str]:
@@ -139,7 +142,7 @@ def verdict(
     if calibration.residual is None:
         return True, text
     judged = 1e3 * calibration.residual
-    if now.rms_mm > HOLDS * judged:
+    if not calibration.holds(1e-3 * now.rms_mm):
         return False, (
             f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '
             'tracker, the target or the robot moved?'
@@ -235,7 +238,7 @@ def noise_in_words(result: Identification) -> str:
     if noise.orientation is not None:
         text += f' and {noise.orientation:.2f} times that of orientation'
     if noise.consistent:
-        text += ', which a chi-squared test lets pass'
+        text += ', consistent with the sigmas given (chi-squared test)'
     else:
         text += '; the sigmas given are wrong, standard deviations follow the residuals'
     return f'{text}; {neighbours_in_words(noise)}'
@@ -264,8 +267,8 @@ def chance_in_words(result: Identification) -> list[str]:
     if result.chance is None:
         return []
     return [
-        f'moved in time against the joint values, residuals are explained as well in '
-        f'{100.0 * result.chance:.1f} % of the shifts: the chance that a drift passes for the gain'
+        'the improvement may only be tracker drift: time-shifted residuals are explained just as '
+        f'well in {100.0 * result.chance:.1f} % of cases'
     ]
 
 

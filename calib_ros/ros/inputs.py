@@ -25,9 +25,12 @@ from rclpy.subscription import Subscription
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.intake import Stream, links_of
+from calib_ros.sampling.messages import PICTURES
 
 INPUT_QUEUE = 2000
 """Messages of a topic that may wait while the node is busy; what comes on top is lost."""
+IMAGE_QUEUE = 20
+"""Images that may wait: of 30 Hz for as long as the node is ever busy."""
 MOST_LOST = 2**30
 """Messages that may get lost between two reports of DDS: two weeks of 1 kHz."""
 SILENCE = 5.0
@@ -231,7 +234,7 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
 def _qos(stream: Stream) -> QoSProfile:
     """Return how a topic is asked for; a new one each time, because overriding changes it."""
     return QoSProfile(
-        depth=INPUT_QUEUE,
+        depth=IMAGE_QUEUE if stream.type in PICTURES else INPUT_QUEUE,
         reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if stream.still else DurabilityPolicy.VOLATILE,
     )

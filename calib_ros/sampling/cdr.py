@@ -207,6 +207,13 @@ def _layout(kind: str, blob: bytes) -> tuple[tuple[str, ...], int, str, int]:
     return tuple(strings), _aligned(at + between, np.dtype(dtype).itemsize), dtype, count
 
 
+def head(blob: bytes) -> tuple[int, str]:
+    """Return stamp [ns] and frame of a serialised message that begins with a header."""
+    order = '<' if blob[:2] == LITTLE_ENDIAN else '>'
+    seconds, nanoseconds = struct.unpack_from(f'{order}iI', blob, _HEAD)
+    return seconds * 1_000_000_000 + nanoseconds, _string(blob, _HEAD + _STAMP, order)[0]
+
+
 def trajectory_size(blob: bytes) -> tuple[int, int]:
     """Return how many joints and points a serialised JointTrajectory has.
 

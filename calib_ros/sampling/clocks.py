@@ -170,7 +170,7 @@ class Clocks:
                 if not isinstance(each.key, StreamKey):
                     if len(each.key) == len(self._chain.joints):
                         joints.append(each)
-                elif not (each.key.distance or each.key.eye_in_hand):
+                elif not (each.key.distance or each.key.eye_in_hand or each.key.images):
                     poses.append(each)
             self._watch.take(joints, poses)
 

@@ -75,6 +75,12 @@ class Collector:
         self.notes: Counter[str] = Counter()
 
     @property
+    def images(self) -> set[int]:
+        """Return the numbers of the images that wait for their time."""
+        found = [rows.values[:, 0] for key, rows in self._waiting.items() if key.images]
+        return {int(number) for numbers in found for number in numbers.tolist()}
+
+    @property
     def waiting(self) -> int:
         """Return how many measurements wait for their time."""
         return sum(rows.count for rows in self._waiting.values())
@@ -91,7 +97,7 @@ class Collector:
         positions = [
             (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
             for key, rows in self._waiting.items()
-            if not (key.distance or key.eye_in_hand)
+            if not (key.distance or key.eye_in_hand or key.images)
         ]
         return stamps[complete], joints[complete], positions
 
@@ -391,6 +397,9 @@ class Collector:
                 self._count_causes(motion.cause)
                 good, motion = good[motion.cause == 0], motion.rows(motion.cause == 0)
             if len(good):
+                more = len(good) - len(np.unique(numbers[good]))
+                if key.images and more:
+                    self.unused['poses: of a stop of which one image is used'] += more
                 found += self.maker.of_stops(
                     key,
                     numbers[good],

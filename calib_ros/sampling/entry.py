@@ -102,9 +102,10 @@ class Entry:
                     source.device,
                     source.target or readings.child,
                     source.validation,
-                    width == 1,
+                    width == 1 and not source.board,
                     source.eye_in_hand,
                     frame_id,
+                    bool(source.board),
                 )
                 yield Piece(key, places, readings.stamps_ns, readings.numbers)
 

@@ -13,29 +13,35 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.sampling.cdr import Alike, decode, transforms
+from calib_ros.sampling.cdr import Alike, decode, head, transforms
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
+    CAMERA_INFO,
     LINKS,
+    PICTURES,
     TRANSFORM,
     TRANSFORMS,
     MessageError,
     Readings,
     frame_name,
+    head_of,
     reading,
     transforms_in,
     usable,
 )
+from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Links, Pair
 
+OF_CAMERAS = (*PICTURES, CAMERA_INFO)
 Deserialise: TypeAlias = Callable[[Any, str], Any]
 """Makes a message of its bytes and type."""
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
@@ -49,7 +55,8 @@ Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
 class Stream:
     """What comes on one topic: its message type, and what it measures; None for joint states.
 
-    A topic of transforms between frames may measure several things, or hold what stands still.
+    A topic of transforms between frames may measure several things, or hold what stands still; one
+    of CameraInfo belongs to the topic of the images.
     """
 
     topic: str
@@ -71,8 +78,10 @@ def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream
         kind = source.type or types[source.topic]
         if kind in LINKS:
             linked.setdefault((source.topic, kind), []).append(source)
-        else:
-            streams.append(Stream(source.topic, kind, source))
+            continue
+        streams.append(Stream(source.topic, kind, source))
+        if source.board:
+            streams.append(Stream(source.camera_info, CAMERA_INFO, source))
     for (topic, kind), some in linked.items():
         links = Links(topic, some, kind)
         names = (topic + STATIC, topic) if kind == TRANSFORMS else (topic,)
@@ -100,7 +109,7 @@ def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) ->
         For those that are not decoded at once.
 
     """
-    found = Intake(batch, deserialise)
+    found = Intake(batch, deserialise, session.pictures)
     for kind, causes in found.faults.items():
         for cause, count in causes.items():
             session.miss(kind, count, cause)
@@ -125,13 +134,18 @@ class Intake:
 
     """
 
-    def __init__(self, batch: Batch, deserialise: Deserialise) -> None:
-        self._batch, self._deserialise = batch, deserialise
+    def __init__(
+        self, batch: Batch, deserialise: Deserialise, pictures: Pictures | None = None
+    ) -> None:
+        self._batch, self._deserialise, self._pictures = batch, deserialise, pictures
         self.parts: list[Part] = []
         self.faults: dict[str, Counter[str]] = {JOINTS: Counter(), POSES: Counter()}
         self.problems: list[str] = []
         lengths: dict[tuple[str, int], list[int]] = {}
         for place, (stream, data) in enumerate(batch):
+            if stream.type in OF_CAMERAS:
+                self._keep(place, stream, data)
+                continue
             size = len(data) if isinstance(data, bytes) else 0
             lengths.setdefault((stream.topic, size), []).append(place)
         linked: list[tuple[Stream, Places, Alike | OneLink]] = []
@@ -163,6 +177,26 @@ class Intake:
             places, found = places[good], found.rows(good)
         if len(places):
             self.parts.append(Part(places, source, found))
+
+    def _keep(self, place: int, stream: Stream, data: Any) -> None:
+        """Add an image by its number, or take a CameraInfo."""
+        source, pictures = stream.source, self._pictures
+        if source is None or pictures is None:
+            return
+        message = partial(self._deserialise, data, stream.type)
+        try:
+            if stream.type == CAMERA_INFO:
+                pictures.learn(source.topic, message())
+                return
+            serialised = isinstance(data, bytes)
+            stamp_ns, frame_id = head(data) if serialised else head_of(message())
+        except Exception as err:  # damaged bytes fail in many ways
+            self.problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
+            return
+        number = pictures.keep(source.topic, len(data) if serialised else 0, message)
+        stamps = np.array([stamp_ns], dtype=np.int64)
+        found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
+        self._add(source, stream.type, np.array([place]), found)
 
     def _decode(self, places: Sequence[int]) -> list[tuple[Stream, Places, OneLink]]:
         """Add messages one after the other; return those of links between frames."""

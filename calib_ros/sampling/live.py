@@ -229,7 +229,7 @@ class LiveEstimate:
             groups.setdefault(key, []).append(sample)
         found = []
         for members in groups.values():
-            ((observations,), _) = collect(members, self._sigmas, self._frames)
+            ((observations,), _) = collect(members, self._sigmas, self._frames, posed=True)
             found.append((members, observations))
         return found
 

@@ -100,6 +100,14 @@ class Maker:
         """
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         counts = np.diff(begins, append=len(values))
+        joints = motion.joints[begins]
+        steps = unwrapped(motion.joints - np.repeat(joints, counts, axis=0), self._revolute)
+        if key.images:
+            joints = joints + mean_of_each(steps, begins, np.ones(len(steps), dtype=bool))
+            yield from self._of_images(
+                key, numbers, begins, stamps, values, joints, motion.approach, delay_ns
+            )
+            return
         turned = ~np.isnan(values[:, QUAT]).any(axis=1)
         own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
         variances = np.add.reduceat(own, begins) / counts  # of NaN where any has none
@@ -110,8 +118,6 @@ class Maker:
         oriented = np.logical_and.reduceat(turned, begins)
         # the chordal mean (Moakher 2002)
         rotations = se3.nearest_rotation(mean_of_each(rotations, begins, means.used))
-        joints = motion.joints[begins]
-        steps = unwrapped(motion.joints - np.repeat(joints, counts, axis=0), self._revolute)
         joints = joints + mean_of_each(steps, begins, means.used)
         since = (stamps - np.repeat(stamps[begins], counts)).astype(np.float64)
         times = stamps[begins] + np.rint(mean_of_each(since, begins, means.used)).astype(np.int64)
@@ -138,6 +144,34 @@ class Maker:
             )
             if sample is not None:
                 yield number, sample
+
+    def _of_images(
+        self,
+        key: StreamKey,
+        numbers: NDArray[np.intp],
+        begins: NDArray[np.intp],
+        stamps: Stamps,
+        values: FloatArray,
+        joints: FloatArray,
+        approach: FloatArray,
+        delay_ns: int,
+    ) -> Iterator[Numbered]:
+        """Yield a sample of the images of each stop, of which one will be looked at."""
+        ends = np.append(begins[1:], len(values))
+        for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+            middle = (begin + end) // 2
+            sample = self._made(
+                key,
+                int(stamps[middle]),
+                values[middle : middle + 1],
+                position=np.full(3, np.nan),
+                joints=joints[k].copy(),
+                approach=approach[begin].copy(),
+                delay=1e-9 * delay_ns,
+                images=tuple(values[begin:end, 0].astype(int).tolist()),
+            )
+            if sample is not None:
+                yield int(numbers[begin]), sample
 
     def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
         """Make a sample of a ball that sits in a socket, at stamps (N,) while the arm stands."""
@@ -223,4 +257,5 @@ def _key(sample: Sample) -> StreamKey:
         sample.distance is not None,
         sample.eye_in_hand,
         sample.frame_id,
+        sample.view is not None,
     )

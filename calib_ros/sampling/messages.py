@@ -32,6 +32,8 @@ BODIES = {
 """Types of poses by name in one frame, of motion capture: their fields of the poses and names."""
 LINKS = (TRANSFORMS, *BODIES)
 """Types of messages that link several frames at once."""
+PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 
 
 class MessageError(InputError):
@@ -44,7 +46,7 @@ class Readings(NamedTuple):
     `strings` are the frame and the child frame of a measurement if it has one, or the frame and
     the names of the joints. `numbers` (N, w) are joint values [rad or m]; or a distance [m]
     (w = 1), a position [m] (3), a pose with its quaternion x y z w (7), or that and a covariance
-    row by row (43).
+    row by row (43); of an image its number among those that are kept (1).
     """
 
     stamps_ns: NDArray[np.int64]
@@ -90,15 +92,20 @@ def reading(kind: str, message: Any) -> tuple[int, tuple[str, ...], Sequence[flo
         When a JointState has not as many names as positions.
 
     """
-    head = message.header
-    stamp_ns = head.stamp.sec * 1_000_000_000 + head.stamp.nanosec
+    stamp_ns, frame_id = head_of(message)
     if kind == JOINT_STATE:
         if len(message.name) != len(message.position):
             raise MessageError('names and positions differ in number')
-        return stamp_ns, (head.frame_id, *message.name), message.position
+        return stamp_ns, (frame_id, *message.name), message.position
     child = getattr(message, 'child_frame_id', None)
-    strings = (head.frame_id,) if child is None else (head.frame_id, child)
+    strings = (frame_id,) if child is None else (frame_id, child)
     return stamp_ns, strings, DECODERS[kind](message)
+
+
+def head_of(message: Any) -> tuple[int, str]:
+    """Return stamp [ns] and frame of a message."""
+    head = message.header
+    return head.stamp.sec * 1_000_000_000 + head.stamp.nanosec, head.frame_id
 
 
 def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]:
@@ -116,7 +123,7 @@ def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]
             good[wrong] = False
 
     refuse(found.stamps_ns <= 0, 'zero stamp')
-    if kind == JOINT_STATE:
+    if kind in (JOINT_STATE, *PICTURES):
         return good, causes
     width = numbers.shape[1]
     if width == 1:

@@ -4,15 +4,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.errors import ConfigError
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
-from calib_ros.kinematics.chain import Chain
-from calib_ros.sampling.sample import Frames, Sample, collect, socket_pairs
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 
 
@@ -25,26 +28,43 @@ def check_settings(chain: Chain, settings: Settings) -> None:
         When a name is unknown to this chain, say.
 
     """
+    if settings.mode == 'continuous' and any(
+        each.board for each in parse_sources(settings.sources)
+    ):
+        raise ConfigError('images are looked at where the arm stands: mode must not be continuous')
     nothing = np.zeros((0, len(chain.joints)))
     empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
     Problem(chain, empty, **settings.for_problem())
 
 
+def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
+    """Return a chain with lenses at its frames."""
+    for name, lens in found.items():
+        frame = chain.frame(name) if name in chain.frame_names else Frame()
+        chain = chain.with_frame(name, replace(frame, lens=lens))
+    return chain
+
+
 def problem_of(
-    chain: Chain, samples: Sequence[Sample], settings: Settings, socket_distance: float
+    chain: Chain,
+    samples: Sequence[Sample],
+    settings: Settings,
+    socket_distance: float,
+    posed: bool = False,
 ) -> Problem | None:
     """Return samples as a problem; None when there is none to fit.
 
-    Two sockets of a location are `socket_distance` [m] apart.
+    Two sockets of a location are `socket_distance` [m] apart. With `posed` the poses of boards are
+    taken instead of their corners.
     """
     frames = Frames()
     sigmas = settings.sigma_position, settings.sigma_orientation
-    fitted, held_out = collect(samples, sigmas, frames)
+    fitted, held_out = collect(samples, sigmas, frames, posed)
     if not fitted:
         return None
     pairs = socket_pairs(samples, frames)
     return Problem(
-        chain,
+        chain if posed else with_lenses(chain, lenses(samples, frames)),
         fitted[0],
         held_out,
         more=fitted[1:],

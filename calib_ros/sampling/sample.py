@@ -13,14 +13,33 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.records import Owner
+from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 SOCKETS = 0.05
 """Distance [m] of the two sockets of a location unless it is given: that of MUKCa's plates."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Corners of a board as a camera saw them.
+
+    Attributes
+    ----------
+    points : (K, 3)
+        In the frame of the board [m].
+    pixels : (K, 2)
+    lens : Lens
+
+    """
+
+    points: FloatArray
+    pixels: FloatArray
+    lens: Lens
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,6 +59,10 @@ class Sample(Shown):
         From the origin of the device to the target [m], where no position was measured.
     covariance : (6, 6), optional
         Of x, y, z [m] and the rotation about the device's x, y, z axes [rad].
+    view : View, optional
+        The corners of a board in an image, whose pose is that of the board by itself.
+    images : tuple of int
+        Numbers of the images of a stop of which one is still to be looked at.
     velocity, acceleration : (n,), optional
         Of the joints, where the arm was moving.
     session, device, target : str
@@ -70,6 +93,8 @@ class Sample(Shown):
     rotation: FloatArray | None = None
     distance: float | None = None
     covariance: FloatArray | None = None
+    view: View | None = None
+    images: tuple[int, ...] = ()
     velocity: FloatArray | None = None
     acceleration: FloatArray | None = None
     session: str = ''
@@ -186,12 +211,16 @@ def plain(name: str) -> str:
 
 
 def collect(
-    samples: Iterable[Sample], sigmas: tuple[float, float], frames: Frames | None = None
+    samples: Iterable[Sample],
+    sigmas: tuple[float, float],
+    frames: Frames | None = None,
+    posed: bool = False,
 ) -> tuple[tuple[Observations, ...], tuple[Observations, ...]]:
     """Return sets of observations to fit and sets held out, one for each pair of frames.
 
     `sigmas` (position [m], orientation [rad]) are those of poses seen by a camera on the flange
-    without a covariance of their own. `frames` remembers the names given to earlier samples.
+    without a covariance of their own. `frames` remembers the names given to earlier samples. With
+    `posed` the poses of boards are taken instead of their corners.
     """
     frames = Frames() if frames is None else frames
     groups: dict[tuple[str, str, str, bool, bool], list[Sample]] = {}
@@ -199,16 +228,56 @@ def collect(
         base, tool = frames.of(sample)
         kind = 'socket' if sample.socket else 'plane' if sample.plane else ''
         kind = kind or ('distance' if sample.distance is not None else 'pose')
+        kind = 'view' if sample.view is not None and not posed else kind
         key = (base, tool, kind, sample.eye_in_hand, sample.validation)
         groups.setdefault(key, []).append(sample)
     fitted: list[Observations] = []
     held_out: list[Observations] = []
-    for (base, tool, _, eye_in_hand, validation), members in groups.items():
+    for (base, tool, kind, eye_in_hand, validation), members in groups.items():
         observations = replace(_observations(members), base=base, tool=tool)
-        if eye_in_hand:
+        if kind == 'view':
+            observations = _seen(observations, members)
+        elif eye_in_hand:
             observations = observations.inverted(sigmas)
         (held_out if validation else fitted).append(observations)
     return tuple(fitted), tuple(held_out)
+
+
+def lenses(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
+    """Return the lens at each frame of a camera.
+
+    Raises
+    ------
+    InputError
+        When one camera has had different ones.
+
+    """
+    found: dict[str, Lens] = {}
+    for sample in samples:
+        if sample.view is not None:
+            camera = frames.of(sample)[sample.eye_in_hand]
+            if found.setdefault(camera, sample.view.lens) != sample.view.lens:
+                raise InputError(
+                    f'the CameraInfo of {sample.device or "the camera"} has changed: take the '
+                    'images of one calibration with one setting of the lens, or call ~/clear'
+                )
+    return found
+
+
+def _seen(posed: Observations, samples: Sequence[Sample]) -> Observations:
+    """Return the corners of images (N), given the poses of their boards."""
+    views = [sample.view for sample in samples if sample.view is not None]
+    rows = posed.select(np.repeat(np.arange(len(views)), [len(each.pixels) for each in views]))
+    return replace(
+        rows,
+        positions=np.zeros((len(rows), 3)),
+        rotations=np.tile(np.eye(3), (len(rows), 1, 1)),
+        oriented=np.zeros(len(rows), dtype=bool),
+        covariance=None,
+        pixels=np.concatenate([each.pixels for each in views]),
+        points=np.concatenate([each.points for each in views]),
+        on_flange=samples[0].eye_in_hand,
+    )
 
 
 def _observations(samples: Sequence[Sample]) -> Observations:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -24,7 +25,8 @@ from calib_ros.sampling.hints import Hint, restless, sparse
 from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.names import FrameNames, JointNames
-from calib_ros.sampling.problems import check_settings, problem_of
+from calib_ros.sampling.pictures import Pictures
+from calib_ros.sampling.problems import check_settings, problem_of, with_lenses
 from calib_ros.sampling.progress import progress
 from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import (
@@ -74,6 +76,7 @@ class CalibrationSession:
     ) -> None:
         self.chain = chain
         self.settings = settings or Settings()
+        self.pictures = Pictures(lambda: self.settings.sigma_pixel)
         self.on_sample = on_sample or (lambda sample: None)
         self.on_removed = on_removed or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
@@ -100,7 +103,8 @@ class CalibrationSession:
         self._frames = FrameNames()
         self._names = JointNames(self.joint_names)
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
-        self._live = LiveEstimate(self.problem_of)
+        self._live = LiveEstimate(partial(self.problem_of, posed=True))
+        self.pictures.clear()
         self._kept = Kept(self._frames, settings.frame_id, self._entry.dropped, self._removed)
 
     def change(self, settings: Settings) -> None:
@@ -124,7 +128,10 @@ class CalibrationSession:
         pieces = self._entry.pieces(parts, self.recording, self.settings.frame_id)
         if self._frames.settled != settled:
             self._kept.leave_out_strange()
-        self._road.take(pieces)
+        try:
+            self._road.take(pieces)
+        finally:
+            self._settle()
 
     def miss(self, kind: str, count: int, cause: str) -> None:
         """Count messages that came and cannot be used."""
@@ -133,6 +140,7 @@ class CalibrationSession:
     def finish(self) -> None:
         """Make samples of everything that still waits; nothing more will come."""
         self._road.finish()
+        self._settle(wait=True)
 
     @property
     def received(self) -> Counter[str]:
@@ -151,9 +159,12 @@ class CalibrationSession:
 
         With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
         """
-        found = self._collector.capture(socket_place(socket) if socket else '')
+        count, why = self._collector.capture(socket_place(socket) if socket else '')
+        before = len(self.samples)
         self._road.hand_over()
-        return found
+        self._settle(wait=True)
+        taken = len(self.samples) - before
+        return (taken, why) if taken or not count else (0, self.pictures.refused)
 
     def remove_last(self) -> Sample:
         """Take back the last sample.
@@ -227,7 +238,7 @@ class CalibrationSession:
                 self.samples
             ) - len(usable)
         strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._road.gate.dropped.items()})
-        dropped = self._entry.dropped + collector.dropped + strays
+        dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + strays
         return Account(
             self.received['joints'],
             self.received['poses'],
@@ -282,6 +293,8 @@ class CalibrationSession:
         `work` is what goes on besides.
         """
         told = [self.state, work, *(hint.status for hint in self.hints)]
+        if self.pictures.refused:
+            told.append(f'the last image is not used: {self.pictures.refused}')
         estimate = self.estimate
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
@@ -302,14 +315,14 @@ class CalibrationSession:
 
         """
         self._clocks.find(self._collector, None)
-        self._road.flush()
+        self._flush()
         if self._kept.different:
             raise InputError(f'{self._kept.different}, {ONE_FRAME}')
         self._kept.leave_out_strange()
         return self.problem_of(self.usable)
 
-    def problem_of(self, samples: Sequence[Sample]) -> Problem:
-        """Return samples as a problem.
+    def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
+        """Return samples as a problem; with `posed` boards by their poses, not their corners.
 
         Raises
         ------
@@ -317,7 +330,7 @@ class CalibrationSession:
             When there is none to fit.
 
         """
-        found = problem_of(self.chain, samples, self.settings, self.socket_distance)
+        found = problem_of(self.chain, samples, self.settings, self.socket_distance, posed)
         if found is None:
             raise InputError(f'no samples to fit: {self._came}')
         return found
@@ -381,15 +394,18 @@ class CalibrationSession:
         """
         calibration, sets = self._since(RECENT)
         first, *more = sets
+        cameras = {each.camera for each in sets if each.pixels is not None}
+        known = {name: calibration.chain.frame(name).lens for name in cameras}
+        chain = with_lenses(self.chain, {name: lens for name, lens in known.items() if lens})
         settings = self.settings.for_problem()
-        return calibration, Problem(self.chain, first, more=tuple(more), **settings)
+        return calibration, Problem(chain, first, more=tuple(more), **settings)
 
     def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
         """Return the calibration, and the samples since, or the last of them, in its frames."""
         calibration = self.calibration
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
-        self._road.flush()
+        self._flush()
         settings = self.settings
         sigmas = (settings.sigma_position, settings.sigma_orientation)
         # the first device and target are those of a file that does not name any
@@ -407,9 +423,20 @@ class CalibrationSession:
             )
         return calibration, sets
 
-    def _take(self, made: Sequence[Sample]) -> int:
+    def _flush(self) -> None:
+        """Make samples of everything that has come, as if nothing came late."""
+        self._road.flush()
+        self._settle(wait=True)
+
+    def _settle(self, wait: bool = False) -> None:
+        """Take the samples of images that were looked at, of all of them if asked."""
+        self._take((), wait)
+        self.pictures.keep_only(self._collector.images)
+
+    def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
         """Keep the samples that were made; return how many there are now."""
-        fresh = [each for each in made if not self._kept.is_strange(each)]
+        self.pictures.through(made)
+        fresh = [each for each in self.pictures.ready(wait) if not self._kept.is_strange(each)]
         self._kept.samples += fresh
         for sample in fresh:
             self.on_sample(sample)

@@ -29,6 +29,7 @@ class StreamKey(NamedTuple):
     distance: bool
     eye_in_hand: bool
     frame_id: str = ''
+    images: bool = False
 
 
 Columns: TypeAlias = tuple[int, ...]

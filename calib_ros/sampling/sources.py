@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.sampling.messages import DECODERS, LINKS, TRANSFORMS, frame_name
+from calib_ros.sampling.messages import DECODERS, LINKS, PICTURES, TRANSFORMS, frame_name
 
 VALIDATION = 'validation_'
 """Topics whose last name starts so hold measurements that judge the result, never fitted."""
@@ -43,6 +43,12 @@ class Source:
     parent, child : str
         On a topic of many transforms or bodies, such as /tf: the frames between which it is
         measured.
+    board : str
+        YAML of the board that images show, which has its type and sizes.
+    info : str
+        Topic of the CameraInfo of images; default: camera_info beside them.
+    lens : str
+        Whether the intrinsics are `given` by it, or `fitted` from there on.
 
     """
 
@@ -54,6 +60,9 @@ class Source:
     validation: bool = False
     parent: str = ''
     child: str = ''
+    board: str = ''
+    info: str = ''
+    lens: str = 'given'
 
     def __post_init__(self) -> None:
         """Refuse what no bag or node could use."""
@@ -65,12 +74,26 @@ class Source:
                 f'source "{self.topic}" needs parent=FRAME child=FRAME, between which it '
                 f'measures, if its type is {_or(LINKS)}, and only then'
             )
+        if bool(self.board) != (self.type in PICTURES):
+            raise ConfigError(
+                f'source "{self.topic}" needs board=FILE, the board that it sees, if its type is '
+                f'{_or(PICTURES)}, and only then'
+            )
+        if self.lens not in LENSES:
+            raise UnknownNameError(f'lens of source "{self.topic}"', self.lens, LENSES)
         for name in (self.device, self.target):
             if '.' in name or ',' in name:
                 raise ConfigError(f'a device or target needs a name without . and , not "{name}"')
 
+    @property
+    def camera_info(self) -> str:
+        """Return the topic of the CameraInfo of images."""
+        beside = self.topic.removesuffix('/compressed').rpartition('/')
+        return self.info or f'{beside[0]}{beside[1]}camera_info'
 
-TYPES = (*DECODERS, *LINKS)
+
+LENSES = ('given', 'fitted')
+TYPES = (*DECODERS, *LINKS, *PICTURES)
 """Types of messages that hold measurements."""
 
 STANDARD = (
@@ -90,8 +113,9 @@ def parse_source(text: str) -> Source:
     """Read a source from "TOPIC key=value ...".
 
     Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
-    child. A short type such as PoseStamped will do; a topic named tf is of type TFMessage, and so
-    is one with a parent or a child and no type. What holds blanks stands in quotes.
+    child, and of images board, info and lens. A short type such as PoseStamped will do; a topic
+    named tf is of type TFMessage, and so is one with a parent or a child and no type; one with a
+    board is of images. What holds blanks stands in quotes.
     """
     try:
         topic, *pairs = shlex.split(text) or ('',)
@@ -114,13 +138,18 @@ def parse_source(text: str) -> Source:
             values[key] = frame_name(value) if key in ('parent', 'child') else value
     if values.keys() & {'parent', 'child'} or topic.rpartition('/')[2] == 'tf':
         values.setdefault('type', TRANSFORMS)
+    if 'board' in values:
+        values.setdefault('type', PICTURES[topic.endswith('/compressed')])
     source = Source(topic, **values)
     if source.type.endswith('/Range') and not source.device:
         source = replace(source, device=DISTANCE)
     return source
 
 
-KEYS = ('type', 'device', 'target', 'eye_in_hand', 'validation', 'parent', 'child')
+KEYS = (
+    *('type', 'device', 'target', 'eye_in_hand', 'validation', 'parent', 'child'),
+    *('board', 'info', 'lens'),
+)
 
 
 def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:

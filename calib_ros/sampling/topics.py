@@ -14,7 +14,7 @@ import numpy as np
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.intake import Deserialise, Intake, Stream, measured
-from calib_ros.sampling.messages import DECODERS, JOINT_STATE, LINKS
+from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import (
     MARKERS,
@@ -65,6 +65,8 @@ def choose(
         if kind not in TYPES or source.type not in ('', kind):
             expected = (source.type,) if source.type else tuple(DECODERS)
             raise _no_topic(f'"{source.topic}"', expected, available)
+        if source.board and available.get(source.camera_info) != CAMERA_INFO:
+            raise _no_topic(f'"{source.camera_info}"', (CAMERA_INFO,), available)
     if all(source.validation for source in sources):
         error = _no_topic('pose topic', tuple(DECODERS), available)
         raise InputError('; '.join([str(error), *_links(available, messages_on, deserialise)]))

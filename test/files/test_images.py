@@ -7,7 +7,6 @@ import json
 import os
 import re
 import zlib
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -19,54 +18,23 @@ from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files import boards, images
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.pictures import Refusal
 
 cv2 = pytest.importorskip('cv2')
+from photographs import CHARUCO, rendered
+
 DATA = os.environ.get('CALIB_ROS_DATA')
 REAL = Path(DATA or '.') / 'charuco_wrist_camera_fixed'
-CHARUCO = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_6X6_250')
 MARKERS = boards.Board('markers', 4, 5, 0.04, 0.03, 'DICT_APRILTAG_36h11')
-SCALE = 5000.0
-"""Pixels of a drawn board per metre."""
+LENS = Lens(1300.0, 1300.0, 640.0, 480.0)
 
 
-@cache
-def drawn(board):
-    """Return a board as it is printed, SCALE pixels a metre."""
-    width, height = (round(side * SCALE) for side in board.size)
-    page = np.full((height, width), 255, dtype=np.uint8)
-
-    def black(left, top, size):
-        first, last = np.round([[left, top], [left + size, top + size]]).astype(int) * 1
-        page[first[1] : last[1], first[0] : last[0]] = 0
-
-    side = board.square * SCALE
-    if board.type == 'charuco':
-        for row, column in np.ndindex(board.rows, board.columns):
-            if (row + column) % 2 == 0:
-                black(column * side, row * side, side)
-    for cells, (left, top) in zip(images.marker_cells(board), board.markers * SCALE, strict=True):
-        size = board.marker * SCALE / len(cells)
-        for row, column in np.argwhere(cells):
-            black(left + column * size, top + row * size, size)
-    return page
-
-
-def photograph(board, turn=(0.2, 0.3, 0.1), depth=0.5, blur=0.7, noise=2.0, shift=(0.0, 0.0)):
+def photograph(board, turn=(0.2, 0.3, 0.1), depth=0.5, blur=0.7, shift=(0.0, 0.0)):
     """Return an image of a board, and where its corners are in it [px]."""
     rotation = se3.exp_rotation(np.array(turn))
     middle = np.array([*shift, depth]) - rotation @ board.corners.mean(axis=0)
-    camera = np.array([[1300.0, 0.0, 640.0], [0.0, 1300.0, 480.0], [0.0, 0.0, 1.0]])
-    matrix = camera @ np.column_stack([rotation[:, :2], middle])
-    finer = np.array([[4.0, 0.0, 1.5], [0.0, 4.0, 1.5], [0.0, 0.0, 1.0]])
-    page = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, SCALE]]) / SCALE
-    large = cv2.warpPerspective(
-        drawn(board), finer @ matrix @ page, (5120, 3840), flags=cv2.INTER_AREA, borderValue=210
-    )
-    image = cv2.resize(large, (1280, 960), interpolation=cv2.INTER_AREA)
-    image = cv2.GaussianBlur(image, (0, 0), blur).astype(float)
-    image += np.random.default_rng(0).normal(size=image.shape) * noise
-    seen = np.column_stack([board.corners[:, :2], np.ones(len(board.corners))]) @ matrix.T
-    return np.clip(image, 0, 255).astype(np.uint8), seen[:, :2] / seen[:, 2:]
+    return rendered(board, se3.transform(rotation, middle), LENS, (1280, 960), blur)
 
 
 @pytest.mark.parametrize(('board', 'limit'), [(CHARUCO, 0.1), (MARKERS, 0.4)])
@@ -96,8 +64,8 @@ def test_images_are_refused_with_the_reason():
     ]
     for detector, picture, reason in cases:
         found = detector.of(picture)
-        assert isinstance(found, str), reason
-        assert re.search(reason, found), found
+        assert isinstance(found, Refusal), reason
+        assert re.search(reason, found.reason), found
 
 
 def test_what_opencv_does_not_know_is_refused():
@@ -148,7 +116,7 @@ def test_boards_that_are_none_are_refused(tmp_path, old, new, said):
 @pytest.mark.parametrize(
     ('text', 'said'),
     [
-        ('image,corner,u\na,0,1\n', 'column v missing'),
+        ('image,corner,u\na,0,1\n', 'no column v;'),
         ('image,corner,u,v\na,24,1,2\n', 'line 2: corner must be from 0 to 23 on this board'),
         ('image,corner,u,v\na,0,1,2\na,0,1,2\n', 'line 3: corner 0 of image a is there already'),
         ('image,corner,u,v\na,0,x,2\n', 'line 2: u'),

@@ -16,6 +16,7 @@ from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, meas
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.leastsquares import stacked
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.pixels import PixelSamples
 from calib_ros.identification.resection import board_poses, resect
@@ -57,19 +58,19 @@ def test_the_jacobian_is_that_of_differences(on_flange, seed):
     true, seen = scene(seed, on_flange, 3)
     chain = true.with_effects(['elbow_joint.sin_1'])
     names = list(chain.parameter_names)
-    samples = PixelSamples(seen, 0.5)
-    samples.weights = np.random.default_rng(seed).uniform(0.1, 1.0, len(seen))
-    rows = samples.rows_of(chain, names)
+    weights = np.random.default_rng(seed).uniform(0.1, 1.0, len(seen))
+    rows = PixelSamples(seen, 0.5).weighted(weights**2).rows_of(chain, names).T
+    weights = weights[:, np.newaxis]
     for k, name in enumerate(names):
         step = 1e-4 if Parameter(name).kind in ('fx', 'fy', 'cx', 'cy') else 1e-6
         more, less = (
             seen_residuals(chain.with_offsets({name: s * step}), seen)[0] for s in (1.0, -1.0)
         )
-        change = samples.weights[:, np.newaxis] * (less - more) / (2.0 * step * 0.5)
+        change = weights * (less - more) / (2.0 * step * 0.5)
         scale = np.abs(change).max() + 1.0
-        np.testing.assert_allclose(rows[:, :, k], change, atol=1e-6 * scale, err_msg=name)
-    residual = samples.weights[:, np.newaxis] * seen_residuals(chain, seen)[0] / 0.5
-    np.testing.assert_allclose(rows[:, :, -1], residual, atol=1e-12)
+        np.testing.assert_allclose(rows[..., k], change, atol=1e-6 * scale, err_msg=name)
+    residual = weights * seen_residuals(chain, seen)[0] / 0.5
+    np.testing.assert_allclose(rows[..., -1], residual, atol=1e-12)
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
@@ -78,13 +79,13 @@ def test_few_rows_an_image_have_the_same_normal_matrix(on_flange):
     seen = seen.select(np.arange(len(seen)) % 7 != 0)
     names = true.parameter_names
     samples = PixelSamples(seen, SIGMA)
-    rows = samples.rows_of(true, names).reshape(-1, len(names) + 1)
+    rows = stacked([samples.rows_of(true, names)])
     found = np.zeros((len(names) + 1,) * 2)
     count = 0
-    for block, _, model in samples.blocks(true, names):
-        order = [*model.order, len(names)]
-        found += block[order] @ block[order].T
-        count += block.shape[1]
+    for _, block, _, model in samples.blocks(true, names):
+        flat = block[[*model.order, len(names)]].reshape(len(block), -1)
+        found += flat @ flat.T
+        count += flat.shape[1]
     assert count == 5 * 16 < len(rows)
     scale = np.sqrt(np.maximum(np.diag(found), 1.0))
     np.testing.assert_allclose(

@@ -180,7 +180,7 @@ def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypa
     system, kernels = System((samples,)), [(3.0, 2.0), (20.0, 0.5)]
     apart = np.abs(np.subtract.outer(np.arange(73), np.arange(73)))
     kernel = sum(size * np.exp(-apart / length) for length, size in kernels)
-    rows = samples.rows_of(UR10E, names)[..., :-1]
+    rows = samples.rows_of(UR10E, names).T[..., :-1]
     for part, own in enumerate((rows[:, :3], rows[:, 3:])):
         found = shared_errors._successive(UR10E, names, system, part, kernels)
         expected = np.einsum('ncp,nm,mcr->pr', own, kernel, own, optimize=True)

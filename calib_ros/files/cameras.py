@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras that are sources of measurements: from image and CameraInfo messages to corners."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.files.boards import lens_of, read_board
+from calib_ros.files.images import Detector, image_of
+from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.sample import View
+from calib_ros.sampling.sources import Source, parse_sources
+
+NO_INFO = Refusal('before any CameraInfo', 'no CameraInfo of it has come')
+
+
+class BoardCamera:
+    """Finds a board in the images of one source.
+
+    Parameters
+    ----------
+    source : Source
+
+    Raises
+    ------
+    ConfigError
+        When the board cannot be read, or OpenCV is missing.
+
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._board = read_board(Path(source.board).expanduser())
+        self._detector = Detector(self._board)
+        self._lens: Lens | Refusal = NO_INFO
+
+    def learn(self, info: Any) -> None:
+        """Take a CameraInfo; one that cannot be used refuses the images after it."""
+        try:
+            self._lens = replace(lens_in(info), fixed=self._source.lens == 'given')
+        except CalibrationError as err:
+            self._lens = Refusal('whose CameraInfo cannot be used', str(err))
+
+    def look(self, message: Any) -> View | Refusal:
+        """Return the corners in an Image or CompressedImage, or why it is not used."""
+        lens = self._lens
+        if isinstance(lens, Refusal):
+            return lens
+        try:
+            found = self._detector.of(image_of(message))
+        except CalibrationError as err:
+            return Refusal('that cannot be decoded', str(err))
+        if isinstance(found, Refusal):
+            return found
+        number, pixels = found
+        return View(self._board.corners[number], np.round(pixels, 4), lens)  # as in a table
+
+
+def lens_in(info: Any) -> Lens:
+    """Return the lens that a CameraInfo tells.
+
+    Raises
+    ------
+    ConfigError
+        When the camera is not calibrated, its image cut out or binned, or its model unknown.
+
+    """
+    matrix, distortion = [[float(x) for x in values] for values in (info.k, info.d)]
+    if not any(matrix):
+        raise ConfigError('CameraInfo: the camera is not calibrated, k is zero')
+    cut = info.roi.x_offset or info.roi.y_offset
+    if cut or info.binning_x > 1 or info.binning_y > 1:
+        raise ConfigError('CameraInfo: give the whole image, without roi and binning')
+    return lens_of(info.distortion_model or 'plumb_bob', matrix, distortion, 'CameraInfo')
+
+
+def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
+    """Return the cameras among sources, by the topics of their images."""
+    cameras = {}
+    for source in parse_sources(texts):
+        if source.board:
+            if 'image_rect' in source.topic.rpartition('/')[2]:
+                raise ConfigError(
+                    f'source "{source.topic}": CameraInfo describes the image before it is '
+                    'rectified, give that (image_raw)'
+                )
+            cameras[source.topic] = BoardCamera(source)
+    return cameras

@@ -1,0 +1,392 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the rows of a table of measurements say, all rows at once, and by what rules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.columns import (
+    Codes,
+    Columns,
+    Lines,
+    check_quaternions,
+    lines_in_words,
+    numbered,
+)
+from calib_ros.files.foreign import refuse_separator
+from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.sample import socket_place
+from calib_ros.values import (
+    LARGEST,
+    LARGEST_RATE,
+    LARGEST_SIGMA,
+    covariance_faults,
+)
+
+SPLITS = {name: name for name in ('', 'train', 'test', 'removed')}
+FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
+KINDS = ('x', 'distance', 'socket', 'plane')
+"""Cells that say what was measured in a row: a pose or position, a distance, ..."""
+POSE, DISTANCE, SOCKET, PLANE = range(4)
+MOST_FRAMES = 100
+"""Sessions, devices and targets of a table."""
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """N rows with what was measured, NaN where nothing was.
+
+    Attributes
+    ----------
+    path, lines : Path, (N,)
+        The file, and the line of each row.
+    stamps_ns : (N,)
+    joints, approach, velocity, acceleration : (N, n)
+        Joint values [rad or m], signs of their last moves, rates; the latter optional.
+    kind : (N,)
+        POSE, DISTANCE, SOCKET or PLANE.
+    position, rotation : (N, 3), (N, 3, 3)
+        Of poses [m]; no turn where none was measured, which `oriented` (N,) tells.
+    distance : (N,)
+        In metres; 0 of touched planes.
+    covariance : (N, 6, 6), optional
+        Of poses [m, rad].
+    session, device, target, frame_id, view : Codes
+    eye_in_hand, test, removed : (N,)
+        Flags.
+    delay, count, spread : (N,)
+        As a `Sample` has them.
+
+    """
+
+    path: Path
+    lines: Lines
+    stamps_ns: NDArray[np.int64]
+    joints: FloatArray
+    approach: FloatArray | None
+    velocity: FloatArray | None
+    acceleration: FloatArray | None
+    kind: NDArray[np.intp]
+    position: FloatArray
+    rotation: FloatArray
+    oriented: NDArray[np.bool_]
+    distance: FloatArray
+    covariance: FloatArray | None
+    session: Codes
+    device: Codes
+    target: Codes
+    frame_id: Codes
+    view: Codes
+    eye_in_hand: NDArray[np.bool_]
+    test: NDArray[np.bool_]
+    removed: NDArray[np.bool_]
+    delay: FloatArray
+    count: NDArray[np.int64]
+    spread: FloatArray
+
+    def select(self, rows: NDArray[np.generic]) -> Measurements:
+        """Return some of the rows, by a mask or by indices."""
+        found: dict[str, object] = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                found[item.name] = value[rows]
+            elif isinstance(value, tuple):
+                found[item.name] = (value[0][rows], value[1])
+        return replace(self, **found)  # type: ignore[arg-type]
+
+    @property
+    def codes(self) -> NDArray[np.intp]:
+        """Return what frames and sets depend on (N, 6), session, device and target first."""
+        words = (self.session[0], self.device[0], self.target[0])
+        return np.column_stack([*words, self.eye_in_hand, self.kind, self.test])
+
+    def kept(self) -> Measurements:
+        """Return the rows that were not taken back: of those alike it is the last one.
+
+        Raises
+        ------
+        InputError
+            When of those that are left two are alike.
+
+        """
+        found = self
+        if self.removed.any():
+            open_rows: dict[tuple[int, ...], list[int]] = {}
+            keys = np.column_stack([self.stamps_ns, self.codes[:, :-1]]).tolist()
+            for row, (key, removed) in enumerate(zip(keys, self.removed.tolist(), strict=True)):
+                same = open_rows.setdefault(tuple(key), [])
+                if not removed:
+                    same.append(row)
+                elif same:
+                    same.pop()
+            rows = sorted(row for same in open_rows.values() for row in same)
+            found = self.select(np.array(rows, dtype=np.intp))
+        _, number = distinct(found.codes)
+        order = np.lexsort((number, found.stamps_ns))
+        same_stamp, same_kind = np.diff(found.stamps_ns[order]), np.diff(number[order])
+        again = np.flatnonzero((same_stamp == 0) & (same_kind == 0))
+        if len(again):
+            row = order[again + 1].min()
+            raise InputError(
+                f'{self.path}, line {found.lines[row]}: stamp_ns {found.stamps_ns[row]} is there '
+                'already'
+            )
+        return found
+
+    def check_frames(self) -> None:
+        """Refuse too many frames, and what one device measured in different ones.
+
+        A row that names no frame may be of any.
+        """
+        kinds, number = distinct(self.codes[:, :3])
+        if len(kinds) > MOST_FRAMES:
+            line = self.lines[int(np.argmax(number == MOST_FRAMES))]
+            raise InputError(
+                f'{self.path}, line {line}: more than {MOST_FRAMES} sessions, devices and '
+                'targets; each has a frame to be fitted'
+            )
+        if self.frame_id[1] == ['']:
+            return
+        kinds, number = distinct(np.column_stack([self.codes[:, :2], self.frame_id[0]]))
+        frames: dict[tuple[int, ...], dict[str, int]] = {}
+        for k, (*device, frame) in enumerate(kinds.tolist()):
+            if self.frame_id[1][frame]:
+                frames.setdefault(tuple(device), {})[self.frame_id[1][frame]] = k
+        for names in frames.values():
+            if len(names) > 1:
+                found = ', '.join(
+                    f'{name} ({lines_in_words(self.lines[number == k].tolist())})'
+                    for name, k in names.items()
+                )
+                raise InputError(
+                    f'{self.path}: poses came in different frames: {found}; one is needed: '
+                    'leave out the rows of the others, or give each a device of its own'
+                )
+
+
+def measurements(columns: Columns, joints: int) -> Measurements:
+    """Return what the rows of a table say; whatever makes no sense is refused.
+
+    Raises
+    ------
+    InputError
+        For a missing column and for cells that are no number, say. The message names the line.
+
+    """
+    header = columns.header
+    _check_header(columns, joints)
+    has = [~columns.blank(n) if n in header else np.zeros(len(columns.lines), bool) for n in KINDS]
+    filled = np.column_stack(has)
+    for row in np.flatnonzero(filled.sum(axis=1) > 1)[:1].tolist():
+        kinds = ' and '.join(np.array(KINDS)[filled[row]])
+        raise InputError(
+            f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each kind of '
+            'measurement a row of its own'
+        )
+    kind = filled.argmax(axis=1)
+    placed = kind == POSE
+    read = _Blocks(columns, joints)
+    count = len(columns.lines)
+    angles = read.of(named('q', joints), True)
+    assert angles is not None
+    position = read.of(POSITION, placed)
+    oriented, rotation = _turned(columns, read.of(QUATERNION, False), placed)
+    signs = read.of(named('s', joints), False, LARGEST_RATE)
+    split = choices(columns, 'split', SPLITS, 'train or test')
+    ones = np.ones(count, dtype=np.int64)
+    return Measurements(
+        columns.path,
+        columns.lines,
+        _stamps(columns),
+        angles,
+        None if signs is None else np.sign(signs),
+        read.of(named('v', joints), False, LARGEST_RATE),
+        read.of(named('a', joints), False, LARGEST_RATE),
+        kind,
+        np.zeros((count, 3)) if position is None else position,
+        rotation,
+        oriented,
+        np.where(kind == PLANE, 0.0, read.one('distance', needed=kind == DISTANCE)),
+        _covariance(columns, read.of(COVARIANCE, False, LARGEST_SIGMA**2), placed, oriented),
+        columns.labels('session'),
+        _devices(columns, kind),
+        columns.labels('target'),
+        columns.labels('frame_id'),
+        columns.labels('view'),
+        choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
+        split == 'test',
+        split == 'removed',
+        read.one('delay'),
+        columns.integers('count', ones) if 'count' in header else ones,
+        read.one('spread', math.inf),
+    )
+
+
+def named(letter: str, joints: int) -> tuple[str, ...]:
+    """Return the names of the columns with a number of each joint."""
+    return tuple(f'{letter}{k + 1}' for k in range(joints))
+
+
+class _Blocks:
+    """The numbers of a table, read at once."""
+
+    def __init__(self, columns: Columns, joints: int) -> None:
+        self._columns = columns
+        blocks = [named(letter, joints) for letter in 'qsva']
+        singles = [(name,) for name in ('distance', 'delay', 'count', 'spread')]
+        self._at: dict[Sequence[str], slice] = {}
+        names: list[str] = []
+        for block in (*blocks, POSITION, QUATERNION, COVARIANCE, *singles):
+            if block[0] in columns.header:
+                self._at[block] = slice(len(names), len(names) + len(block))
+                names += block
+        self._numbers = columns.numbers(names)
+
+    def of(
+        self, names: tuple[str, ...], needed: NDArray[np.bool_] | bool, largest: float = LARGEST
+    ) -> FloatArray | None:
+        """Return the numbers (N, len(names)) of a block, None where all are blank."""
+        if names not in self._at:
+            return None
+        found = self._numbers[:, self._at[names]]
+        found = self._columns.block(names, largest, found, needed)
+        return None if len(found) and np.isnan(found[:, 0]).all() else found
+
+    def one(
+        self, name: str, largest: float = LARGEST, needed: NDArray[np.bool_] | bool = False
+    ) -> FloatArray:
+        """Return the numbers (N,) of a column, 0 where it is blank."""
+        found = self.of((name,), needed, largest)
+        return np.zeros(len(self._columns.lines)) if found is None else np.nan_to_num(found[:, 0])
+
+
+def _check_header(columns: Columns, joints: int) -> None:
+    """Refuse a table without columns that it needs, or with a part of a block."""
+    header = set(columns.header)
+    needed = [*named('q', joints)]
+    if not set(KINDS[1:]) & header:
+        needed += POSITION
+    together = (*(named(letter, joints) for letter in 'sva'), POSITION, QUATERNION, COVARIANCE)
+    for block in (*together, ('location', 'socket')):
+        needed += block if set(block) & header else ()
+    missing = [name for name in dict.fromkeys(needed) if name not in header]
+    if missing:
+        refuse_separator(columns.path, columns.header)
+        expected = ', '.join([*needed[:joints], *POSITION])
+        raise InputError(
+            f'{columns.path} has no column {", ".join(missing)}; expected {expected} '
+            f'and, with orientation, {", ".join(QUATERNION)} as well (or '
+            'distance, plane, or location and socket); found '
+            f'{", ".join(columns.header) or "nothing"}. '
+            'Columns of other names: --columns q1=NAME,x=NAME,...'
+        )
+
+
+def choices(
+    columns: Columns, name: str, known: Mapping[str, object], what: str
+) -> NDArray[np.generic]:
+    """Return what the cells (N,) of a column stand for, of which only some are known."""
+    numbers, found = columns.labels(name)
+    for k, word in enumerate(found):
+        if word not in known:
+            row = int(np.argmax(numbers == k))
+            raise InputError(f'{columns.where(row, name)} must be {what}, not {word!r}')
+    return np.array([known[word] for word in found])[numbers]
+
+
+def _stamps(columns: Columns) -> NDArray[np.int64]:
+    """Return the stamps (N,) [ns]: a row without one is measured at its line, in seconds."""
+    lines = columns.lines.astype(np.int64) * 1_000_000_000
+    if 'stamp_ns' not in columns.header or columns.blank('stamp_ns').all():
+        return lines
+    return columns.integers('stamp_ns', lines)
+
+
+def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
+    """Return the devices; a socket and a plane stand for one, as does what measures distances."""
+    device = columns.labels('device')
+    plane, place = columns.labels('plane'), columns.labels('location')
+    socket = columns.labels('socket')
+    if not kind.any():
+        return device
+    combined = np.column_stack([kind, device[0], plane[0], place[0], socket[0]])
+    kinds, number = distinct(combined)
+    names = []
+    for k, (what, by, touched, location, hole) in enumerate(kinds.tolist()):
+        name = device[1][by]
+        if what == PLANE:
+            name = plane[1][touched]
+        elif what == SOCKET:
+            try:
+                name = socket_place(f'{place[1][location]}/{socket[1][hole]}')
+            except ConfigError as err:
+                row = int(np.argmax(number == k))
+                raise InputError(f'{columns.path}, line {columns.lines[row]}: {err}') from err
+        elif what == DISTANCE and 'x' in columns.header:  # the origin of a tracker is another one
+            name = name or 'distance'
+        names.append(name)
+    found, different = numbered(names)
+    return found[number], different
+
+
+def _turned(
+    columns: Columns, quat: FloatArray | None, placed: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Return which of the poses are oriented (N,), and the rotations (N, 3, 3)."""
+    if quat is None:
+        return np.zeros(len(placed), bool), np.tile(np.eye(3), (len(placed), 1, 1))
+    check_quaternions(columns, quat)
+    oriented = placed & ~np.isnan(quat[:, 0])
+    if not oriented.all():
+        quat = np.where(oriented[:, np.newaxis], quat, [0.0, 0.0, 0.0, 1.0])
+    return oriented, se3.from_quat(quat)
+
+
+def _covariance(
+    columns: Columns,
+    upper: FloatArray | None,
+    placed: NDArray[np.bool_],
+    oriented: NDArray[np.bool_],
+) -> FloatArray | None:
+    """Return the covariances (N, 6, 6), NaN where none was given; None where none was."""
+    if upper is None:
+        return None
+    given = placed & ~np.isnan(upper[:, 0])
+    full = np.full((len(upper), 6, 6), np.nan)
+    rows, across = np.transpose(UPPER)
+    full[:, rows, across] = upper
+    full[:, across, rows] = upper
+    known = np.where(oriented[given, np.newaxis], 1.0, np.repeat([1.0, 0.0], 3))
+    faults = covariance_faults(full[given] * known[:, :, np.newaxis] * known[:, np.newaxis, :])
+    for k in np.flatnonzero(faults != '')[:1].tolist():
+        line = columns.lines[np.flatnonzero(given)[k]]
+        raise InputError(f'{columns.path}, line {line}: c11 ... c66: {faults[k]}')
+    full[~given | ~full.any(axis=(1, 2))] = np.nan
+    return None if np.isnan(full).all() else full
+
+
+def distinct(codes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the different rows of (N, C) in order of appearance, and which (N,) each row is."""
+    if not codes.any():
+        return codes[:1], np.zeros(len(codes), dtype=np.intp)
+    sizes = [int(size) + 1 for size in codes.max(axis=0)]
+    if math.prod(sizes) < 2**62:
+        joined = np.ravel_multi_index(tuple(codes.T), sizes)
+        _, first, number = np.unique(joined, return_index=True, return_inverse=True)
+    else:
+        _, first, number = np.unique(codes, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.intp)
+    rank[order] = np.arange(len(order))
+    return codes[first[order]], rank[number.reshape(-1)]

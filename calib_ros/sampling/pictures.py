@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Images of a board on their way to samples.
+
+An image goes the way of all measurements by its stamp and a number, and is itself kept here, as it
+came, until its stop is known. Then the one in the middle of the stop is decoded and looked at, on
+a thread of its own: one for each stop, however many come. Samples leave in the order of their
+stops, those without an image as well, so that live and of a bag they are the same.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from calib_ros.errors import InputError
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.resection import board_poses, uncertainty
+from calib_ros.kinematics import se3
+from calib_ros.sampling.sample import Sample, View
+
+MOST_BYTES = 500_000_000
+"""Size of the images that are kept: six seconds of 30 Hz at 2 megapixels in grey."""
+MOST_WAITING = 4
+"""Images that may wait to be looked at; an arm that stops so often that more come loses some."""
+
+
+class Refusal(NamedTuple):
+    """Why an image is not used: by its kind, and with what was found in it."""
+
+    cause: str
+    reason: str
+
+
+class Camera(Protocol):
+    """What finds a board in images."""
+
+    def learn(self, info: Any) -> None:
+        """Take a CameraInfo."""
+
+    def look(self, message: Any) -> View | Refusal:
+        """Return the corners in an Image or CompressedImage."""
+
+
+class _Kept(NamedTuple):
+    topic: str
+    size: int
+    message: Callable[[], Any]
+
+
+class Pictures:
+    """Keeps images, and makes samples of those that are looked at.
+
+    Parameters
+    ----------
+    sigma : callable
+        Returns the standard deviation of a corner [px].
+
+    """
+
+    def __init__(self, sigma: Callable[[], float]) -> None:
+        self._sigma = sigma
+        self.cameras: Mapping[str, Camera] = {}
+        """What looks at images, by their topics."""
+        self._pool = ThreadPoolExecutor(1, 'images')
+        self._last = 0
+        self.patient = False
+        """True when images may be waited for rather than dropped, as those of a bag."""
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all images and counts."""
+        self._kept: dict[int, _Kept] = {}
+        self._queue: deque[tuple[Sample, Future[Sample | Refusal] | None]] = deque()
+        self.dropped: Counter[str] = Counter()
+        """What became of images that are not used, by cause."""
+        self.refused = ''
+        """Why the last image that was looked at is not used; empty when it is."""
+
+    def keep(self, topic: str, size: int, message: Callable[[], Any]) -> int:
+        """Keep an image of some bytes; return its number. `message` decodes it."""
+        self._last += 1
+        self._kept[self._last] = _Kept(topic, size, message)
+        while sum(each.size for each in self._kept.values()) > MOST_BYTES and len(self._kept) > 1:
+            for number in [*self._kept][-2::-2]:  # the newest stays, and every stop has some
+                del self._kept[number]
+        return self._last
+
+    def learn(self, topic: str, info: Any) -> None:
+        """Take the CameraInfo of the images on a topic."""
+        self.cameras[topic].learn(info)
+
+    def keep_only(self, numbers: set[int]) -> None:
+        """Let go of images that no stop can need any more."""
+        for number in self._kept.keys() - numbers:
+            del self._kept[number]
+
+    def through(self, made: Sequence[Sample]) -> None:
+        """Begin to look at the images of samples; they come out of `ready`."""
+        for sample in made:
+            if not sample.images:
+                self._queue.append((sample, None))
+            elif (found := self._begin(sample)) is not None:
+                self._queue.append((sample, found))
+
+    def ready(self, wait: bool = False) -> list[Sample]:
+        """Return the samples that are done, in their order; wait for all of them if asked."""
+        found: list[Sample] = []
+        while self._queue:
+            sample, looked = self._queue[0]
+            if looked is not None:
+                if not (wait or looked.done()):
+                    break
+                result = looked.result()
+                self.refused = ''
+                if isinstance(result, Refusal):
+                    self.refused = result.reason
+                    self.dropped[f'poses: image {result.cause}'] += sample.count
+                else:
+                    found.append(result)
+            else:
+                found.append(sample)
+            self._queue.popleft()
+        return found
+
+    def _begin(self, sample: Sample) -> Future[Sample | Refusal] | None:
+        waiting = [looked for _, looked in self._queue if looked is not None]
+        busy = [looked for looked in waiting if not looked.done()]
+        if len(busy) >= MOST_WAITING:
+            if not self.patient:
+                self.dropped['poses: image while others were looked at'] += sample.count
+                return None
+            busy[0].exception()
+        middle = len(sample.images) // 2
+        kept = [k for k, number in enumerate(sample.images) if number in self._kept]
+        if not kept:
+            self.dropped['poses: image let go, the memory for them was full'] += sample.count
+            return None
+        nearest = min(kept, key=lambda k: abs(k - middle))
+        return self._pool.submit(self._look, self._kept[sample.images[nearest]], sample)
+
+    def _look(self, kept: _Kept, sample: Sample) -> Sample | Refusal:
+        """Return the sample of an image; on a thread of its own."""
+        try:
+            view = self.cameras[kept.topic].look(kept.message())
+            return view if isinstance(view, Refusal) else self._posed(sample, view)
+        except Exception as err:  # damaged bytes fail in many ways
+            return Refusal('that cannot be decoded', f'it cannot be decoded: {err!r}')
+
+    def _posed(self, sample: Sample, view: View) -> Sample | Refusal:
+        """Return a sample with the corners, and the pose of the board that they tell."""
+        index = np.zeros(len(view.pixels), dtype=np.intp)
+        joints = np.repeat(sample.joints[np.newaxis], len(index), axis=0)
+        seen = Observations.from_pixels(joints, view.pixels, view.points, index)
+        try:
+            found = board_poses(seen, view.lens)
+        except InputError:
+            return Refusal('of corners in a line', 'its corners are in a line')
+        pose = se3.transform(found.rotations, found.positions)
+        return replace(
+            sample,
+            images=(),
+            view=view,
+            position=found.positions[0],
+            rotation=found.rotations[0],
+            covariance=self._sigma() ** 2 * uncertainty(seen, pose, view.lens)[0],
+        )

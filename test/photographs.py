@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Boards as a camera sees them, rendered; needs OpenCV."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+
+from calib_ros.files import boards, images
+
+CHARUCO = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_6X6_250')
+SCALE = 5000.0
+"""Pixels of a drawn board per metre."""
+
+
+@cache
+def drawn(board):
+    """Return a board as it is printed, SCALE pixels a metre."""
+    width, height = (round(side * SCALE) for side in board.size)
+    page = np.full((height, width), 255, dtype=np.uint8)
+
+    def black(left, top, size):
+        first, last = np.round([[left, top], [left + size, top + size]]).astype(int)
+        page[first[1] : last[1], first[0] : last[0]] = 0
+
+    side = board.square * SCALE
+    if board.type == 'charuco':
+        for row, column in np.ndindex(board.rows, board.columns):
+            if (row + column) % 2 == 0:
+                black(column * side, row * side, side)
+    for cells, (left, top) in zip(images.marker_cells(board), board.markers * SCALE, strict=True):
+        size = board.marker * SCALE / len(cells)
+        for row, column in np.argwhere(cells):
+            black(left + column * size, top + row * size, size)
+    return page
+
+
+def rendered(board, pose, lens, size, blur=0.7, noise=2.0, finer=4):
+    """Return an image (height, width) of a board at a pose (4, 4) in a camera without distortion.
+
+    Also where its corners are in it [px].
+    """
+    camera = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+    matrix = camera @ np.column_stack([pose[:3, :2], pose[:3, 3]])
+    middle = (finer - 1) / 2
+    larger = np.array([[finer, 0.0, middle], [0.0, finer, middle], [0.0, 0.0, 1.0]])
+    page = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, SCALE]]) / SCALE
+    large = cv2.warpPerspective(
+        drawn(board),
+        larger @ matrix @ page,
+        (finer * size[0], finer * size[1]),
+        flags=cv2.INTER_AREA,
+        borderValue=210,
+    )
+    image = cv2.resize(large, size, interpolation=cv2.INTER_AREA)
+    image = cv2.GaussianBlur(image, (0, 0), blur).astype(float)
+    image += np.random.default_rng(0).normal(size=image.shape) * noise
+    seen = np.column_stack([board.corners[:, :2], np.ones(len(board.corners))]) @ matrix.T
+    return np.clip(image, 0, 255).astype(np.uint8), seen[:, :2] / seen[:, 2:]

@@ -1,0 +1,305 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A camera on the flange before a printed board, live: from images to a calibration."""
+
+import sys
+import threading
+from array import array
+from functools import cache
+
+import numpy as np
+import pytest
+from ros_cell import START, Cell, header, joint_messages, stamp_ns
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from calib_ros.apply.simulation import Camera, before_camera, drive, faulty, photograph
+from calib_ros.apply.simulation import Cell as SimulatedCell
+from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.files.bags import replay
+from calib_ros.files.cameras import cameras_of, lens_in
+from calib_ros.files.images import grey
+from calib_ros.files.recording import Recording
+from calib_ros.files.tables import read_journal
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import dump_yaml, load_chain
+from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling import pictures
+from calib_ros.sampling.intake import Stream, feed, measured
+from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
+from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import parse_sources
+from calib_ros.settings import Settings
+
+cv2 = pytest.importorskip('cv2')
+from photographs import CHARUCO, rendered
+
+LENS = Lens(800.0, 810.0, 322.0, 243.0)
+VIEW = Camera(LENS, 640, 480, depth=0.5)
+STOPS, EACH = 36, 2
+SPOILT = {3: 'blurred', 7: 'with too little of the board'}
+"""Stops whose images cannot be used."""
+
+
+@pytest.fixture(scope='module')
+def truth():
+    rng = np.random.default_rng(4)
+    arm = faulty(load_chain('ur10e'), SimulatedCell(), rng)
+    return before_camera(arm, VIEW, CHARUCO.corners, True, rng)
+
+
+@pytest.fixture(scope='module')
+def shift(truth):
+    """Return joint states, and an image (480, 640) with its stamps for each stop."""
+    rng = np.random.default_rng(5)
+    seen = photograph(truth, VIEW, CHARUCO.corners, True, STOPS, rng)
+    configurations = seen.joints[:: len(CHARUCO.corners)]
+    cell = SimulatedCell(joint_rate=50.0, move=0.4, dwell=0.6, poses_per_dwell=EACH)
+    stamps, joints, image_stamps = drive(configurations, cell, START)
+    poses = se3.invert(truth.forward(configurations))
+    shots = []
+    for k, pose in enumerate(poses):
+        image = rendered(CHARUCO, pose, LENS, (640, 480), blur=6.0 if k == 3 else 0.7, finer=2)[0]
+        if k == 7:
+            image[:, :] = np.roll(image, 320, axis=1)
+            image[:, :560] = 200
+        shots.append(image)
+    recording = Recording(truth.joint_names, stamps, joints, seen, np.zeros(0, bool))
+    return joint_messages(recording), shots, image_stamps.reshape(STOPS, EACH).tolist()
+
+
+@cache
+def packed(data):
+    ok, found = cv2.imencode('.png', np.frombuffer(data, np.uint8).reshape(480, 640))
+    assert ok
+    return found.tobytes()
+
+
+def messages(shift, kind, until=STOPS):
+    """Return messages with their topics, by stamps."""
+    joints, shots, stamps = shift
+    info = CameraInfo(header=header(START, 'camera'), distortion_model='plumb_bob', d=[0.0] * 5)
+    info.k = [LENS.fx, 0.0, LENS.cx, 0.0, LENS.fy, LENS.cy, 0.0, 0.0, 1.0]
+    found = [('cam/camera_info', info), *(('joint_states', each) for each in joints)]
+    for image, times in zip(shots[:until], stamps, strict=False):
+        for stamp in times:
+            head = header(stamp, 'camera')
+            if kind is Image:
+                message = Image(header=head, height=480, width=640, step=640, encoding='mono8')
+                message.data = array('B', image.tobytes())  # bytes are checked one by one
+            else:
+                message = CompressedImage(header=head, format='png')
+                message.data = array('B', packed(image.tobytes()))
+            found.append((TOPICS[kind], message))
+    return sorted(found, key=lambda each: stamp_ns(each[1]))
+
+
+TOPICS = {Image: 'cam/image_raw', CompressedImage: 'cam/image_raw/compressed'}
+
+
+@pytest.fixture(scope='module')
+def board(tmp_path_factory):
+    keys = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary')
+    path = tmp_path_factory.mktemp('board') / 'board.yaml'
+    path.write_text(dump_yaml({key: getattr(CHARUCO, key) for key in keys}))
+    return path
+
+
+def sources(board, kind, more=''):
+    return (f'{TOPICS[kind]} board={board} device=camera eye_in_hand=true{more}',)
+
+
+def rooted(given):
+    return tuple(f'/{each}' for each in given)
+
+
+def streams_of(given):
+    streams = {each.topic: each for each in measured(parse_sources(given), {})}
+    return {**streams, 'joint_states': Stream('joint_states', JOINT_STATE)}
+
+
+def directly(come, given):
+    session = CalibrationSession(load_chain('ur10e'), Settings(sources=given))
+    session.pictures.cameras, session.pictures.patient = cameras_of(given), True
+    streams = streams_of(given)
+    batch = [(streams[topic], message) for topic, message in come]
+    assert feed(session, batch, lambda message, kind: message) == []
+    return session
+
+
+def for_bags(message, types):
+    """Return a message of rclpy as one of rosbags: rclpy's bytes end in what no bag has."""
+    package, kind = type(message).__module__.partition('.')[0], type(message).__name__
+    values = []
+    for name in message.get_fields_and_field_types():
+        value = getattr(message, name)
+        if hasattr(value, 'get_fields_and_field_types'):
+            value = for_bags(value, types)
+        elif isinstance(value, array | np.ndarray):
+            value = np.array(value, dtype=getattr(value, 'typecode', None))
+        values.append(value)
+    return types[f'{package}/msg/{kind}'](*values)
+
+
+def bag_of(path, come):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kinds = dict(zip((*TOPICS, CameraInfo), (*PICTURES, CAMERA_INFO), strict=True))
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        known = {}
+        for topic, message in come:
+            if topic not in known:
+                kind = kinds.get(type(message), JOINT_STATE)
+                known[topic] = writer.add_connection(f'/{topic}', kind, typestore=store)
+            made = for_bags(message, store.types)
+            data = store.serialize_cdr(made, known[topic].msgtype)
+            writer.write(known[topic], stamp_ns(message), data)
+
+
+def assert_same(first, second):
+    for name in ('stamps_ns', 'joints', 'pixels', 'points', 'approach', 'delay'):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+def by_topic(come):
+    found = {}
+    for topic, message in come:
+        found.setdefault(topic, []).append(message)
+    return found
+
+
+def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
+    come, given = messages(shift, Image), sources(board, Image)
+    expected = directly(come, given)
+    wanted = expected.problem().observations
+    replayed = CalibrationSession(load_chain('ur10e'), Settings(sources=rooted(given)))
+    bag_of(tmp_path / 'bag', come)
+    assert replay(tmp_path / 'bag', replayed).warnings == ()
+    assert_same(wanted, replayed.problem().observations)
+    with Cell(chain='ur10e', sources=list(given), data_dir=str(tmp_path)) as cell:
+        played = by_topic(come)
+        live = cell.node.session
+        live.pictures.patient = True  # played faster than any arm moves
+        info = cell.publisher(CameraInfo, 'cam/camera_info')
+        info.publish(played.pop('cam/camera_info')[0])
+        camera = live.pictures.cameras[TOPICS[Image]]
+        cell.spin_until(lambda: not isinstance(camera._lens, Refusal))
+        cell.play(played)
+        answer = cell.call('identify')
+        assert_same(wanted, live.problem().observations)
+        assert live.account().dropped == expected.account().dropped
+        assert live.account().unused == expected.account().unused
+        assert answer.success, cell.in_full(answer)
+        found = live.calibration.chain
+    assert wanted.on_flange
+    assert len(live.samples) == STOPS - len(SPOILT)
+    dropped = {f'poses: image {cause}': 1 for cause in SPOILT.values()}
+    assert live.account().dropped == dropped
+    away = found.forward(wanted.joints) - truth.forward(wanted.joints)
+    assert 1e3 * np.abs(away[:, :3, 3]).max() < 0.2
+    (journal,) = tmp_path.glob('*.csv')
+    kept, _ = read_journal(journal, 6)
+    assert_same(wanted, live.problem_of(kept).observations)
+
+
+def test_compressed_images_of_a_bag_and_of_messages(tmp_path, shift, board):
+    raw = directly(messages(shift, Image, 8), sources(board, Image)).problem().observations
+    come, given = messages(shift, CompressedImage, 8), sources(board, CompressedImage)
+    assert_same(raw, directly(come, given).problem().observations)
+    replayed = CalibrationSession(load_chain('ur10e'), Settings(sources=rooted(given)))
+    bag_of(tmp_path / 'bag', come)
+    replay(tmp_path / 'bag', replayed)
+    assert_same(raw, replayed.problem().observations)
+
+
+class Slow:
+    """A camera that looks until it may go on."""
+
+    def __init__(self):
+        self.go_on = threading.Event()
+
+    def look(self, message):
+        assert self.go_on.wait(20.0)
+        return Refusal('blurred', 'it is blurred')
+
+
+def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_nothing(shift, board):
+    given = sources(board, Image)
+    session = CalibrationSession(load_chain('ur10e'), Settings(sources=given))
+    camera = Slow()
+    session.pictures.cameras = {TOPICS[Image]: camera}
+    come = [each for each in messages(shift, Image) if not isinstance(each[1], CameraInfo)]
+    batch = [(streams_of(given)[topic], message) for topic, message in come]
+    assert feed(session, batch, lambda message, kind: message) == []
+    assert session.account().joint_states == len(shift[0])  # none has waited
+    assert session.account().dropped['poses: image while others were looked at'] > STOPS // 2
+    camera.go_on.set()
+    session.finish()
+    assert session.account().dropped['poses: image blurred'] >= pictures.MOST_WAITING
+    assert 'the last image is not used: it is blurred' in session.status()
+
+
+def test_memory_for_images_is_bounded(monkeypatch):
+    monkeypatch.setattr(pictures, 'MOST_BYTES', 1000)
+    kept = pictures.Pictures(lambda: 0.3)
+    for _ in range(50):
+        newest = kept.keep('image', 100, lambda: None)
+    assert newest in kept._kept
+    assert 4 < len(kept._kept) <= 10
+    assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        ({'k': [0.0] * 9}, 'not calibrated'),
+        ({'binning_x': 2}, 'without roi and binning'),
+        ({'distortion_model': 'equidistant'}, 'must be plumb_bob'),
+        ({'d': [0.0] * 5 + [0.1] * 3}, 'only k1 k2 p1 p2 k3'),
+    ],
+)
+def test_a_camera_info_that_cannot_be_used(change, said):
+    info = CameraInfo(distortion_model='plumb_bob', d=[0.1, 0.2, 0.3, 0.4, 0.5])
+    info.k = [800.0, 0.0, 322.0, 0.0, 810.0, 243.0, 0.0, 0.0, 1.0]
+    lens = lens_in(info)
+    assert (lens.fx, lens.cy, lens.k1, lens.k3) == (800.0, 243.0, 0.1, 0.5)
+    for name, value in change.items():
+        setattr(info, name, value)
+    with pytest.raises(ConfigError, match=said):
+        lens_in(info)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('cam/image_raw type=Image', 'needs board=FILE'),
+        ('cam/pose type=PoseStamped board=x.yaml', 'needs board=FILE'),
+        ('cam/image_raw board=x.yaml lens=thick', 'unknown lens'),
+        ('cam/image_raw board=/nowhere.yaml', 'nowhere.yaml'),
+        ('cam/image_rect board=BOARD', 'before it is rectified'),
+    ],
+)
+def test_a_source_of_images_that_cannot_be(board, text, said):
+    with pytest.raises(CalibrationError, match=said):
+        cameras_of([text.replace('BOARD', str(board))])
+
+
+def test_what_images_need_is_told(monkeypatch, board):
+    with pytest.raises(ConfigError, match='mode must not be continuous'):
+        CalibrationSession(
+            load_chain('ur10e'), Settings(mode='continuous', sources=sources(board, Image))
+        )
+    monkeypatch.setitem(sys.modules, 'cv2', None)
+    with pytest.raises(ConfigError, match='photographs need OpenCV: sudo apt install'):
+        cameras_of(sources(board, Image))
+
+
+def test_bayer_patterns_become_grey():
+    rng = np.random.default_rng(0)
+    colours = rng.integers(0, 255, 3)
+    for encoding, places in (('bayer_rggb8', 'rggb'), ('bayer_gbrg8', 'gbrg')):
+        tile = np.array([colours['rgb'.index(each)] for each in places], np.uint8).reshape(2, 2)
+        image = np.tile(tile, (8, 8))
+        found = grey(image.ravel(), 16, 16, 16, encoding)[4:-4, 4:-4]
+        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0
