@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import zipfile
 from concurrent.futures import ProcessPoolExecutor
 from datetime import timedelta
 from itertools import product
@@ -62,12 +63,27 @@ def bumps_of(serials, nights, number, rng):
     return found
 
 
-def nights_part(folder, robots, nights, number, workers):
+def archived(plant):
+    """Put the tables of a plant into an archive, from which workers fetch them by its URL."""
+    place = plant.parent / 'nights.zip'
+    with zipfile.ZipFile(place, 'w') as archive:
+        for path in (plant.parent / 'nights').rglob('*.csv'):
+            archive.write(path, path.relative_to(plant.parent))
+    content = json.loads(plant.read_text())
+    for robot in content['robots']:
+        robot['measured'] = f'zip://{robot["measured"]}::file://{place}'
+    plant.write_text(json.dumps(content))
+
+
+def nights_part(folder, robots, nights, number, cluster):
     """Return what two runs over a plant find and take."""
     serials = [f'R{k:03}' for k in range(robots)]
     bumps = bumps_of(serials, nights, number, np.random.default_rng(1))
-    plant = read_plant(plants.write_plant(folder, serials, nights, POSES, bumps))
-    history, out, cluster = History(folder / 'history'), folder / 'report', Cluster('', workers)
+    written = plants.write_plant(folder, serials, nights, POSES, bumps)
+    if cluster.address:
+        archived(written)
+    plant = read_plant(written)
+    history, out = History(folder / 'history'), folder / 'report'
     spans, parts = [], {}
     for name in ('first', 'second'):
         begin = time.monotonic()
@@ -225,12 +241,17 @@ def main():
     parser.add_argument('--part', choices=('nights', 'workers', 'scheduler', 'kills'))
     parser.add_argument('--robots', type=int, help='for the nights')
     parser.add_argument('--workers', type=int, default=0, help='for the nights')
+    parser.add_argument('--scheduler', default='', help='for the nights, from an archive by URL')
     options = parser.parse_args()
     quick = options.quick
     robots, nights, bumped = (10, 8, 2) if quick else (200, 30, 5)
     parts = {
         'nights': lambda folder: nights_part(
-            folder, options.robots or robots, nights, bumped, options.workers
+            folder,
+            options.robots or robots,
+            nights,
+            bumped,
+            Cluster(options.scheduler, options.workers),
         ),
         'workers': lambda folder: workers_part(
             folder, 4 if quick else 8, 12_000, 1 if quick else 5

@@ -30,23 +30,33 @@ from calib_ros.kinematics.chain_file import load_chain
 SIGMA = 0.3
 POINTS = np.array([(0.03 * i, 0.03 * j, 0.0) for j in range(5) for i in range(8)])
 CASES = {
-    'camera on the flange, intrinsics given': (True, True),
-    'camera on the flange, intrinsics fitted': (True, False),
-    'camera fixed, intrinsics given': (False, True),
-    'camera fixed, intrinsics fitted': (False, False),
+    f'camera {where}, intrinsics {lens}': (where != 'fixed', lens)
+    for where in ('on the flange', 'fixed')
+    for lens in ('given', 'prior', 'fitted')
 }
 OFF = {'fx': 8.0, 'fy': -6.0, 'cx': 5.0, 'cy': -7.0, 'k1': 0.02, 'k2': -0.03}
 """By how much intrinsics are wrong before they are fitted."""
+PRIOR = {'fx': 3.0, 'fy': 3.0, 'cx': 3.0, 'cy': 3.0, 'k1': 0.01, 'k2': 0.02, 'p1': 1e-3}
+PRIOR |= {'p2': 1e-3, 'k3': 0.02}
+"""Standard deviations by which they are wrong where a prior holds them."""
 
 
-def scene(nominal, seed, on_flange, given, images):
-    """Return the true chain, the nominal one with its lens, what was seen, and other joints."""
+def scene(nominal, seed, on_flange, kind, images):
+    """Return the true chain, the nominal one with its lens, what was seen, and other joints.
+
+    The lens is `given`, `fitted` from OFF on, or off by a PRIOR.
+    """
     rng = np.random.default_rng(seed)
     camera = Camera()
     true = before_camera(faulty(nominal, Cell(), rng), camera, POINTS, on_flange, rng)
     seen = photograph(true, camera, POINTS, on_flange, images, rng, SIGMA)
     other = photograph(true, camera, POINTS[:1], on_flange, 50, rng).joints
-    lens = camera.lens if given else replace(camera.lens.moved(OFF), fixed=False)
+    off = {
+        'given': {},
+        'fitted': OFF,
+        'prior': {name: s * rng.normal() for name, s in PRIOR.items()},
+    }
+    lens = replace(camera.lens.moved(off[kind]), fixed=kind == 'given')
     frame = Frame(lens=lens)
     known = replace(nominal, tool=frame) if on_flange else replace(nominal, base=frame)
     return true, known, seen, other
@@ -58,10 +68,14 @@ def error_of(chain, true, joints):
     return 1e3 * float(np.sqrt((away**2).sum(axis=1).mean()))
 
 
-def one_run(nominal, seed, on_flange, given, images):
+def one_run(nominal, seed, on_flange, lens, images):
     """Return squared deviation / bound (P,), hits (P,), errors [mm] by pixels and by poses."""
-    true, known, seen, other = scene(nominal, seed, on_flange, given, images)
-    problem = Problem(known, seen, held_out=seen.select(np.arange(80)), sigma_pixel=SIGMA)
+    true, known, seen, other = scene(nominal, seed, on_flange, lens, images)
+    frame = 'tool' if on_flange else 'base'
+    priors = {f'{frame}.{kind}': sigma for kind, sigma in PRIOR.items() if lens == 'prior'}
+    problem = Problem(
+        known, seen, held_out=seen.select(np.arange(80)), sigma_pixel=SIGMA, priors=priors
+    )
     result = identify(problem)
     bound = identifiability.covariance(
         triangular_factor(true, result.names, problem.system([seen]))
@@ -69,8 +83,7 @@ def one_run(nominal, seed, on_flange, given, images):
     deviation = np.array([result.chain.offset(name, true) for name in result.names])
     width = {p.name: p.half_width() for p in result.parameters if p.std is not None}
     hits = np.abs(deviation) <= [width[name] for name in result.names]
-    frame = known.tool if on_flange else known.base
-    poses = board_poses(seen, frame.lens)
+    poses = board_poses(seen, known.frame(frame).lens)
     by_poses = identify(Problem(known, poses, held_out=poses.select(np.arange(2))))
     errors = error_of(result.chain, true, other), error_of(by_poses.chain, true, other)
     return deviation**2 / np.diag(bound), hits, errors
@@ -78,14 +91,14 @@ def one_run(nominal, seed, on_flange, given, images):
 
 def speed(nominal):
     """Print how long 500 images of 40 corners take."""
-    for given in (True, False):
-        _, known, seen, _ = scene(nominal, 0, True, given, 500)
+    for lens in ('given', 'fitted'):
+        _, known, seen, _ = scene(nominal, 0, True, lens, 500)
         taken = []
         for _ in range(5):
             begin = time.process_time()
             identify(Problem(known, seen, sigma_pixel=SIGMA))
             taken.append(time.process_time() - begin)
-        print(f'500 images, intrinsics {"given" if given else "fitted"}: {min(taken):.3f} s (CPU)')
+        print(f'500 images, intrinsics {lens}: {min(taken):.3f} s (CPU)')
 
 
 def main():

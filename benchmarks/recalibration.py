@@ -4,11 +4,13 @@
 
 A simulated UR10e is calibrated from 60 random poses (noise 0.05 mm, 0.2 mrad). Then a joint's
 zero slips by 0.5 mrad (`zero`), a link is bent (`bent`: a, alpha, d and beta of a joint, some
-tenths of a millimetre and of a milliradian), or nothing happens (`none`), and 8 poses, the same
-for all arms, chosen before by `plan`, are measured.
+tenths of a millimetre and of a milliradian), or nothing happens (`none`), and 8 poses (--poses),
+the same for all arms, chosen before by `plan`, are measured.
 
 - `ratio`: RMS error over the joint range, in the best frames, of the arm brought up to date over
   that of a full calibration from 60 new poses
+- `bound`: the least ratio of any unbiased estimate (Cramer, Rao) that is told which joint it was
+  and uses the earlier calibration
 - `named`: share of the arms whose joint is among those named
 - `alone`: share of the arms of which only the right joint is named
 - `claimed`: share of the unchanged arms of which a change is claimed
@@ -30,23 +32,25 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import Columns
 from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
 BENT = {'a': 3e-4, 'alpha': 5e-4, 'd': 3e-4, 'beta': 5e-4}
-FEW, MANY = 8, 60
+MANY = 60
 SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 
 
-def few_poses():
-    """Return poses (8, n) that tell of changes of an arm that is known but for these."""
+def few_poses(count):
+    """Return poses (count, n) that tell of changes of an arm that is known but for these."""
     nominal = replace(UR, tool=faulty(UR, Cell(), np.random.default_rng(1)).tool)
     rng = np.random.default_rng(0)
     priors = {'*.a': 1e-3, '*.d': 1e-3, '*.theta': 2e-3, '*.alpha': 2e-3, '*.beta': 2e-3}
@@ -56,7 +60,7 @@ def few_poses():
     design = Design.of(problem)
     candidates = draw_candidates(design, 500, rng, Visibility())
     task = UR.random_joints(100, rng)
-    return plan(design, candidates, task, FEW, criterion='task').joints
+    return plan(design, candidates, task, count, criterion='task').joints
 
 
 def changed(true, kind, rng):
@@ -78,6 +82,42 @@ def error(chain, true):
     fit = minimise(chain, names, System((Samples(wanted, 1e-4, 1e-3),))).chain
     left = fit.forward(joints)[:, :3, 3] - wanted.positions
     return 1e3 * float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def bound(few, kind):
+    """Return the least error by few poses (K, n) and the joint's name, over that by many."""
+    rng = np.random.default_rng(0)
+    chain = faulty(UR, Cell(), rng)
+    frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
+    names = Calibration.of(identify(problem_of(chain, UR.random_joints(MANY, rng), rng))).names
+    rest = [k for k, name in enumerate(names) if name not in frames]
+    weights = 1.0 / np.repeat(NOISE, 3)[:, np.newaxis]
+
+    def information(joints):
+        flat = (weights * ErrorModel(chain, names).jacobian(joints)).reshape(-1, len(names))
+        return flat.T @ flat
+
+    flat = ErrorModel(chain, [*frames, *(names[k] for k in rest)]).jacobian(
+        UR.random_joints(300, np.random.default_rng(99))
+    )[:, :3]
+    flat = flat.reshape(-1, flat.shape[2])
+    basis = np.linalg.qr(flat[:, : len(frames)])[0]
+    seen = flat[:, len(frames) :] - basis @ (basis.T @ flat[:, len(frames) :])
+
+    def mean_square(matrix):
+        return np.trace(seen @ np.linalg.inv(matrix)[np.ix_(rest, rest)] @ seen.T)
+
+    columns = Columns(chain, tuple(map(Parameter, names)))
+    ratios = []
+    for _ in range(20):
+        many = information(UR.random_joints(MANY, rng))
+        for joint in UR.joint_names[: 6 if kind == 'zero' else 5]:
+            sets = [own for owner, own in columns.sets if owner == joint]
+            own = columns.of(sets[-1] if kind == 'bent' else sets[0])
+            shown = many @ own
+            kept = many - shown @ np.linalg.solve(own.T @ shown, shown.T)  # of the rest
+            ratios.append(mean_square(kept + information(few)) / mean_square(many))
+    return float(np.sqrt(np.mean(ratios)))
 
 
 def problem_of(true, joints, rng):
@@ -106,13 +146,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--quick', action='store_true', help='fewer arms')
     parser.add_argument('--json', action='store_true', help='print the figures as JSON')
+    parser.add_argument('--poses', type=int, default=8, help='after the collision')
     options = parser.parse_args()
     counts = (
         {'zero': 20, 'bent': 20, 'none': 40}
         if options.quick
         else {'zero': 200, 'bent': 200, 'none': 500}
     )
-    few = few_poses()
+    few = few_poses(options.poses)
     figures = {}
     for kind, count in counts.items():
         rows = [trial(kind, seed, few) for seed in range(count)]
@@ -130,6 +171,7 @@ def main():
             'alone': mean['alone'],
             'accepted': mean['accepted'],
             'ratio': rms['few'] / rms['full'],
+            'bound': bound(few, kind),
             **{f'{key}_mm': value for key, value in rms.items()},
         }
     if options.json:

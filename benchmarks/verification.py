@@ -8,7 +8,8 @@ Every limit is one-sided at 95 %: the share of draws in which the upper (lower) 
 (below) the truth should be 0.95 or a little more.
 
 Drawn: errors of Gaussian noise alone, and those that a geometric calibration leaves of arms with
-compliance or eccentricities, 5 to 100 at a time, against 20,000 of the same arm (six arms each).
+compliance or eccentricities, 5 to 100 at a time, against 20,000 of the same arm (six arms each);
+`places`: noise times the size of a normal variable, another one at each place.
 
 Measured robots: 5, 10 and 20 of the held-out poses, drawn at random, against all of them.
 
@@ -83,6 +84,8 @@ def drawn(kind, draws):
     rows = {}
     rng = np.random.default_rng(2)
     arms = [left_behind(kind, seed) for seed in range(6)]
+    if kind == 'places':
+        arms = [rng.normal(size=(20_000, 1)) * each for each in arms]
     for count in (5, 10, 20, 40, 100):
         held = []
         for errors in arms:
@@ -153,7 +156,7 @@ def main():
     parser.add_argument('--json', action='store_true')
     options = parser.parse_args()
     table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 200)}
-    for kind in ('noise', 'compliance', 'eccentricity'):
+    for kind in ('noise', 'compliance', 'eccentricity', 'places'):
         table[f'drawn, {kind}'] = drawn(kind, 600 if options.quick else 12_000)
     for name, session in SETS:
         if DATA.is_dir():

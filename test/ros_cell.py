@@ -59,7 +59,8 @@ from calib_ros.settings import Settings
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-node_module.TAKING_PERIOD = 0.005
+node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
+node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
 node_module.JOIN_TIMEOUT = 60.0  # what was begun ends, however busy the machine is
 BURST_NS = 370_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
@@ -136,6 +137,12 @@ class Cell:
         future = self.start_call(name, request, node)
         self.spin_until(future.done)
         return future.result()
+
+    def in_full(self, answer):
+        """Return an answer of ~/identify in full: what stands beside the journal if it was cut."""
+        _, cut, name = answer.message.partition(' ... all of it: ')
+        folder = self.node._archive.folder
+        return (folder / name).read_text().rstrip() if cut else answer.message
 
     def set_parameters(self, values, node='/calibration_node'):
         """Set parameters of a node; return the results that the client receives."""

@@ -31,7 +31,6 @@ SLOPES = (0.5, 2.0)
 """References k: shifts of one and of four standard deviations show soonest."""
 STEPS = 200
 """Of the Markov chain; more change the run length by less than a hundredth (test_chart.py)."""
-DAYS = 365.25
 
 
 @dataclass(frozen=True)
@@ -43,6 +42,8 @@ class Drift:
     scores : (N,)
         How large each night's error is against those before, as a normal variable; NaN in the
         first night and in the first after an alarm.
+    sums : (N, 2)
+        Of both charts, as shares of their heights: beyond 1 is an alarm.
     alarms : tuple of int
         Nights in which it is too large.
     since : tuple of int
@@ -51,6 +52,7 @@ class Drift:
     """
 
     scores: FloatArray
+    sums: FloatArray
     alarms: tuple[int, ...]
     since: tuple[int, ...]
 
@@ -63,7 +65,7 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) 
     rms : (N,)
         Errors of the nights, in any unit.
     freedom : (N,)
-        Their degrees of freedom, as of `confidence.freedom_of` times the configurations.
+        Their degrees of freedom, as of `Verification.freedom`.
     years : float
         Between two false alarms of one robot, on average, with a night each day.
 
@@ -76,8 +78,8 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) 
     errors, nus = np.asarray(rms, dtype=float), np.asarray(freedom, dtype=float)
     if errors.shape != nus.shape or not (np.isfinite(errors) & (errors > 0.0) & (nus > 0.0)).all():
         raise InputError('errors and degrees of freedom of nights must be as many, and positive')
-    limits = [limit(slope, len(SLOPES) * years * DAYS) for slope in SLOPES]
-    scores = np.full(len(errors), np.nan)
+    limits = [limit(slope, len(SLOPES) * years * 365.25) for slope in SLOPES]
+    scores, shares = np.full(len(errors), np.nan), np.zeros((len(errors), len(SLOPES)))
     alarms, since = [], []
     squares = known = 0.0
     sums, starts = np.zeros(len(SLOPES)), np.zeros(len(SLOPES), dtype=int)
@@ -88,13 +90,14 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) 
             scores[night] = -special.ndtri(chance)
             starts = np.where(sums > 0.0, starts, night)
             sums = np.maximum(0.0, sums + scores[night] - np.array(SLOPES))
-            if (sums > limits).any():
+            shares[night] = sums / limits
+            if (shares[night] > 1.0).any():
                 alarms.append(night)
-                since.append(int(starts[np.argmax(sums / limits)]))
+                since.append(int(starts[np.argmax(shares[night])]))
                 squares = known = 0.0
                 sums[:] = 0.0
         squares, known = squares + nu * error**2, known + nu
-    return Drift(scores, tuple(alarms), tuple(since))
+    return Drift(scores, shares, tuple(alarms), tuple(since))
 
 
 def run_length(slope: float, height: float) -> float:

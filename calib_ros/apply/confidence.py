@@ -5,14 +5,15 @@
 Of K configurations with errors e_k the sum of squares is taken for theta / nu chi2(nu)
 (Satterthwaite 1946) with
 
-    S = mean of e_k e_k^T        nu = K min((tr S)^2 / tr S^2, 2 / c^2)
+    S = mean of e_k e_k^T        g = 2 tr S^2 / (tr S)^2        nu = 2 K / max(g, c^2)
 
-between K (all errors in one direction) and 3 K (in all directions alike), and fewer where the
-errors are larger at some places than at others, as compliance and eccentricities leave them: c^2
-is the variance of the squared errors over the square of their mean, taken together with that of
-POOLED errors in one direction (2), and larger by its own standard deviation. Few configurations
-make nu too small rather than too large. Measurements of one configuration share its error and
-count for one. Limits are one-sided, each at the confidence wanted.
+between K (g = 2: all errors in one direction) and 3 K (in all directions alike) for Gaussian
+errors of one size, and fewer where the errors are larger at some places than at others, as
+compliance and eccentricities leave them: c^2 is the variance of the squared errors over the square
+of their mean, taken together with g for one configuration more, and larger by SAFETY of its
+standard deviations, for few configurations rarely show the worst places. Measurements of one
+configuration share its error and count for one. Limits are one-sided, each at the confidence
+wanted.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from scipy import special
 
 from calib_ros.kinematics.se3 import FloatArray
 
-POOLED = 2
-"""Configurations with errors in one direction that the scatter of the squares is pooled with."""
+SAFETY = 4.0
+"""So many make limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
 
 
 def rms_limits(
@@ -46,8 +47,7 @@ def rms_interval(
     `group` (N,) are the configurations, of which each counts for one. With a single one nothing
     is known: (0, inf).
     """
-    _, place = np.unique(group, return_inverse=True)
-    moments = moments_of(errors, place)
+    moments = moments_of(errors, np.unique(group, return_inverse=True)[1])
     if len(moments) < 2:
         return 0.0, np.inf
     rms = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
@@ -62,10 +62,11 @@ def freedom_of(moments: FloatArray) -> float:
     """Return the degrees of freedom of one of the configurations with moments (K, 3, 3)."""
     spread, count = moments.mean(axis=0), len(moments)
     squares = np.trace(moments, axis1=1, axis2=2)
+    normal = 2.0 * np.trace(spread @ spread) / np.trace(spread) ** 2
     scatter = squares.var(ddof=1) / squares.mean() ** 2
-    scatter = ((count - 1) * scatter + 2.0 * POOLED) / (count - 1 + POOLED)
-    scatter *= 1.0 + np.sqrt(scatter / count)
-    return float(min(np.trace(spread) ** 2 / np.trace(spread @ spread), 2.0 / scatter))
+    scatter = ((count - 1) * scatter + normal) / count
+    scatter *= 1.0 + SAFETY * np.sqrt(scatter / count)
+    return float(2.0 / max(normal, scatter))
 
 
 def moments_of(errors: FloatArray, group: NDArray[np.intp]) -> FloatArray:

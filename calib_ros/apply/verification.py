@@ -97,6 +97,8 @@ class Verification(Shown):
         The configuration that each measurement belongs to; `configurations` counts them.
     rms, lower, upper : float
         RMS position error [m] over poses like these, and its limits.
+    freedom : float
+        Degrees of freedom of that error.
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
@@ -119,6 +121,7 @@ class Verification(Shown):
     rms: float
     lower: float
     upper: float
+    freedom: float
     verdict: Verdict
     needed: int | None
     common: float
@@ -186,12 +189,15 @@ def verify(
     lost = sum(LOST[frame] for frame in fitted)
     rms = _rms(moments, lost)
     numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
-    lower, upper = rms_limits(rms, freedom_of(moments) * (numbers - lost), confidence)
+    freedom = freedom_of(moments) * (numbers - lost)
+    lower, upper = rms_limits(rms, freedom, confidence)
     verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
-    found = (rms, float(lower[0]), float(upper[0]), *verdict, common)
+    limits = (float(lower[0]), float(upper[0]), float(freedom[0]))
     known = (commanded is not None, fitted, arm.holds(rms))
-    return Verification(comparison, tolerance, confidence, group, *found, *known)
+    return Verification(
+        comparison, tolerance, confidence, group, rms, *limits, *verdict, common, *known
+    )
 
 
 def _compared(

@@ -184,6 +184,15 @@ class Archive:
             write_files(partial, files)
         return folder
 
+    def note(self, text: str) -> Path | None:
+        """Write what came of the last identification beside the journal; return its path."""
+        path = self._path.with_suffix('.identified.txt')
+        try:
+            write_file(path, f'{text}\n', overwrite=True)
+        except OSError:
+            return None
+        return path
+
     def close(self) -> None:
         """Write what can be written, and close the journal."""
         self.write()

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import io
 import secrets
-from collections.abc import Sequence
 from dataclasses import fields
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
@@ -54,7 +52,7 @@ class History:
             self._files, self._root = url_to_fs(str(place))
         except (ImportError, ValueError) as err:
             raise ConfigError(f'a history cannot be at {place}: {err}') from err
-        self._local = 'file' in _protocols(self._files)
+        self._local = is_local(self._files)
 
     def file(self, row: Row) -> bool:
         """Add a row; return False where it was there already."""
@@ -115,6 +113,8 @@ class History:
             return [str(each) for each in self._files.ls(folder, detail=False, refresh=True)]
         except FileNotFoundError:
             return []
+        except OSError as err:
+            raise InputError(f'the history {folder} cannot be read: {err}') from err
 
     def _read(self, serial: str, key: str) -> Any:
         import pyarrow.parquet as parquet
@@ -169,9 +169,9 @@ class History:
             return
 
 
-def _protocols(files: Any) -> tuple[str, ...]:
-    known = files.protocol
-    return (known,) if isinstance(known, str) else tuple(known)
+def is_local(files: Any) -> bool:
+    """Tell whether a file system of fsspec is that of this machine."""
+    return 'file' in ((files.protocol,) if isinstance(files.protocol, str) else files.protocol)
 
 
 @cache
@@ -219,26 +219,20 @@ def _conformed(table: Any, key: str) -> Any:
 
 def _rows_of(table: Any) -> list[Row]:
     """Return the rows of a table."""
-    columns: dict[str, Sequence[Any]] = {}
-    for each in fields(Row):
-        column = table.column(each.name).combine_chunks()
-        kind = str(each.type)
-        if kind == 'FloatArray':
-            ends = np.asarray(column.offsets)
-            values = np.asarray(column.values)
-            columns[each.name] = [values[a:b].copy() for a, b in pairwise(ends)]
-        elif kind.startswith('tuple'):
-            columns[each.name] = [tuple(value or ()) for value in column.to_pylist()]
-        else:
-            columns[each.name] = column.to_pylist()
     rows = []
-    for values_of in zip(*columns.values(), strict=True):
-        record = dict(zip(columns, values_of, strict=True))
+    for record in table.drop_columns(['key']).to_pylist():
+        for each in fields(Row):
+            value = record[each.name]
+            if str(each.type) == 'FloatArray':
+                record[each.name] = np.array(value or (), dtype=float)
+            elif str(each.type).startswith('tuple'):
+                record[each.name] = tuple(value or ())
         size = len(record['names'])
-        if record['covariance'].size != size * size:
+        square = record['covariance']
+        if square.size != size * size or not np.isfinite(square).all():
             raise InputError(
-                f'the covariance of {record["serial"]} in the history has no {size} rows'
+                f'the covariance of {record["serial"]} in the history is not one of {size} names'
             )
-        record['covariance'] = record['covariance'].reshape(size, size)
+        record['covariance'] = square.reshape(size, size)
         rows.append(Row(**record))
     return rows

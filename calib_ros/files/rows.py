@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime, timezone
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -25,11 +26,10 @@ from calib_ros.kinematics.chain_file import chain_document, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
-from calib_ros.values import parse_name
+from calib_ros.values import LONGEST_NAME, parse_name
 
 EPOCH_NS = 10**17
 """Stamps from which on they are times of this century."""
-NONE = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,16 @@ class Filing:
 
     def __post_init__(self) -> None:
         """Refuse a serial number that cannot name a folder."""
-        if not parse_name(self.serial, 'the serial number'):
-            raise ConfigError(
-                'give the serial number of the robot (--serial): rows are filed by it'
-            )
+        parse_serial(self.serial, 'the serial number')
+
+
+def parse_serial(value: object, where: str) -> str:
+    """Return a serial number that can name a folder; `where` names it in the error."""
+    if not isinstance(value, str) or value in ('', '.', '..'):
+        raise ConfigError(f'{where} must be text ("0042" in quotes), not {value!r}')
+    if len(quote(parse_name(value, where), safe='')) > LONGEST_NAME:
+        raise ConfigError(f'{where} is too long to name a folder: {value}')
+    return value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,16 +89,17 @@ class Row(Shown):
     mean_mm: float | None = None
     max_mm: float | None = None
     rms_mrad: float | None = None
+    rms_freedom: float | None = None
     freedom: float | None = None
     names: tuple[str, ...] = ()
-    offsets: FloatArray = field(default_factory=NONE.copy)
-    covariance: FloatArray = field(default_factory=NONE.copy)
+    offsets: FloatArray = field(default_factory=lambda: np.zeros(0))
+    covariance: FloatArray = field(default_factory=lambda: np.zeros(0))
     chain: str = ''
 
     @property
     def key(self) -> str:
         """Return the name of the result: the same for the same work."""
-        return key_of(self.serial, self.kind, self.inputs, self.settings, self.software)
+        return digest([self.serial, self.kind, self.inputs, self.settings, self.software])
 
     @property
     def accepted(self) -> bool:
@@ -102,11 +109,6 @@ class Row(Shown):
     def corrected(self) -> Chain:
         """Return the corrected chain with its frames."""
         return parse_chain(self.chain, f'the chain of {self.serial} in the history')
-
-
-def key_of(serial: str, kind: str, inputs: str, settings: str, software: str = '') -> str:
-    """Return the name of a piece of work by what it was done from."""
-    return digest([serial, kind, inputs, settings, software or calib_ros.__version__])
 
 
 def digest(content: object) -> str:
@@ -178,6 +180,7 @@ def verified(chain: Chain, found: Verification, about: Filing) -> Row:
         **_common(about, 'verify', chain),
         verdict=found.verdict,
         **_figures(*compared.figures, (found.lower, found.upper)),
+        rms_freedom=found.freedom,
     )
 
 

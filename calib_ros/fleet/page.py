@@ -22,6 +22,7 @@ MOST_ROBOTS, MOST_NIGHTS = 1000, 100
 """Robots, the worst ones, and nights of each, that the page shows; the history has all."""
 LOOKS: dict[State, Mark] = {
     'changed': 'bad',
+    'worse': 'bad',
     'unreadable': 'bad',
     'refused': 'open',
     'beyond tolerance': 'open',
@@ -56,7 +57,7 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
         counts={state: number for state, number in counts(found).items() if number},
         meaning=MEANING,
         total=len(found),
-        changed=[each for each in shown if each.watched.changes],
+        alarmed=[each for each in shown if each.alarms],
         unreadable=[each for each in shown if each.errors],
         rows=[(each, _link(out, each)) for each in shown],
         done=done,
@@ -79,6 +80,7 @@ def _chart(standing: Standing) -> dict[str, Any]:
     """Return the nights of a robot: errors, and how strongly each joint seems changed."""
     nights = standing.watched.nights[-MOST_NIGHTS:]
     joints = list(nights[0].strength) if nights else []
+    verified = standing.verified[-MOST_NIGHTS:]
     return {
         'serial': standing.robot.serial,
         'tolerance': standing.robot.tolerance,
@@ -87,6 +89,11 @@ def _chart(standing: Standing) -> dict[str, Any]:
         'changes': [
             change.time.isoformat(timespec='seconds') for change in standing.watched.changes
         ],
+        'verified': {
+            'time': [row.time.isoformat(timespec='seconds') for row in verified],
+            'rms': [row.rms_mm for row in verified],
+            'sums': standing.drift.sums[-MOST_NIGHTS:].round(3).T.tolist(),
+        },
         'joints': {
             joint: [round(night.strength[joint], 2) for night in nights] for joint in joints
         },

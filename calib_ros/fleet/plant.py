@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.files.rows import settings_hash
+from calib_ros.files.rows import parse_serial, settings_hash
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import LONGEST_ENTRY, Settings
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import parse_name, parse_number
+from calib_ros.values import parse_number
 
 COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
 """What a group says for its robots, and a robot for itself."""
@@ -26,6 +26,7 @@ KEYS = {
     'a group': COMMON,
     'a robot': ('serial', 'group', 'measured', 'since', *COMMON),
     'measured': ('files', 'session'),
+    'settings': tuple(each.name for each in fields(Settings)),
 }
 
 
@@ -53,6 +54,10 @@ class Robot:
     largest_loss: float = 0.1
     since: datetime | None = None
 
+    def compares(self, time: datetime) -> bool:
+        """Tell whether what was measured at a time is compared with what came later."""
+        return self.since is None or time >= self.since
+
     @cached_property
     def settings_hash(self) -> str:
         """Return the hash of what a result depends on besides the measurements."""
@@ -79,8 +84,10 @@ def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Rob
     groups = content.get('groups') or {}
     if not isinstance(groups, dict):
         raise ConfigError(f'{where}: groups must be a mapping of names, not {groups!r}')
-    for name, values in groups.items():
-        _mapping(values, 'a group', f'{where}: group {name}')
+    groups = {
+        str(name): _mapping(values, 'a group', f'{where}: group {name}')
+        for name, values in groups.items()
+    }
     rows = content.get('robots')
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: robots must be a list, each with serial, chain and measured')
@@ -105,19 +112,21 @@ def _robot(
     chains: dict[str, Chain],
 ) -> Robot:
     own = _mapping(row, 'a robot', where)
-    serial = own.get('serial')
-    if not isinstance(serial, str) or not parse_name(serial, f'{where}: serial'):
-        raise ConfigError(f'{where}: serial must be text ("0042" in quotes), not {serial!r}')
+    serial = parse_serial(own.get('serial'), f'{where}: serial')
     where = f'{where} ({serial})'
     group = own.get('group')
-    if group is not None and group not in groups:
-        raise UnknownNameError(f'group in {where}', str(group), map(str, groups))
-    shared = {} if group is None else groups[group]
+    if group is not None and str(group) not in groups:
+        raise UnknownNameError(f'group in {where}', str(group), groups)
+    shared = {} if group is None else groups[str(group)]
     given = {**shared, **own}
-    chosen = {**_names(shared, 'settings', where), **_names(own, 'settings', where)}
+    chosen: dict[str, Any] = {}
+    for each in (shared, own):
+        chosen |= _mapping(each.get('settings') or {}, 'settings', f'{where}: settings')
     tolerance = given.get('tolerance')
     if tolerance is not None:
-        tolerance = _positive(tolerance, f'{where}: tolerance')
+        tolerance = parse_number(tolerance, f'{where}: tolerance')
+        if tolerance <= 0.0:
+            raise ConfigError(f'{where}: tolerance must be positive, not {tolerance:g}')
     loss = parse_number(given.get('largest_loss', Robot.largest_loss), f'{where}: largest_loss')
     if not 0.0 <= loss <= 1.0:
         raise ConfigError(f'{where}: largest_loss must be from 0 to 1, not {loss:g}')
@@ -166,67 +175,44 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
 
 def _settings(given: Mapping[str, Any], where: str) -> Settings:
     """Return settings by their names, the others by default."""
-    known = {each.name: each for each in fields(Settings)}
     values: dict[str, Any] = {}
     for name, value in given.items():
-        if name not in known:
-            raise UnknownNameError(f'setting in {where}', name, known)
-        default = known[name].default
-        place = f'{where}: {name}'
-        if isinstance(default, tuple):
-            entries = value if isinstance(value, list) else [value]
-            if not all(isinstance(entry, str) for entry in entries):
-                raise ConfigError(f'{place} must be a list of texts, not {value!r:.100}')
-            values[name] = tuple(entries)
-        elif isinstance(default, str):
-            if not isinstance(value, str):
-                raise ConfigError(f'{place} must be text, not {value!r:.100}')
-            values[name] = value
-        else:
+        default, place = getattr(Settings, name), f'{where}: {name}'
+        if isinstance(default, int | float):
             number = parse_number(value, place)
-            if isinstance(default, int) and number != int(number):
+            if isinstance(default, int) and number % 1.0:
                 raise ConfigError(f'{place} must be a whole number, not {number:g}')
-            values[name] = int(number) if isinstance(default, int) else number
+            values[name] = type(default)(number)
+            continue
+        many = isinstance(default, tuple)
+        entries = value if many and isinstance(value, list) else [value]
+        if not all(isinstance(entry, str) for entry in entries):
+            kind = 'a list of texts' if many else 'text'
+            raise ConfigError(f'{place} must be {kind}, not {value!r:.100}')
+        values[name] = tuple(entries) if many else value
     try:
         return Settings(**values)
     except ConfigError as err:
         raise ConfigError(f'{where}: {err}') from err
 
 
-def _names(given: Mapping[str, Any], key: str, where: str) -> dict[str, Any]:
-    value = given.get(key) or {}
-    if not isinstance(value, dict):
-        raise ConfigError(f'{where}: {key} must be a mapping of names, not {value!r:.100}')
-    return value
-
-
 def _mapping(value: object, kind: str, where: str) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ConfigError(f'{where} must be a mapping with the keys {", ".join(KEYS[kind])}')
+        keys = ', '.join(KEYS[kind])
+        raise ConfigError(f'{where} must be a mapping with keys of {keys}, not {value!r:.100}')
     for key in value:
         if key not in KEYS[kind]:
             raise UnknownNameError(f'key in {where}', str(key), KEYS[kind])
     return value
 
 
-def _positive(value: object, where: str) -> float:
-    number = parse_number(value, where)
-    if number <= 0.0:
-        raise ConfigError(f'{where} must be positive, not {number:g}')
-    return number
-
-
 def _moment(value: object, where: str) -> datetime | None:
     """Return a date of YAML as a time; without a zone it is in UTC."""
     if value is None:
         return None
-    if isinstance(value, str):
-        try:
-            value = datetime.fromisoformat(value)
-        except ValueError:
-            value = repr(value)
-    if isinstance(value, date) and not isinstance(value, datetime):
-        value = datetime(value.year, value.month, value.day)
-    if not isinstance(value, datetime):
-        raise ConfigError(f'{where} must be a date, such as 2026-11-20, not {value!r}')
-    return value if value.tzinfo else value.replace(tzinfo=timezone.utc)
+    try:
+        text = value.isoformat() if isinstance(value, date) else value
+        moment = datetime.fromisoformat(text)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise ConfigError(f'{where} must be a date, such as 2026-11-20, not {value!r}') from None
+    return moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -34,12 +34,15 @@ SPAN = 2.0
 """Time [s] that a piece of several tasks takes: much to dask's 4 ms for it, little to lose."""
 PATIENCE = 60.0
 """Time [s] for a scheduler and its first worker to answer."""
-QUIET = {
+DASK = {
     'distributed.worker.profile.enabled': False,
     'distributed.admin.tick.interval': '1s',
     'distributed.admin.system-monitor.interval': '2s',
+    'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**28,
+    'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2**25,
 }
-"""Settings of dask: it watches itself less, which takes more than its work."""
+"""Settings of dask: it watches itself less, which takes more than its work, and workers keep what
+memory [bytes] they need again: to get it anew costs a third of a large task's time."""
 NEVER = datetime.fromtimestamp(0, timezone.utc)
 Told: TypeAlias = Callable[[str, float], None]
 
@@ -122,23 +125,20 @@ def page_path(out: Path, row: Row) -> Path:
     return out / 'robots' / quote(row.serial, safe='') / f'{row.key}.html'
 
 
-def results(robot: Robot, history: History) -> tuple[Row, ...]:
-    """Return the identifications of a robot by its settings of today, in order of time."""
-    return tuple(
-        row
-        for row in history.rows(robot.serial)
-        if row.kind == 'identify' and row.settings == robot.settings_hash
-    )
+def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return the identifications among rows of a robot that are by its settings of today."""
+    hashed = robot.settings_hash
+    return tuple(row for row in rows if row.kind == 'identify' and row.settings == hashed)
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
     """Return the sources of a robot whose results are not filed; the last one has a page."""
     try:
-        there = sources(robot)
+        there, rows = sources(robot), results(robot, history.rows(robot.serial))
     except CalibrationError as err:
         found.note(robot.serial, '', str(err))
         return []
-    rows = [row for row in results(robot, history) if row.software == calib_ros.__version__]
+    rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
     last = max(there, key=lambda each: (each.modified or NEVER, each.name))
     return [
@@ -155,14 +155,14 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
 
 def _without_page(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
     """Return the source of a robot's newest result if that has no page yet."""
-    rows = results(robot, history)
-    if out is None or not rows or page_path(out, rows[-1]).exists():
+    names = found.errors.get(robot.serial, {})
+    if out is None or '' in names:
         return []
-    with suppress(CalibrationError):  # it was told of before
-        names = found.errors.get(robot.serial, {})
-        there = [each for each in sources(robot) if each.name not in names]
-        return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
-    return []
+    rows = results(robot, history.rows(robot.serial))
+    if not rows or rows[-1].source in names or page_path(out, rows[-1]).exists():
+        return []
+    there = sources(robot)
+    return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
 
 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
@@ -190,11 +190,12 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         from distributed import Client, LocalCluster
     except ImportError:
         raise ConfigError(MISSING) from None
+    logging.getLogger('distributed.client').setLevel(logging.CRITICAL)  # LostError says it
     with ExitStack() as stack:
         if cluster.address:
             where: Any = cluster.address
         else:
-            stack.enter_context(dask.config.set(QUIET))
+            stack.enter_context(dask.config.set(DASK))
             where = stack.enter_context(
                 LocalCluster(
                     n_workers=cluster.workers or None,

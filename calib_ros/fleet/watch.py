@@ -30,7 +30,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from calib_ros.apply.chart import DAYS
 from calib_ros.files.rows import Row
 from calib_ros.identification.changes import (
     DOUBT,
@@ -88,24 +87,22 @@ class Night(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """What the nights of a robot tell; `left_out` cannot be compared with the others."""
+    """What the nights of a robot tell, those that can be compared with the first."""
 
     nights: tuple[Night, ...] = ()
     changes: tuple[Change, ...] = ()
-    left_out: tuple[Row, ...] = ()
 
 
-def watch(rows: Sequence[Row], since: datetime | None = None, years: float = YEARS) -> Watched:
+def watch(rows: Sequence[Row], years: float = YEARS) -> Watched:
     """Look for changes in identifications in the order of their times.
 
-    Those that are not accepted, and what was before `since`, are left out.
+    Those that are not accepted, or tell other parameters than the first, are left out.
     """
-    known = [row for row in rows if row.accepted and (since is None or row.time >= since)]
-    wanted = known[0].names if known else ()
-    alike = [row for row in known if row.names == wanted]
-    left_out = tuple(row for row in known if row.names != wanted)
+    known = [row for row in rows if row.accepted]
+    alike = [row for row in known if row.names == known[0].names]
     if not alike:
-        return Watched((), (), left_out)
+        return Watched()
+    wanted = alike[0].names
     joints = {joint['name'] for joint in json.loads(alike[0].chain)['joints']}
     own = [k for k, name in enumerate(wanted) if Parameter(name).owner in joints]
     names = tuple(Parameter(wanted[k]) for k in own)
@@ -115,7 +112,7 @@ def watch(rows: Sequence[Row], since: datetime | None = None, years: float = YEA
         np.linalg.inv(np.array([row.covariance[np.ix_(own, own)] for row in alike])),
         np.array([row.freedom or KNOWN for row in alike]),
     )
-    level = 1.0 / (DAYS * years * len(LAGS) * len(data.joints))
+    level = 1.0 / (365.25 * years * len(LAGS) * len(data.joints))
     changes: list[Change] = []
     strengths = np.zeros((len(alike), len(data.joints)))
     first = known_up_to = 0
@@ -138,7 +135,7 @@ def watch(rows: Sequence[Row], since: datetime | None = None, years: float = YEA
         Night(row, dict(zip(data.joints, values, strict=True)))
         for row, values in zip(alike, strengths.tolist(), strict=True)
     )
-    return Watched(nights, tuple(changes), left_out)
+    return Watched(nights, tuple(changes))
 
 
 class _Tests(NamedTuple):

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
 from calib_ros.files.bags import replay
+from calib_ros.files.history import is_local
 from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
 from calib_ros.files.tables import read_table
 from calib_ros.fleet.plant import Robot
@@ -29,8 +30,9 @@ from calib_ros.sampling.session import CalibrationSession
 
 TABLES = ('.csv', '.txt', '.xlsx')
 """Endings of tables; anything else is a bag, or a folder that is one."""
-DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified', 'ETag', 'etag')
-"""What file systems call that by which a change of content shows."""
+DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
+SUMS = ('ETag', 'etag', 'CRC')
+"""What file systems call dates and sums by which a change of content shows."""
 PLOTLY = 'plotly.min.js'
 """The script that all pages of a report share."""
 
@@ -93,7 +95,7 @@ def sources(robot: Robot) -> tuple[Source, ...]:
             raise InputError(f'nothing matches {each.files}')
         for path, info in sorted(matched.items()):
             fingerprint, modified = _state(files, path, info)
-            url = path if _is_local(files) else files.unstrip_protocol(path)
+            url = path if is_local(files) else files.unstrip_protocol(path)
             url += each.files[each.files.find('::') :] if '::' in each.files else ''
             found.append(Source(url, each.session, fingerprint, modified))
     return tuple(found)
@@ -142,7 +144,7 @@ def _outcome(task: Task) -> Outcome:
 def fetched(url: str) -> Iterator[Path]:
     """Yield the path of a local file or folder, or of a copy of what is elsewhere."""
     files, path = _file_system(url)
-    if _is_local(files):
+    if is_local(files):
         yield Path(path)
         return
     with TemporaryDirectory(prefix='calib_ros_') as folder:
@@ -180,10 +182,6 @@ def _file_system(url: str) -> tuple[Any, str]:
     return files, path
 
 
-def _is_local(files: Any) -> bool:
-    return 'file' in (files.protocol if isinstance(files.protocol, tuple) else (files.protocol,))
-
-
 def _is_folder(files: Any, path: str) -> bool:
     """Tell whether a path is a folder; a name with an ending of a file is not asked for."""
     name = PurePosixPath(path).name
@@ -195,12 +193,12 @@ def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime |
     parts = files.find(path, detail=True) if _is_folder(files, path) else {path: info}
     marks, times = [], []
     for name, part in sorted(parts.items()):
-        if not any(part.get(key) for key in DATES):
+        if not any(part.get(key) for key in (*DATES, *SUMS)):
             part = files.info(name)
-        dates = [part[key] for key in DATES if part.get(key)]
-        if part.get('size') is None or not dates:
+        dates, sums = ([part[key] for key in keys if part.get(key)] for keys in (DATES, SUMS))
+        if part.get('size') is None or not dates + sums:
             return '', None
-        marks.append([name, part['size'], *map(str, dates)])
+        marks.append([name, part['size'], *map(str, dates + sums)])
         times += [each for each in map(_moment, dates) if each is not None]
     return digest(marks), max(times, default=None)
 

@@ -21,11 +21,12 @@ transforms.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from calib_ros.identification.leastsquares import System
 from calib_ros.identification.observations import stops
@@ -44,40 +45,19 @@ SINGULAR = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns X of parameters, and what they have in common with the moved residuals.
+    """Columns X of parameters, and what they have in common with each other and the residuals.
 
     Attributes
     ----------
-    rows : (R, P)
-        By stop, without the slowest part.
+    matrix : (P, P)
+        X^T X, without the slowest part of the columns, with the normal matrix of the priors.
     products : (P, S)
         X^T r by shift.
-    inverse : (P,)
-        1 / sigma of priors; zero without one.
 
     """
 
-    rows: FloatArray
+    matrix: FloatArray
     products: FloatArray
-    inverse: FloatArray
-
-    def __getitem__(self, index: slice | list[int]) -> Columns:
-        """Return some of the columns."""
-        return Columns(self.rows[:, index], self.products[index], self.inverse[index])
-
-    @property
-    def matrix(self) -> FloatArray:
-        """Return the normal matrix (P, P), with that of the priors."""
-        return np.asarray(self.rows.T @ self.rows + np.diag(self.inverse**2))
-
-    @staticmethod
-    def side_by_side(parts: Sequence[Columns]) -> Columns:
-        """Return all columns as one."""
-        return Columns(
-            np.concatenate([part.rows for part in parts], axis=1),
-            np.concatenate([part.products for part in parts]),
-            np.concatenate([part.inverse for part in parts]),
-        )
 
 
 class Shifts:
@@ -102,44 +82,56 @@ class Shifts:
         for begins, residual in zip(self._begins, residuals, strict=True):
             series = _by_stop(residual, begins)
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
-            self._circles.append(np.fft.rfft(circle))
             length = len(begins)
+            again = np.concatenate([circle, series], axis=1)  # as far as a moved series reaches
+            self._circles.append(fft.rfft(again, fft.next_fast_len(3 * length, real=True)))
             squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
-            spectrum = _spectrum(slow_cosines(length)[:, np.newaxis], self._circles[-1])
-            slow = np.fft.irfft(spectrum, 2 * length)
+            slow = _correlated(slow_cosines(length)[:, np.newaxis], self._circles[-1], each=True)
             energy = squares[length : 3 * length] - squares[: 2 * length]
             self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
 
-    def columns(self, columns: Sequence[FloatArray], inverse: FloatArray) -> Columns:
-        """Return weighted columns, (P, c, N) for each set, with their products."""
-        found = []
-        products = np.zeros((len(inverse), len(self._share)))
-        for begins, circle, column in zip(self._begins, self._circles, columns, strict=True):
-            series = _by_stop(column, begins)
-            whole = np.linalg.norm(series, axis=(1, 2))
-            slow = slow_cosines(len(begins))
-            series -= series @ slow.T @ slow
-            series *= (np.linalg.norm(series, axis=(1, 2)) > CONSTANT * whole)[:, None, None]
-            spectrum = _spectrum(series, circle).sum(axis=1)
-            products += self._sampled(np.fft.irfft(spectrum, 2 * len(begins)))
-            found.append(series.reshape(len(series), -1))
-        return Columns(np.concatenate(found, axis=1).T, products, inverse)
+    def columns(self, columns: Iterable[Sequence[FloatArray]], inverse: FloatArray) -> Columns:
+        """Return weighted columns, (P, c, N) for each set, with their products.
 
-    def shares(self, before: Columns, groups: Sequence[Columns]) -> FloatArray:
-        """Return the share (G, S) that each group of columns explains beside those before.
+        They may come in several lots; `inverse` (P,) is 1 / sigma of the priors of all of them,
+        zero without one.
+        """
+        rows, products = [], []
+        for lot in columns:
+            parts = []
+            products.append(np.zeros((len(lot[0]), len(self._share))))
+            for begins, circle, column in zip(self._begins, self._circles, lot, strict=True):
+                series = _by_stop(column, begins)
+                whole = np.linalg.norm(series, axis=(1, 2))
+                slow = slow_cosines(len(begins))
+                series -= series @ slow.T @ slow
+                series *= (np.linalg.norm(series, axis=(1, 2)) > CONSTANT * whole)[:, None, None]
+                products[-1] += self._sampled(_correlated(series, circle))
+                parts.append(series.reshape(len(series), -1))
+            rows.append(np.concatenate(parts, axis=1))
+        every = np.concatenate(rows)
+        return Columns(every @ every.T + np.diag(inverse**2), np.concatenate(products))
+
+    def shares(
+        self, columns: Columns, known: Sequence[int], groups: Sequence[Sequence[int]]
+    ) -> FloatArray:
+        """Return the share (G, S) that each group of columns explains beside those known.
 
         By shift; each group is taken by itself.
         """
-        matrix = before.matrix
+        matrix = columns.matrix[np.ix_(known, known)]
         root = inverse_root(matrix, np.diag(matrix))
-        known = root.T @ before.products
-        found = []
+        gone = root.T @ columns.products[known]
+        every = [k for group in groups for k in group]
+        cross = root.T @ columns.matrix[np.ix_(known, every)]
+        products = columns.products[every] - cross.T @ gone
+        found, first = [], 0
         for group in groups:
-            cross = root.T @ (before.rows.T @ group.rows)
-            own = group.matrix
-            mine = inverse_root(own - cross.T @ cross, np.diag(own))
-            found.append(((mine.T @ (group.products - cross.T @ known)) ** 2).sum(axis=0))
-        left = np.maximum(self._energy - (known**2).sum(axis=0), 1e-300)
+            part = slice(first, first + len(group))
+            own, first = columns.matrix[np.ix_(group, group)], part.stop
+            mine = inverse_root(own - cross[:, part].T @ cross[:, part], np.diag(own))
+            found.append(((mine.T @ products[part]) ** 2).sum(axis=0))
+        left = np.maximum(self._energy - (gone**2).sum(axis=0), 1e-300)
         return np.asarray(np.array(found) / left)
 
     def _sampled(self, shifted: FloatArray) -> FloatArray:
@@ -160,10 +152,17 @@ def slow_cosines(length: int) -> FloatArray:
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 
 
-def _spectrum(series: FloatArray, circle: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the spectrum of the circular correlation of series (..., c, n) with the circle."""
-    length = series.shape[-1]
-    return np.asarray(np.conj(np.fft.rfft(series, 2 * length)) * circle)
+def _correlated(
+    series: FloatArray, circle: NDArray[np.complex128], each: bool = False
+) -> FloatArray:
+    """Return (P, 2 n) the products of series (P, c, n) with the circle (c, K) moved by each shift.
+
+    Summed over the components c; (P, c, 2 n) of `each` if asked.
+    """
+    length = fft.next_fast_len(3 * series.shape[-1], real=True)
+    spectrum = np.conj(fft.rfft(series, length)) * circle
+    found = fft.irfft(spectrum if each else spectrum.sum(axis=1), length)
+    return np.asarray(found[..., : 2 * series.shape[-1]])
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
@@ -194,6 +193,6 @@ def chance_of_gain(
     shifts = Shifts(system, [each[-1] for each in rows])
     prior = system.prior
     inverse = np.zeros(len(names)) if prior is None else prior.rows(chain, names)[0]
-    columns = shifts.columns([each[:-1] for each in rows], inverse)
-    known, more = columns[: len(before)], columns[len(before) :]
-    return chance(shifts.shares(known, [more])[0])
+    columns = shifts.columns([[each[:-1] for each in rows]], inverse)
+    numbers = range(len(names))
+    return chance(shifts.shares(columns, numbers[: len(before)], [numbers[len(before) :]])[0])

@@ -30,19 +30,19 @@ L dp/dL.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from calib_ros.identification.leastsquares import System, normal_equations
+from calib_ros.identification.leastsquares import Normal, System, normal_equations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 BENDING = ('gravity', 'compliance', 'backlash')
@@ -66,8 +66,6 @@ MOST = 2000
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
 ROUNDS = 60
-ROUNDING = 1e-12
-"""Added to the scaled precision, so that rounding cannot make it singular."""
 LEAST = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
@@ -151,6 +149,7 @@ def posterior_of(
     known: Mapping[str, float],
     more: Sequence[str] = (),
     doubts: Mapping[str, float] | None = None,
+    at_the_fit: Normal | None = None,
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
@@ -170,35 +169,27 @@ def posterior_of(
         Effects to consider.
     doubts : mapping of str to float
         Parameters that something else than the arm moves as well, with its standard deviation.
+    at_the_fit : Normal
+        The last normal equations of the fit, if they are known.
 
     """
     chain = chain.with_effects(more)
     every = (*names, *more)
-    few, share = _few(system)
-    lengths = _lengths(chain, system) if more else {}
-    columns = tuple(dict.fromkeys([*every, *lengths]))
-    normal = normal_equations(chain, columns, few)
-    mixing = np.eye(len(columns), len(every))
     beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
+    lengths = _lengths(chain, system) if more else {}
     if lengths:
         beside.append((lengths, SCALE))
-    for parts, _ in beside:
-        mixing = np.column_stack([mixing, [parts.get(name, 0.0) for name in columns]])
-    matrix = share / noise**2 * (mixing.T @ normal.matrix @ mixing)
-    gradient = share / noise**2 * (mixing.T @ normal.gradient)
-    offsets = np.zeros(len(gradient))
-    for k, name in enumerate(names):
-        if not chain.owns_frame(name):
-            offsets[k] = chain.offset(name, nominal)
-    vector = matrix @ offsets + gradient
-    groups = [None if name in known else group_of(chain, name) for name in every]
-    groups += [None] * len(beside)
+    told = _told(chain, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
+    matrix = told[:-1, :-1]
+    own = [0.0 if chain.owns_frame(n) else chain.offset(n, nominal) for n in names]
+    offsets = np.array([*own, *[0.0] * (len(matrix) - len(own))])
+    vector = matrix @ offsets + told[:-1, -1]
+    groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
     size, near = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     stds = evidence.stds(size)
-    own = stds[: len(every)].tolist()
-    priors = {name: std for name, std in zip(every, own, strict=True) if std < np.inf}
+    priors = {name: std for name, std in zip(every, stds.tolist(), strict=False) if std < np.inf}
     arm = np.s_[: len(every)]
     mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
     doubted = []
@@ -232,13 +223,31 @@ def _lengths(chain: Chain, system: System) -> dict[str, float]:
     return {name: chain.value(name) for name in names}
 
 
-def _few(system: System) -> tuple[System, int]:
-    """Return the samples without priors, of many every so many, and how many each stands for."""
+def _told(
+    chain: Chain,
+    names: Sequence[str],
+    beside: Sequence[Mapping[str, float]],
+    system: System,
+    known: Normal | None,
+) -> FloatArray:
+    """Return the products (K + 1, K + 1) of columns and residual, without priors.
+
+    Columns are those of the names, and sums of columns `beside` them. Of many samples every so
+    many are taken; `known` holds the products of all of them for the names alone.
+    """
+    columns = list(dict.fromkeys([*names, *(name for parts in beside for name in parts)]))
     share = max(1, -(-system.count // MOST))
-    sets = system.sets
-    if share > 1:
-        sets = tuple(each.select(np.arange(0, each.count, share)) for each in sets)
-    return System(sets, None, system.separations), share
+    if known is None or share > 1 or beside:
+        few = system.select([np.arange(0, each.count, share) for each in system.sets])
+        known = normal_equations(chain, columns, replace(few, prior=None))
+    extra = np.column_stack(system.separation_rows(chain, columns))
+    mixing = np.eye(len(columns) + 1, len(names))
+    for parts in beside:
+        sums = [parts.get(name, 0.0) for name in columns]
+        mixing = np.column_stack([mixing, [*sums, 0.0]])
+    mixing = np.column_stack([mixing, np.eye(len(columns) + 1)[-1]])
+    products = known.products.sum(axis=0) + extra.T @ extra
+    return np.asarray(share * (mixing.T @ products @ mixing))
 
 
 def _solved(
@@ -258,7 +267,7 @@ def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, Floa
     diagonal = matrix[size, size] + precision
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
     scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
-    scaled[..., size, size] = diagonal * scale**2 + ROUNDING
+    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # which cannot make it singular
     return scaled, scale
 
 

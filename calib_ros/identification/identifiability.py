@@ -18,7 +18,7 @@ from scipy import linalg
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 RANK_TOLERANCE = 1e-8
@@ -221,29 +221,25 @@ class Uncertainty(Shown):
 
 TRADE = 1e-4
 """Least share of a parameter in a trade to be named."""
-ROUNDING = 1e-12
-"""Length of a column beside the longest one from which on it is more than rounding."""
 
 
-def trades(factor: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
+def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
     """Return, for each parameter that was left out, the fitted ones that it trades against.
 
     Moving the one, and the others by the right amounts, leaves every measured pose as it is.
+    `matrix` (P, P) is the normal matrix of all of them.
     """
-    sizes = np.linalg.norm(factor, axis=0)
-    known = sizes > ROUNDING * sizes.max(initial=0.0)
-    scaled = factor[:, known] / sizes[known]
-    number = {
-        name: k for k, name in enumerate(n for n, yes in zip(names, known, strict=True) if yes)
-    }
-    fitted = [name for name in kept if name in number]
-    left_out = [name for name in number if name not in set(kept)]
-    basis, columns = (scaled[:, [number[n] for n in part]] for part in (fitted, left_out))
+    sizes = np.sqrt(np.diag(matrix))
+    seen = np.flatnonzero(sizes > ROUNDING * sizes.max(initial=0.0)).tolist()
+    fitted = [k for k in seen if names[k] in set(kept)]
+    left_out = [k for k in seen if names[k] not in set(kept)]
+    scaled = matrix[fitted] / sizes[fitted, np.newaxis]
+    basis, columns = (scaled[:, part] / sizes[part] for part in (fitted, left_out))
     shares = np.abs(np.linalg.lstsq(basis, columns, rcond=None)[0])
     strong = (shares > TRADE * shares.max(axis=0, initial=0.0)).T
     partners: dict[str, list[str]] = {name: [] for name in names if name not in set(kept)}
-    for name, marks in zip(left_out, strong, strict=True):
-        partners[name] = [other for other, yes in zip(fitted, marks, strict=True) if yes]
+    for k, marks in zip(left_out, strong, strict=True):
+        partners[names[k]] = [names[j] for j, yes in zip(fitted, marks, strict=True) if yes]
     return partners
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from calib_ros.identification.acceptance import MOST_OUTLIERS
 from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -48,11 +48,6 @@ POLISHED = 6
 """Suspects that are polished."""
 MEANINGLESS = 0.25
 """Share of the spread of the positions from which an error explains nothing."""
-ROWS = (1, -1, 2, -2)
-"""Rows by which joint values may stand beside another measurement."""
-QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
-"""Zeros of joints [rad] that differ between conventions."""
-SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +210,7 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
         for name in parameters_of(frame)
         if name.is_length or frame not in sockets
     ]
-    known = excited(triangular_factor(chain, names, system), names)
+    known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
     spread = trial.error / trial.share if trial.share > 0.0 else np.inf
     return min(trial, _trial(fitted, sets, spread), key=lambda one: one.error)

@@ -14,7 +14,7 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
-from calib_ros.identification.evidence import ROUNDING, group_of
+from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
@@ -33,7 +33,7 @@ from calib_ros.identification.validation import log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 PAYS = 0.999
 """One-sided confidence that the gain of a group or harmonic must have."""
@@ -159,14 +159,18 @@ class _Linear:
         for each in numbers:  # every fold has some of each set
             new = np.unique(each[blocks[each] < 0])
             blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
-        self._dealings = (self._groups % problem.folds, blocks[self._groups])
+        dealings = (self._groups % problem.folds, blocks[self._groups])
         rows = self._rows(self._names)
-        self._base = stacked(rows)[:, :-1]
-        self._residual = stacked(rows)[:, -1]
+        self._columns = stacked(rows)
+        self._residual = np.ascontiguousarray(self._columns[:, -1])
+        self._number = {name: k for k, name in enumerate([*self._names, ''])}
         self._ends = np.cumsum([each[-1].size for each in rows])
-        self._owner = owners(rows)
-        self._columns: dict[str, FloatArray] = {}
-        self._seen: dict[str, Columns] = {}
+        owner = owners(rows)
+        self._folds = [dealing[owner] for dealing in dealings]
+        self._products = [
+            np.array([_square(self._columns[folds == k]) for k in range(problem.folds)])
+            for folds in self._folds
+        ]
         self._pairs = [
             effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
@@ -176,12 +180,15 @@ class _Linear:
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
+        self._moved: dict[str, int] = {}
+        self._seen: Columns | None = None
 
     def useful(self, names: Sequence[str]) -> list[str]:
         """Return those effects whose columns are independent of the geometric model."""
-        basis = np.linalg.qr(self._base)[0]
+        basis = np.linalg.qr(self._columns[:, : len(self._names)])[0]
         kept = []
-        for name, column in zip(names, self._of(names).T, strict=True):
+        which = self._of(names)
+        for name, column in zip(names, self._columns[:, which].T, strict=True):
             rest = column - basis @ (basis.T @ column)
             rest -= basis @ (basis.T @ rest)
             size = float(np.linalg.norm(rest))
@@ -194,14 +201,13 @@ class _Linear:
         """Compare the errors on configurations left out, with and without some effects."""
         new = [name for name in added if name not in chosen]
         found, pays = [], True
-        for folds in self._dealings:
-            before, after = (self._left_out(names, folds) for names in (chosen, [*chosen, *new]))
+        for dealing in range(len(self._folds)):
+            before, after = (self._left_out(n, dealing) for n in (chosen, [*chosen, *new]))
             gain, limit = log_gain(before, after, self._groups, PAYS)
             pays = pays and gain > max(limit, LEAST_GAIN)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
         if pays and self._shifts is not None:
-            known = self._moved([*self._names, *chosen])
-            pays = chance(self._shifts.shares(known, [self._moved(new)])[0]) < CHANCE
+            pays = chance(self._shares(chosen, [new])[0]) < CHANCE
         return Verdict(what, found[0], found[1], bool(pays))
 
     def strongest_harmonic(
@@ -214,63 +220,98 @@ class _Linear:
         pairs = [pair for pair in self._pairs if pair[0] not in chosen]
         if self._shifts is None or not pairs:
             return None
-        known = self._moved([*self._names, *chosen])
-        moved: list[Columns] = []
-        for joint, own in groupby(pairs, lambda pair: pair[0].owner):
-            progress(f'harmonics of {joint}')
-            moved += [self._moved(pair) for pair in own]
-        shares = self._shifts.shares(known, moved)
+        shares = self._shares(chosen, pairs, progress)
         if chance(shares.max(axis=0)) >= CHANCE:
             return None
         return list(pairs[int(np.argmax(shares[:, 0]))])
 
-    def _moved(self, names: Sequence[str]) -> Columns:
-        """Return the columns of parameters beside the moved residuals, each made once."""
-        assert self._shifts is not None
-        missing = [name for name in names if name not in self._seen]
-        if missing:
-            columns = [each[:-1] for each in self._rows(missing)]
-            found = self._shifts.columns(columns, self._priors(missing))
-            self._seen |= {name: found[[k]] for k, name in enumerate(missing)}
-        return Columns.side_by_side([self._seen[name] for name in names])
+    def _shares(
+        self,
+        chosen: Sequence[str],
+        groups: Sequence[Sequence[str]],
+        progress: Callable[[str], None] = _unheard,
+    ) -> FloatArray:
+        """Return the shares (G, S) of the moved residuals that groups of effects explain.
 
-    def _of(self, names: Sequence[str]) -> FloatArray:
-        """Return the weighted columns (R, E) of effects, each made once."""
-        missing = [name for name in names if name not in self._columns]
+        Columns are made once: those of effects, and with them all harmonics when one is asked for.
+        """
+        assert self._shifts is not None
+        wanted = {name for group in groups for name in group}
+        if not {*wanted, *chosen} <= self._moved.keys():
+            lots: list[Sequence[str]] = [[name for name in self._number if name]]
+            if wanted & {name for pair in self._pairs for name in pair}:
+                for _, own in groupby(self._pairs, lambda pair: pair[0].owner):
+                    left = [n for pair in own for n in pair if n not in self._number]
+                    lots += [left] if left else []
+            names = [name for lot in lots for name in lot]
+            self._moved = {name: k for k, name in enumerate(names)}
+            self._seen = self._shifts.columns(self._lots(lots, progress), self._priors(names))
+        assert self._seen is not None
+        numbers = self._moved
+        return self._shifts.shares(
+            self._seen,
+            [numbers[name] for name in (*self._names, *chosen)],
+            [[numbers[name] for name in group] for group in groups],
+        )
+
+    def _lots(
+        self, lots: Sequence[Sequence[str]], progress: Callable[[str], None]
+    ) -> Iterator[list[FloatArray]]:
+        """Yield the weighted columns (P, c, N) of each set, lot by lot."""
+        for number, names in enumerate(lots):
+            if number:
+                progress(f'harmonics of {Parameter(names[0]).owner}')
+            yield [each[:-1] for each in self._rows(names)]
+
+    def _of(self, names: Sequence[str]) -> list[int]:
+        """Return the numbers of the columns of effects, each made once."""
+        missing = [name for name in names if name not in self._number]
         if missing:
-            rows = stacked(self._rows(missing))[:, :-1]
-            self._columns |= dict(zip(missing, rows.T, strict=True))
-        if not names:
-            return np.zeros((len(self._residual), 0))
-        return np.column_stack([self._columns[name] for name in names])
+            added = stacked(self._rows(missing))[:, :-1]
+            self._number |= {name: k for k, name in enumerate(missing, self._columns.shape[1])}
+            self._columns = np.column_stack([self._columns, added])
+            self._products = [
+                self._wider(parts, folds, added)
+                for parts, folds in zip(self._products, self._folds, strict=True)
+            ]
+        return [self._number[name] for name in names]
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
         """Return weighted Jacobian and residual (P + 1, c, N) of each set."""
         chain = self._chain.with_effects([name for name in names if name not in self._names])
         return self._system.rows_of(chain, names)
 
-    def _left_out(self, chosen: Sequence[str], dealing: NDArray[np.intp]) -> FloatArray:
+    def _wider(self, parts: FloatArray, folds: NDArray[np.intp], added: FloatArray) -> FloatArray:
+        """Return the products (F, C, C) by fold, those of the last columns (R, K) added."""
+        inside = np.arange(self._problem.folds) == folds[:, np.newaxis]
+        size, count = self._columns.shape[1], added.shape[1]
+        masked = (inside[:, :, np.newaxis] * added[:, np.newaxis]).reshape(len(added), -1)
+        new = (self._columns.T @ masked).reshape(size, -1, count).transpose(1, 0, 2)
+        found = np.zeros((len(new), size, size))
+        found[:, :-count, :-count] = parts
+        found[:, :, -count:] = new
+        found[:, -count:] = np.swapaxes(new, 1, 2)
+        return found
+
+    def _left_out(self, chosen: Sequence[str], dealing: int) -> FloatArray:
         """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
-        columns = np.column_stack([self._base, self._of(chosen)])
-        extra, offset = self._extra(chosen)
-        errors = np.empty(len(self._residual))
-        whole = columns.T @ columns + extra.T @ extra
-        gradient = columns.T @ self._residual + extra.T @ offset
-        folds = dealing[self._owner]
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(whole), 1e-300))  # a fold may hold all of it
-        for fold in range(self._problem.folds):
-            inside = folds == fold
-            part = columns[inside]
-            scaled = (whole - part.T @ part) * np.outer(scale, scale) + ROUNDING * np.eye(
-                len(scale)
-            )
+        which = [*range(len(self._names)), *self._of(chosen)]
+        extra = np.column_stack(self._extra(chosen))
+        ends = [*which, self._number['']]
+        parts = self._products[dealing][:, ends][:, :, ends]
+        rest = parts.sum(axis=0) + _square(extra)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))  # a fold may hold all of it
+        weights = np.zeros((self._columns.shape[1], len(parts)))
+        for fold, part in enumerate(parts):
+            left = (rest - part)[:-1]
+            scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
             factor = linalg.cho_factor(scaled)
-            right = gradient - part.T @ self._residual[inside]
-            weights = scale * linalg.cho_solve(factor, scale * right)
-            errors[inside] = self._residual[inside] - part @ weights
-        parts = np.split(errors, self._ends[:-1])
+            weights[which, fold] = scale * linalg.cho_solve(factor, scale * left[:, -1])
+        folds = self._folds[dealing][:, np.newaxis]
+        predicted = np.take_along_axis(self._columns @ weights, folds, axis=1)[:, 0]
+        pieces = np.split(self._residual - predicted, self._ends[:-1])
         sets = self._system.sets
-        return np.concatenate([s.position_errors(p) for s, p in zip(sets, parts, strict=True)])
+        return np.concatenate([s.position_errors(p) for s, p in zip(sets, pieces, strict=True)])
 
     def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""
@@ -292,3 +333,8 @@ class _Linear:
                 size = max(effects.expected(name), self._sizes.get(group, 0.0))
             found[k] = self._noise / size if size else 0.0
         return found
+
+
+def _square(rows: FloatArray) -> FloatArray:
+    """Return the products (P, P) of the columns of rows (R, P)."""
+    return np.asarray(rows.T @ rows)

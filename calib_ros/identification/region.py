@@ -173,7 +173,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
     ends = sets[0]
-    measured = np.concatenate([_spread(each) for each in sets])
+    measured = np.concatenate([each.spread(MEASURED).joints for each in sets])
     drawn = posterior.chain.random_joints(DRAWN, np.random.default_rng(0))
     judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
     near, far = np.split(judge.sigma, [len(measured)])
@@ -210,11 +210,6 @@ def _length(rows: FloatArray, square: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
-def _spread(observations: Observations) -> FloatArray:
-    """Return joint values of some of the pairs, evenly over the session."""
-    return observations.joints[:: 1 + len(observations) // MEASURED]
-
-
 class _Judge:
     """Tells how probable it is that a calibration makes the arm worse at some poses."""
 
@@ -235,10 +230,9 @@ class _Judge:
         self._placed = len(frames)
         self._rows = shift[[row[name] for name in [*frames, *(names[k] for k in own)]]]
         self._offsets = posterior.offsets[own]
-        self._doubted = [
-            (weight, mean[own], covariance[np.ix_(own, own)])
-            for weight, mean, covariance in posterior.doubted
-        ]
+        weights, means, covariances = zip(*posterior.doubted, strict=True)
+        self._weights, self._means = np.array(weights), np.array(means)[:, own]
+        self._covariances = np.array(covariances)[:, own][:, :, own]
         self._freedom = freedom
 
     def products(self, which: Sequence[int] | NDArray[np.intp]) -> FloatArray:
@@ -255,12 +249,8 @@ class _Judge:
         left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
         slope = left @ self._offsets
         gain = float(slope @ self._offsets)
-        risk = 0.0
-        for weight, mean, covariance in self._doubted:
-            margin = float(slope @ mean) - 0.5 * gain
-            spread = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
-            if spread == 0.0:
-                risk += weight * (margin <= 0.0)
-            else:
-                risk += weight * float(special.stdtr(min(self._freedom, KNOWN), -margin / spread))
-        return risk
+        margins = self._means @ slope - 0.5 * gain
+        spreads = np.sqrt(np.maximum(self._covariances @ slope @ slope, 0.0))
+        with np.errstate(divide='ignore', invalid='ignore'):
+            risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
+        return float(self._weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

@@ -75,7 +75,7 @@ def _step(values: FloatArray) -> float:
     if len(different) < 3:
         return 0.0
     for step in sorted(STEPS, reverse=True):
-        if _are_multiples(different, step):
+        if _are_multiples(different[:3], step) and _are_multiples(different, step):
             return 0.0 if _are_multiples(different, WIDER * step) else step
     return 0.0
 

@@ -33,7 +33,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from calib_ros.identification.leastsquares import Fit, System
-from calib_ros.identification.observations import stops
+from calib_ros.identification.observations import FEWEST, stops
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -47,8 +47,6 @@ NEAREST = 3
 MOST = 400
 """Stops on which sizes are estimated; of more, every so many runs of RUN are taken."""
 RUN = 20
-FEWEST = 8
-"""Stops from which on neighbours are looked at."""
 APART = 1e9
 """Distance of the stops of different sets, which are no neighbours."""
 ROUNDING = 1e-10
@@ -107,10 +105,11 @@ class _Stops:
             far, nearest = cKDTree(self.place).query(self.place, k=NEAREST + 1)
             first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < APART / 2)
-            ends = np.sort([first[good], second[good]], axis=0)
-            first, second = np.divmod(np.unique(count * ends[0] + ends[1]), count)
+            first, second = first[good], second[good]
         links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
-        return csr_array(links + links.T)
+        both = csr_array(links + links.T)
+        both.data[:] = 1.0
+        return both
 
     def kernel(self, kind: str, length: float) -> FloatArray:
         """Return (n, n): covariance of the sums over each stop's samples, per root of count."""
@@ -184,7 +183,8 @@ class _Forms:
             first = here.stop
             if not each.any():
                 continue
-            self._basis[part] = basis[here].reshape(*shape, -1).transpose(1, 0, 2)
+            turned = basis[here].reshape(*shape, -1).transpose(1, 0, 2)
+            self._basis[part] = np.ascontiguousarray(turned)
             self._residual[part] = left[here].reshape(shape).T
             self._known[part] = each.any(axis=0).T.astype(float)
             self.parts.append(part)
@@ -196,7 +196,7 @@ class _Forms:
             part,
             matrix,
             product,
-            np.einsum('ncp,ncr->pr', basis, product, optimize=True),
+            _inner(basis, product),
             float((residual * (matrix @ residual)).sum()),
         )
 
@@ -222,8 +222,7 @@ class _Forms:
         """
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
         product = self._product(part, links)
-        white = np.einsum('ncp,ncr->pr', basis, basis, optimize=True)
-        linked = np.einsum('ncp,ncr->pr', basis, product, optimize=True)
+        white, linked = _inner(basis, basis), _inner(basis, product)
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())
         freedom = float(known.sum() - np.trace(white))
@@ -272,6 +271,12 @@ class _Form:
     product: FloatArray
     inner: FloatArray
     value: float
+
+
+def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return (P, P) the products of columns (n, c, P) with others."""
+    size = first.shape[2]
+    return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
 
 
 def _sums(
@@ -347,8 +352,8 @@ def _successive(
 ) -> FloatArray:
     """Return J^T K J of errors that fade in succession, for (length, size) each.
 
-    The sum over all stops so far follows the recursion y_j = decay y_{j-1} + s_j, a system of
-    equations with two diagonals.
+    The sum over all stops so far follows the recursion y_j = decay y_{j-1} + s_j, of which each
+    step takes in twice as many stops.
     """
     found = np.zeros((len(names), len(names)))
     for samples in system.sets:
@@ -357,14 +362,16 @@ def _successive(
             if part >= len(sums):
                 continue
             rows = sums[part][:-1]
-            own = np.einsum('pcn,rcn->pr', rows, rows, optimize=True)
+            own, earlier = rows.reshape(len(rows), -1), np.zeros_like(rows)
             for k, (length, size) in enumerate(kernels):
                 decay = float(np.exp(-1.0 / length))
-                added = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
-                bands = np.tile([[1.0], [-decay]], added.shape[2])
-                flat = linalg.solve_banded((1, 0), bands, added.reshape(-1, added.shape[2]).T)
-                so_far = flat.T.reshape(added.shape)
-                before[k] = so_far[..., -1]
-                cross = decay * np.einsum('pcn,rcn->pr', rows, so_far[..., :-1], optimize=True)
-                found += size * (own + cross + cross.T)
+                so_far = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
+                step = 1
+                while step < so_far.shape[2] and decay**step > ROUNDING**2:
+                    so_far[..., step:] += decay**step * so_far[..., :-step]
+                    step *= 2
+                before[k] = so_far[..., -1].copy()
+                earlier += size * decay * so_far[..., :-1]
+            cross = own @ earlier.reshape(len(rows), -1).T
+            found += sum(size for _, size in kernels) * (own @ own.T) + cross + cross.T
     return found

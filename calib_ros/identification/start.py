@@ -26,7 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
-from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
@@ -110,7 +110,7 @@ def _start_one(
     if subset.plane:
         best, least = chain, np.inf
         for start in _on_plane(chain, arm, subset):
-            determined = excited(triangular_factor(start, names, system), names)
+            determined = excited(factor_of(start, names, system), names)
             fitted = robust_fit(start, determined, system, loss).fit.chain
             height = float(np.median(np.abs(residual_arrays(fitted, subset)[0])))
             if height < least:
@@ -125,7 +125,7 @@ def _start_one(
         for rotation in candidates:
             start = _complete(chain, arm, subset, rotation)
             if not determined:
-                determined = excited(triangular_factor(start, names, system), names)
+                determined = excited(factor_of(start, names, system), names)
             fitted = minimise(start, determined, system, tolerance=1e-3).chain
             error = _typical_error(fitted, subset)
             if error < best_error:

@@ -270,15 +270,8 @@ class Chain(Shown):
 
     def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the joint values (n, B) that the effects make of those reported (n, B)."""
-        if not self.effects:
-            return q
-        names = tuple(name for name, _ in self.effects)
-        phi = effects.basis(self, names, q, approach)
-        q = q.copy()
-        for (name, value), row in zip(self.effects, phi, strict=True):
-            if value:
-                q[self.joint_names.index(Parameter(name).owner)] += value * row
-        return q
+        names = tuple(name for name, value in self.effects if value)
+        return effects.moved(self, names, effects.basis(self, names, q, approach), q)
 
     def trace(
         self, q: FloatArray, base: str = 'base', tool: str = 'tool'
@@ -299,9 +292,7 @@ class Chain(Shown):
 
     def ends(self, q: FloatArray) -> FloatArray:
         """Return the frames (n, 4, 3, B) at the ends of the links: axes and origin [m]."""
-        found = np.empty((2, len(q) + 1, 4, 3, q.shape[1]))
-        self.walk.frames(q, self.frame('base').matrix, found[0], found[1])
-        return found[1, :-1]
+        return self.walk.along(q, self.frame('base').matrix)[1]
 
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw joint values (count, n) within the limits, +-180 degrees or +-0.5 m by default."""

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.kinematics.chain import Chain
@@ -97,8 +97,6 @@ def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
 
 
 WAVES = ('sin', 'cos')
-ROUNDING = 1e-12
-"""Share of gravity below which what turns a joint is a rounding error."""
 
 
 def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:
@@ -154,6 +152,8 @@ def basis(
     without it no backlash shows.
     """
     phi = np.zeros((len(names), q.shape[1]))
+    if not names:
+        return phi
     for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
         if kind == 'ratio':
             phi[rows] = q[joints]
@@ -167,6 +167,16 @@ def basis(
         elif kind in ('gravity', 'compliance'):
             phi[rows] = _torques(chain, q, joints, others if kind == 'gravity' else None)
     return phi
+
+
+def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
+    """Return joint values (n, B) with what effects add to them, by their phi (E, B)."""
+    values = dict(chain.effects)
+    q = q.copy() if names else q
+    for name, row in zip(names, phi, strict=True):
+        if values[name]:
+            q[chain.joint_names.index(name.partition('.')[0])] += values[name] * row
+    return q
 
 
 @lru_cache(maxsize=256)
@@ -197,11 +207,10 @@ def _torques(
     Of a unit weight [m] at the `ends` (E,) of links, or [N m] of all masses that they carry.
     """
     start = chain.frame('base').matrix
-    found = np.empty((2, len(q) + 1, 4, 3, q.shape[1]))
-    chain.walk.frames(q, start, found[0], found[1])
+    frames, places = chain.walk.along(q, start)
     down = start[:3, :3] @ np.asarray(chain.gravity)
     # a weight along g at r turns the axis u through c by u . ((r - c) x g) = (r - c) . (g x u)
-    axes, points = found[0, :-1, 2], found[0, :-1, 3]
+    axes, points = frames[:-1, 2], frames[:-1, 3]
     x, y, z = down
     turned = np.stack(
         [
@@ -213,7 +222,6 @@ def _torques(
     )
     turned[np.abs(turned) < ROUNDING * np.linalg.norm(down)] = 0.0  # of a vertical axis
     turned *= chain.walk.signs[..., np.newaxis]
-    places = found[1, :-1]
     if ends is not None:
         arms = places[ends.astype(int), 3] - points[joints]
         return np.asarray(np.einsum('ecb,ecb->eb', arms, turned[joints]) / np.linalg.norm(down))

@@ -66,6 +66,14 @@ class Walk:
         self._links = links
         self._d = np.zeros_like(d) if standard else d
 
+    def along(self, q: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the frames (n + 1, 4, 3, B) that `frames` writes, and those at links' ends."""
+        found = np.empty((len(q) + 1, 4, 3, q.shape[1]))
+        if self.standard:
+            return self.frames(q, base, found), found[1:]
+        ends = np.empty((len(q), 4, 3, q.shape[1]))
+        return self.frames(q, base, found, ends), ends
+
     def frames(
         self, q: FloatArray, base: FloatArray, found: FloatArray, ends: FloatArray | None = None
     ) -> FloatArray:
@@ -80,7 +88,8 @@ class Walk:
         found : (n + 1, 4, 3, B)
             Gets the frames, of which it is returned.
         ends : (n, 4, 3, B), optional
-            Gets the frames at the ends of the links.
+            Gets the frames at the ends of the links of the modified convention; of the standard
+            one they are those that follow.
 
         """
         values = self.signs * q
@@ -105,8 +114,8 @@ class Walk:
                 here[3] += self._d[i] * here[2]
             if self.standard:
                 np.matmul(link, here.reshape(4, -1), out=after.reshape(4, -1))
-            if ends is not None:
-                ends[i] = after if self.standard else here
+            elif ends is not None:
+                ends[i] = here
         if not self.standard:
             found[-1] = here
         return found

@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
-Answer = tuple[bool, str]
+from calib_ros.ros.boundary import Answer
 
 
 class DeferredTrigger:

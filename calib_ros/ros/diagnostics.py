@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -13,6 +12,7 @@ from rclpy.node import Node
 
 from calib_ros.files.archive import Archive
 from calib_ros.ros import to_ros
+from calib_ros.ros.boundary import Boundary
 from calib_ros.ros.inputs import Inputs
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.session import CalibrationSession
@@ -27,10 +27,10 @@ class Diagnostics:
     session : CalibrationSession
     archive : Archive
     inputs : Inputs
+    boundary : Boundary
+        Knows what has failed.
     serial : str
         Of the robot.
-    answers : callable
-        Returns what else there is to say.
 
     """
 
@@ -40,42 +40,34 @@ class Diagnostics:
         session: CalibrationSession,
         archive: Archive,
         inputs: Inputs,
+        boundary: Boundary,
         serial: str,
-        answers: Callable[[], dict[str, Any]],
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
-        self._inputs, self._serial, self._answers = inputs, serial, answers
+        self._inputs, self._boundary, self._serial = inputs, boundary, serial
         self._dropped_before: dict[str, int] = {}
-        self._failed: dict[str, str] = {}
-        self._logged: dict[str, str] = {}
         self._alike = 1
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
-    def tried(self, what: str, work: Callable[[], Any]) -> Any:
-        """Return what a part of the work returns; None when it fails, which is told then."""
-        try:
-            return work()
-        except Exception as err:
-            self._failed[what] = f'{what} failed: {err!r}'
-            if self._logged.get(what) != str(err):  # not every second
-                self._logged[what] = str(err)
-                self._node.get_logger().error(f'internal error: {traceback.format_exc()}')
-            return None
+    def publish(self, status: str, answers: Callable[[], Mapping[str, Any]]) -> None:
+        """Publish how it goes, with the status in words, and what failed since the last time.
 
-    def publish(self, status: str) -> None:
-        """Publish how it goes, with the status in words, and what failed since the last time."""
-        self.tried('the rates', self._inputs.look)
-        account = self.tried('the account', self._session.account)
+        `answers` returns what came of calls and requests.
+        """
+        tried = self._boundary.tried
+        tried('the rates', self._inputs.look)
+        account = tried('the account', self._session.account)
         level, words = DiagnosticStatus.OK, ''
         figures: dict[str, Any] = {}
         if account is not None:
-            judged = self.tried('judging', lambda: self._judged(account))
+            judged = tried('judging', lambda: self._judged(account))
             level, words = judged or (level, words)
-            figures = self.tried('the figures', lambda: self._figures(account)) or {}
-        if self._failed:
+            figures = tried('the figures', lambda: {**self._figures(account), **answers()})
+        figures = figures or {}
+        if failed := self._boundary.failed:
             level = DiagnosticStatus.ERROR
-            words = ''.join(f'{text}; ' for text in self._failed.values()) + words
-            self._failed = {}
+            words = ''.join(f'{text}; ' for text in failed.values()) + words
+            failed.clear()
         name = f'{self._node.get_fully_qualified_name().lstrip("/")}: calibration'
         message = DiagnosticArray(
             status=[to_ros.status(name, self._serial, level, f'{words}{status}', figures)]
@@ -122,7 +114,6 @@ class Diagnostics:
             'robot': session.chain.name,
             'recording': session.recording,
             'calibrated': session.calibration is not None,
-            **self._answers(),
             'joint states': account.joint_states,
             'poses': account.poses,
             'poses waiting': account.waiting,

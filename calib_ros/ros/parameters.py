@@ -8,7 +8,7 @@ Every field of `Settings` is a parameter of the same name, with its text and its
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypedDict
@@ -27,6 +27,8 @@ from calib_ros.ros.arguments import BESIDE_SETTINGS
 from calib_ros.settings import STARTUP, Settings
 
 QOS = 'qos_overrides.'
+OF_ROS = ('use_sim_time', 'start_type_description_service')
+"""Parameters that rclpy itself declares."""
 DESCRIPTION_WAIT = 10.0
 """Time [s] for which the node waits for the robot's description."""
 
@@ -64,8 +66,11 @@ class Given:
     settings: Settings
 
 
-def declare_all(node: Node) -> Given:
-    """Declare all parameters of the node and return what they were set to.
+def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
+    """Declare all parameters of the node; return what they were set to, and the names that were.
+
+    The node was told to declare what is set by itself, for rclpy tells no other way what that is.
+    Each is declared anew here, with what it is for.
 
     Raises
     ------
@@ -73,18 +78,27 @@ def declare_all(node: Node) -> Given:
         When a value cannot be, or a parameter was set that does not exist.
 
     """
+    overrides = {
+        name: each.value
+        for name, each in node.get_parameters_by_prefix('').items()
+        if not name.startswith(OF_ROS)
+    }
+    for name in overrides:
+        node.undeclare_parameter(name)
     own = {
-        each.name: _declare(node, each.name, each.default, each.text, each.fixed)
+        each.name: _declare(node, overrides, each.name, each.default, each.text, each.fixed)
         for each in BESIDE_SETTINGS
     }
-    settings = Settings(**{item.name: _declare_setting(node, item) for item in fields(Settings)})
-    refuse_unknown(node, QOS)
+    settings = Settings(
+        **{item.name: _declare_setting(node, overrides, item) for item in fields(Settings)}
+    )
+    refuse_unknown(node, [*overrides], QOS)
     if not own['chain']:
         raise ConfigError(
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    return Given(
+    given = Given(
         chain=own['chain'],
         links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
         serial=own['serial'],
@@ -98,6 +112,7 @@ def declare_all(node: Node) -> Given:
         socket_distance=own['socket_distance'],
         settings=settings,
     )
+    return given, [*overrides]
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
@@ -136,14 +151,14 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     return replace(chain_from_urdf(text, **links), base=None, tool=None), text
 
 
-def refuse_unknown(node: Node, later: str = f'{QOS}/clock.') -> None:
-    """Refuse parameters that were set but do not exist; ROS ignores them.
+def refuse_unknown(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.') -> None:
+    """Refuse names of parameters that were set but do not exist; ROS ignores them.
 
     Names that begin with `later` are let pass: what they set comes into being later, or not.
     """
-    known = [*node._parameters]
-    for name in node._parameter_overrides:
-        if name not in known and not name.startswith((later, 'use_sim_time')):
+    known = [*node.get_parameters_by_prefix('')]
+    for name in names:
+        if name not in known and not name.startswith(later):
             raise UnknownNameError('parameter', name, known)
 
 
@@ -152,17 +167,22 @@ def _path(name: str) -> Path | None:
 
 
 def _declare(
-    node: Node, name: str, default: Any, text: str, read_only: bool = True, **ranges: Any
+    node: Node,
+    overrides: Mapping[str, Any],
+    name: str,
+    default: Any,
+    text: str,
+    read_only: bool = True,
+    **ranges: Any,
 ) -> Any:
     descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
-    override = node._parameter_overrides.get(name)
-    expected = _expected(name, default, override.value) if override else ''
-    if expected:
+    given = name in overrides
+    if given and (expected := _expected(name, default, overrides[name])):
         raise ConfigError(f'parameter "{name}" must be {expected}')
     if isinstance(default, tuple):  # an empty list has no type in ROS, [''] has one
         return _names(node.declare_parameter(name, [''], descriptor).value)
     if isinstance(default, float):  # so that 1 is taken as 1.0
-        value = float(override.value if override else default)
+        value = float(overrides[name] if given else default)
         return node.declare_parameter(name, value, descriptor, ignore_override=True).value
     return node.declare_parameter(name, default, descriptor).value
 
@@ -184,16 +204,16 @@ def _expected(name: str, default: Any, value: Any) -> str:
     return ''
 
 
-def _declare_setting(node: Node, item: Any) -> Any:
+def _declare_setting(node: Node, overrides: Mapping[str, Any], item: Any) -> Any:
     text, lower = item.metadata['text'], item.metadata.get('lower')
-    fixed = item.name in STARTUP
-    if isinstance(item.default, tuple | str):
-        return _declare(node, item.name, item.default, text, fixed)
+    ranges: dict[str, Any] = {}
     if isinstance(item.default, int):
-        span = IntegerRange(from_value=int(lower), to_value=2**31 - 1)
-        return _declare(node, item.name, item.default, text, fixed, integer_range=[span])
-    span = FloatingPointRange(from_value=float(lower), to_value=1e9)
-    return _declare(node, item.name, item.default, text, fixed, floating_point_range=[span])
+        ranges['integer_range'] = [IntegerRange(from_value=int(lower), to_value=2**31 - 1)]
+    elif isinstance(item.default, float):
+        span = FloatingPointRange(from_value=float(lower), to_value=1e9)
+        ranges['floating_point_range'] = [span]
+    fixed = item.name in STARTUP
+    return _declare(node, overrides, item.name, item.default, text, fixed, **ranges)
 
 
 def _names(values: Sequence[str] | None) -> tuple[str, ...]:

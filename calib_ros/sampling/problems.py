@@ -9,11 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.errors import ConfigError
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 
 
@@ -26,6 +28,10 @@ def check_settings(chain: Chain, settings: Settings) -> None:
         When a name is unknown to this chain, say.
 
     """
+    if settings.mode == 'continuous' and any(
+        each.board for each in parse_sources(settings.sources)
+    ):
+        raise ConfigError('images are looked at where the arm stands: mode must not be continuous')
     nothing = np.zeros((0, len(chain.joints)))
     empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
     Problem(chain, empty, **settings.for_problem())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib_ros.apply import chart
-from calib_ros.apply.chart import drift, limit, run_length
+from calib_ros.apply.chart import drift, run_length
 from calib_ros.errors import InputError
 
 
@@ -23,18 +23,6 @@ def test_more_steps_change_nothing(monkeypatch):
     few = run_length(0.5, 5.0)
     monkeypatch.setattr(chart, 'STEPS', 600)
     assert run_length(0.5, 5.0) == pytest.approx(few, rel=0.01)
-
-
-@pytest.mark.parametrize('slope', chart.SLOPES)
-def test_a_simulation_runs_as_long(slope):
-    """2,000 runs of 100 nights on average: the mean has a standard error of 2.2 %."""
-    height = limit(slope, 100.0)
-    z = np.random.default_rng(0).normal(size=(2000, 1500))
-    sums, ended = np.zeros(2000), np.full(2000, 1500)
-    for night in range(1500):
-        sums = np.maximum(0.0, sums + z[:, night] - slope)
-        ended = np.where((sums > height) & (ended == 1500), night + 1, ended)
-    assert ended.mean() == pytest.approx(100.0, rel=0.07)
 
 
 def test_false_alarms_are_as_rare_as_said():

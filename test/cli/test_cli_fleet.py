@@ -103,4 +103,5 @@ def test_a_scheduler_that_is_lost_is_told_of(folder, capsys, monkeypatch):
     plants.write_plant(folder, ['A'], 1)
     command = ['fleet', 'plant.yaml', '--history', 'history', '--scheduler', 'tcp://127.0.0.1:1']
     assert main(command) == 1
+    assert not list(folder.glob('history/*'))
     assert 'tcp://127.0.0.1:1' in capsys.readouterr().err

@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-import multiprocessing
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from datetime import datetime, timedelta, timezone
+from threading import Barrier
 
 import numpy as np
 import pandas
@@ -150,22 +151,16 @@ def test_the_time_is_that_of_the_measurement():
     assert at == datetime.fromtimestamp(1.7e9, timezone.utc)
 
 
-def _race(folder, barrier):
-    store = History(folder)
-    barrier.wait()
-    for k in range(20):
-        store.file(row(k))
-
-
 def test_writers_that_race_file_each_result_once(tmp_path):
-    context = multiprocessing.get_context('spawn')
-    barrier = context.Barrier(2)
-    writers = [context.Process(target=_race, args=(tmp_path, barrier)) for _ in range(2)]
-    for each in writers:
-        each.start()
-    for each in writers:
-        each.join()
-        assert each.exitcode == 0
+    barrier = Barrier(2)
+
+    def write(store):
+        barrier.wait()
+        for k in range(20):
+            store.file(row(k))
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(write, [History(tmp_path), History(tmp_path)]))
     assert len(pandas.read_parquet(tmp_path)) == 20
     assert len(History(tmp_path).rows('SN 1/ö')) == 20
 

@@ -21,6 +21,7 @@ from calib_ros.cli.main import main
 from calib_ros.files.history import History
 
 DASK = Path(sys.executable).with_name('dask')
+TWO = ('--nworkers', '2', '--nthreads', '1')
 ALONE = ('--host', '127.0.0.1', '--no-dashboard')
 
 
@@ -66,8 +67,7 @@ def test_whatever_is_killed_each_result_is_filed_once(served):
     history, known = served / 'history', served / 'scheduler.json'
     with (
         started(DASK, 'scheduler', *ALONE, '--port', '0', '--scheduler-file', known),
-        started(DASK, 'worker', '--scheduler-file', known, '--nthreads', '1', *ALONE) as nanny,
-        started(DASK, 'worker', '--scheduler-file', known, '--nthreads', '1', *ALONE),
+        started(DASK, 'worker', '--scheduler-file', known, *TWO, *ALONE) as nannies,
     ):
         until(lambda: known.exists() and known.read_text().endswith('}'))
         address = json.loads(known.read_text())['address']
@@ -79,8 +79,8 @@ def test_whatever_is_killed_each_result_is_filed_once(served):
 
         with started(sys.executable, '-m', 'calib_ros.cli.main', *command) as client:
             until(lambda: filed() >= 2)
-            for worker in psutil.Process(nanny.pid).children():
-                worker.kill()
+            workers = psutil.Process(nannies.pid).children()
+            next(each for each in workers if 'spawn_main' in ' '.join(each.cmdline())).kill()
             until(lambda: filed() >= 5)
             assert client.poll() is None
             client.kill()

@@ -8,7 +8,9 @@ from calib_ros.errors import ConfigError
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
-from calib_ros.fleet.run import Cluster, LostError, run
+from calib_ros.fleet.run import Cluster, run
+from calib_ros.fleet.standing import standings
+from calib_ros.fleet.work import Outcome, Source, Task
 
 
 @pytest.fixture(scope='module')
@@ -21,6 +23,12 @@ def cluster():
 def plant(tmp_path):
     path = plants.write_plant(tmp_path, ('A', 'B'), 2)
     return read_plant(path)
+
+
+def echoed(task):
+    if task.source.url == '150':
+        raise RuntimeError('150')  # as dask tells of a worker that has died too often
+    return Outcome(error=task.source.url, seconds=0.01)
 
 
 def keys(history):
@@ -68,6 +76,29 @@ def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     assert 'nothing matches' in found.errors['B']['']
 
 
+def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
+    history = History(tmp_path / 'history')
+    run(plant, history, cluster)
+    row = next(tmp_path.glob('history/robot=A/*.parquet'))
+    row.write_bytes(row.read_bytes()[:500])
+    (tmp_path / 'nights/B/002.csv').write_text(plants.night(*plants.robot(1), 2))
+    found = run(plant, history, cluster)
+    assert found.filed == 1
+    assert row.name in found.errors['A']['']
+    first, second = standings(plant, history, found)
+    assert (first.robot.serial, first.state, first.last) == ('A', 'unreadable', None)
+    assert (second.robot.serial, second.state) == ('B', 'fine')
+
+
+def test_small_tasks_go_together_and_the_one_that_ends_a_worker_is_found(plant, cluster):
+    tasks = [Task(plant[0], Source(str(number))) for number in range(200)]
+    with running._client(cluster) as client:
+        done = {task.source.url: found for task, found in running._done(client, tasks, echoed)}
+    assert len(done) == 200
+    assert done.pop('150').error.startswith('its worker ended: 150')
+    assert all(outcome.error == url for url, outcome in done.items())
+
+
 def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeypatch):
     history = History(tmp_path / 'history')
     original = running.work.__globals__['read_table']
@@ -83,14 +114,6 @@ def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeyp
     assert [next(iter(each.values())) for each in found.errors.values()] == [
         'ZeroDivisionError: by zero'
     ] * 2
-
-
-def test_without_a_scheduler_nothing_is_lost(plant, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, 'PATIENCE', 0.5)
-    history = History(tmp_path / 'history')
-    with pytest.raises(LostError, match=r'tcp://127\.0\.0\.1:1'):
-        run(plant, history, Cluster('tcp://127.0.0.1:1'))
-    assert keys(history) == set()
 
 
 def test_workers_of_another_version_are_refused(plant, cluster, tmp_path, monkeypatch):

@@ -79,8 +79,10 @@ def test_several_changes_and_those_before_a_date(first, rng):
     rows = [replace(r, offsets=r.offsets + 1e-4 * again * (k >= 12)) for k, r in enumerate(rows)]
     changes = watch(rows).changes
     assert [change.joint for change in changes] == ['elbow_joint', 'wrist_1_joint']
-    assert [c.joint for c in watch(rows, changes[0].time).changes] == ['wrist_1_joint']
-    assert watch(rows, changes[1].time).changes == ()
+    assert [c.joint for c in watch([r for r in rows if r.time >= changes[0].time]).changes] == [
+        'wrist_1_joint'
+    ]
+    assert watch([r for r in rows if r.time >= changes[1].time]).changes == ()
 
 
 def test_what_cannot_be_compared_is_left_out(first, rng):
@@ -95,6 +97,5 @@ def test_what_cannot_be_compared_is_left_out(first, rng):
     rows[3] = replace(rows[3], verdict='refused', offsets=rows[3].offsets + 1.0)
     found = watch(rows)
     assert [night.row for night in found.nights] == [rows[k] for k in (0, 1, 4, 5)]
-    assert found.left_out == (rows[2],)
     assert found.changes == ()
     assert watch(()).nights == watch(rows[:1]).changes == ()

@@ -120,18 +120,18 @@ def test_dependent_columns_by_hand():
     factor[:3] = matrix
     names = ('a', 'b', 'sum', 'nothing', 'c')
     assert independent(factor, names) == ('a', 'b', 'c')
-    assert trades(factor, names, ('a', 'b', 'c')) == {'sum': ['a', 'b'], 'nothing': []}
+    assert trades(factor.T @ factor, names, ('a', 'b', 'c')) == {'sum': ['a', 'b'], 'nothing': []}
     swapped = factor[:, [2, 1, 0, 3, 4]]
     others = ('sum', 'b', 'a', 'nothing', 'c')
     assert independent(swapped, others) == ('sum', 'b', 'c')
-    assert trades(swapped, others, ('sum', 'b', 'c'))['a'] == ['sum', 'b']
+    assert trades(swapped.T @ swapped, others, ('sum', 'b', 'c'))['a'] == ['sum', 'b']
 
 
 def test_a_trade_is_named_though_a_fitted_parameter_shows_nowhere():
     """A prior keeps a parameter that no pose depends on; its column is zero."""
     a, b, _ = np.eye(3)
     factor = np.stack([a, np.zeros(3), 2.0 * a], axis=1)
-    assert trades(factor, ('a', 'hidden', 'twice'), ('a', 'hidden')) == {'twice': ['a']}
+    assert trades(factor.T @ factor, ('a', 'hidden', 'twice'), ('a', 'hidden')) == {'twice': ['a']}
     factor = np.stack([b, np.zeros(3), 2.0 * a], axis=1)
     assert independent(factor, ('b', 'hidden', 'a')) == ('b', 'a')
 

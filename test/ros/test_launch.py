@@ -116,7 +116,7 @@ def parameters_of(words, name='calibration_node'):
         start_parameter_services=False,
     )
     try:
-        found = {key: each.value for key, each in node._parameters.items()}
+        found = {key: each.value for key, each in node.get_parameters_by_prefix('').items()}
         return {
             key: list(value) if isinstance(PARAMETERS.get(key, node).default, tuple) else value
             for key, value in found.items()
@@ -230,7 +230,7 @@ def test_every_parameter_of_the_node_is_an_argument():
     with Cell(chain='ur10e') as cell:
         declared = {
             name: cell.node.get_parameter(name).value
-            for name in cell.node._parameters
+            for name in cell.node.get_parameters_by_prefix('')
             if name not in OTHERS and not name.startswith('qos_overrides.')
         }
     assert set(declared) == set(PARAMETERS)

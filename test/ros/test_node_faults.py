@@ -24,10 +24,8 @@ from ros_cell import (
     direct,
     joint_messages,
     pose_messages,
-    shift,
     stamp_ns,
     topics,
-    true_arm,
     values_of,
 )
 from rosgraph_msgs.msg import Clock
@@ -37,7 +35,6 @@ from std_msgs.msg import String
 from calib_ros.errors import ConfigError
 from calib_ros.files.archive import Archive
 from calib_ros.files.tables import read_journal
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import inputs as inputs_module
 from calib_ros.ros import node as node_module
 from calib_ros.ros.advisor import Guide
@@ -46,18 +43,6 @@ from calib_ros.ros.outputs import Keeper
 from calib_ros.sampling.session import CalibrationSession
 
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-
-@pytest.fixture(scope='module')
-def recording():
-    return shift(true_arm())
-
-
-@pytest.fixture
-def cell(monkeypatch, tmp_path):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
-    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
-        yield cell
 
 
 @pytest.fixture
@@ -78,6 +63,10 @@ def part(recording, first, last):
         topic: [m for m in messages if first <= (stamp_ns(m) - START) * 1e-9 < last]
         for topic, messages in topics(recording).items()
     }
+
+
+def begun(folder):
+    return any(path.stat().st_size for path in folder.glob('*Z.csv'))
 
 
 def samples_in(folder):
@@ -118,28 +107,34 @@ def cell_and_child(**parameters):
 # Killed
 
 
-def test_a_killed_node_goes_on_with_all_its_samples(tmp_path, recording):
-    with cell_and_child(data_dir=tmp_path) as (cell, child):
+def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
+    monkeypatch, tmp_path, recording
+):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.delenv('ROS_HOME', raising=False)
+    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
+    folder = tmp_path / '.ros' / 'calib_ros'
+    with cell_and_child() as (cell, child):
         cell.play(part(recording, 0.0, 12.0))
-        cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 10)
+        cell.spin_until(lambda: begun(folder))
+        cell.spin_until(lambda: len(samples_in(folder)) == 10)
         child.kill()
-    (path,) = tmp_path.glob('*Z.csv')
+    (path,) = folder.glob('*Z.csv')
     with path.open('a') as file:
         file.write('1700000000,0.1,0.')  # a row that a crash of the machine cut off
-    with cell_and_child(data_dir=tmp_path, resume='true') as (cell, child):
+    with cell_and_child(resume='true') as (cell, child):
         output = child.wait_for('ready to calibrate')
         assert 'was cut off and is left out' in output
         assert f'resumed 10 samples of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
-        cell.spin_until(lambda: len(samples_in(tmp_path)) == 20)
+        cell.spin_until(lambda: len(samples_in(folder)) == 20)
         answer = cell.call('identify')
         assert answer.success, answer.message
         assert '22 samples' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
     expected.finish()
     survived = [s for s in expected.samples if not 10.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
-    for kept, sample in zip(samples_in(tmp_path), survived, strict=True):
+    for kept, sample in zip(samples_in(folder), survived, strict=True):
         assert kept.stamp_ns == sample.stamp_ns
         np.testing.assert_array_equal(kept.joints, sample.joints)
         np.testing.assert_array_equal(kept.position, sample.position)
@@ -150,18 +145,19 @@ import os, time
 sync = os.fsync
 def slow(file):
     sync(file)
-    if os.readlink(f'/proc/self/fd/{file}').endswith('.partial'):
+    name = os.readlink(f'/proc/self/fd/{file}')
+    if '.yaml' in name and name.endswith('.partial'):
         print('in the middle of saving', flush=True)
         time.sleep(60.0)
 os.fsync = slow
 """
 SLOW_IDENTIFICATION = """
 import time
-from calib_ros.ros import node
+from calib_ros.ros import identifying, node
 def identify_model(problem, model, progress):
     print('identifying', flush=True)
     time.sleep(60.0)
-node.identify_model = identify_model
+identifying.identify_model = identify_model
 close = node.CalibrationNode.close
 def noisy(self):
     print('joining', flush=True)
@@ -178,44 +174,33 @@ sys.exit(main())
 def test_killed_while_it_saves(journal):
     with cell_and_child(data_dir=journal, resume='true') as (cell, child):
         assert cell.call('identify').success
-        assert cell.call('save').success
-        (earlier,) = journal.glob('*Z.yaml')
-        whole = earlier.read_text()
+        for _ in range(4):
+            assert cell.call('save').success
+        cell.start_call('save')
         child.kill()
+    saved = sorted(journal.glob('*Z.yaml'))
+    assert len(saved) >= 4
+    (whole,) = {path.read_text() for path in saved}
     command = ('-c', SLOW_SAVE + RUN)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
         assert cell.call('identify').success
         cell.start_call('save')
         child.wait_for('in the middle of saving')
         child.kill()
-    assert list(journal.glob('*Z.yaml')) == [earlier]
-    assert earlier.read_text() == whole
+    assert sorted(journal.glob('*Z.yaml')) == saved
+    assert {path.read_text() for path in saved} == {whole}
     with Cell(chain='ur10e', data_dir=str(journal)) as cell:
         loaded = cell.call('load')
         assert loaded.success, loaded.message
-        assert str(earlier) in loaded.message
+        assert str(saved[-1]) in loaded.message
 
 
-def test_killed_in_a_loop_of_saves(journal):
-    with cell_and_child(data_dir=journal, resume='true') as (cell, child):
-        assert cell.call('identify').success
-        for _ in range(12):
-            assert cell.call('save').success
-        cell.start_call('save')
-        child.kill()
-    saved = list(journal.glob('*Z.yaml'))
-    assert len(saved) >= 12
-    assert len({path.read_text() for path in saved}) == 1
-    assert load_chain(saved[-1]).joint_names == true_arm().joint_names
-
-
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_ended_while_an_identification_runs(journal, number):
+def test_ended_while_an_identification_runs(journal):
     command = ('-c', SLOW_IDENTIFICATION + RUN)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
         cell.start_call('identify')
         child.wait_for('identifying')
-        child.process.send_signal(number)
+        child.process.send_signal(signal.SIGTERM)
         child.process.send_signal(signal.SIGINT)  # a second one harms nothing
         child.wait_for('joining')
         child.process.send_signal(signal.SIGINT)
@@ -233,45 +218,24 @@ def test_the_last_stop_is_kept_at_the_end(tmp_path, recording):
 # The first run
 
 
-@contextmanager
-def fresh_home(monkeypatch, tmp_path):
-    monkeypatch.setenv('HOME', str(tmp_path))
-    monkeypatch.delenv('ROS_HOME', raising=False)
-    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
-    yield tmp_path / '.ros' / 'calib_ros'
-
-
-@pytest.mark.parametrize(('number', 'default'), [(signal.SIGKILL, True), (signal.SIGTERM, False)])
-def test_the_first_run_of_an_account_loses_nothing(
-    monkeypatch, tmp_path, recording, default, number
-):
-    with fresh_home(monkeypatch, tmp_path) as folder:
-        given = {}
-        if not default:
-            folder = tmp_path / 'not' / 'yet' / 'there'
-            given = {'data_dir': folder}
-        with cell_and_child(**given) as (cell, child):
-            status = cell.listen(String, '/calibration_node/status')
-            cell.play(part(recording, 0.0, 12.0))
-            cell.spin_until(lambda: status and '; 10 samples' in status[-1].data)
-            if number == signal.SIGKILL:
-                child.kill()
-            else:
-                assert child.end(number) == 0, child.output
-            assert 'memory only' not in child.output
-        kept = samples_in(folder)
-        assert len(kept) == (10 if number == signal.SIGKILL else 12)
-        with cell_and_child(resume='true', **given) as (_, child):
-            assert f'resumed {len(kept)} samples' in child.wait_for('ready to calibrate')
+def test_a_folder_that_is_not_there_yet_is_made(tmp_path, recording):
+    folder = tmp_path / 'not' / 'yet' / 'there'
+    with cell_and_child(data_dir=folder) as (cell, child):
+        status = cell.listen(String, '/calibration_node/status')
+        cell.play(part(recording, 0.0, 12.0))
+        cell.spin_until(lambda: status and '; 10 samples' in status[-1].data)
+        assert child.end(signal.SIGTERM) == 0, child.output
+        assert 'memory only' not in child.output
+        assert 'Traceback' not in child.output
     expected = direct(recording)
     expected.finish()
-    for one, other in zip(kept, expected.samples[: len(kept)], strict=True):
+    for one, other in zip(samples_in(folder), expected.samples[:12], strict=True):
         assert one.stamp_ns == other.stamp_ns
         np.testing.assert_array_equal(one.position, other.position)
 
 
-@pytest.mark.parametrize('folder', ['/proc/nope', '/dev/null/nope'])
-def test_a_node_that_could_keep_no_samples_does_not_start(folder):
+def test_a_node_that_could_keep_no_samples_does_not_start():
+    folder = '/proc/nope'
     with Child(chain='ur10e', data_dir=folder) as child:
         assert child.end() == 1
     lines = [line for line in child.output.splitlines() if 'calibration_node:' in line]
@@ -289,7 +253,7 @@ def test_a_full_disk(tmp_path, recording):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         status = cell.listen(String, '/calibration_node/status')
         cell.play(part(recording, 0.0, 6.0))
-        cell.spin_until(lambda: list(tmp_path.glob('*Z.csv')))
+        cell.spin_until(lambda: begun(tmp_path))
         cell.spin_until(lambda: len(samples_in(tmp_path)) == 4)
         (path,) = tmp_path.glob('*Z.csv')
         _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
@@ -520,8 +484,7 @@ def test_stray_stamps_are_told_and_cost_nothing_else(cell, recording):
     assert len(cell.node.session.samples) == STOPS
 
 
-def test_poses_in_another_frame_than_frame_id_are_dropped(monkeypatch, tmp_path, recording):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_poses_in_another_frame_than_frame_id_are_dropped(tmp_path, recording):
     some = pose_messages(recording.poses)
     some[40].header.frame_id = 'camera'
     with Cell(chain='ur10e', data_dir=str(tmp_path), frame_id='tracker') as cell:
@@ -546,8 +509,8 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     cell.play(topics(recording, joint_states=joint_messages(recording, names)))
     answer = cell.call('identify')
     assert not answer.success
-    assert 'set joint_names' in answer.message
-    assert names[5] in answer.message
+    assert 'set joint_names' in cell.in_full(answer)
+    assert names[5] in cell.in_full(answer)
     said = 'waiting for joint states, set joint_names? Those that come name '
     cell.spin_until(lambda: words and words[-1].data.startswith(said))
     missing = recording.joint_names if all_renamed else recording.joint_names[5:]
@@ -574,8 +537,7 @@ def test_broken_messages_are_counted_by_cause(cell, recording):
     assert cell.call('identify').success
 
 
-def test_an_overridden_qos(monkeypatch, tmp_path, recording):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_an_overridden_qos(tmp_path, recording):
     override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
     with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
@@ -642,8 +604,7 @@ def test_an_overridden_qos_leaves_other_topics_alone(tmp_path):
         assert offered('/measured_pose') == [ReliabilityPolicy.BEST_EFFORT]
 
 
-def test_a_queue_that_was_full_is_told(monkeypatch, tmp_path, recording):
-    monkeypatch.setattr(node_module, 'DIAGNOSTICS_PERIOD', 0.1)
+def test_a_queue_that_was_full_is_told(tmp_path, recording):
     override = {'qos_overrides./joint_states.subscription.depth': 5}
     with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
@@ -752,7 +713,7 @@ def test_a_list_without_end_is_refused(cell):
     assert cell.node.session.settings.fixed == ()
 
 
-def test_a_negative_time_does_not_end_the_node(tmp_path, recording):
+def test_a_negative_time_does_not_end_the_node(tmp_path):
     with cell_and_child(data_dir=tmp_path, use_sim_time='true') as (cell, child):
         clock = cell.publisher(Clock, '/clock')
         stamps = cell.listen(DiagnosticArray, '/diagnostics', 10)
@@ -781,5 +742,5 @@ def test_a_negative_time_does_not_end_the_node(tmp_path, recording):
 def test_what_comes_out_after_the_end_is_no_error(tmp_path, capfd):
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         node = cell.node
-    node._guarded(node._status.publish)(String())
+    node._boundary.guarded(node._status.publish)(String())
     assert 'internal error' not in capfd.readouterr().err

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera on the flange before a printed board, live: from images to a calibration."""
 
+import sys
+import threading
 from array import array
 from functools import cache
 
@@ -14,8 +16,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from calib_ros.apply.simulation import Camera, before_camera, drive, faulty, photograph
 from calib_ros.apply.simulation import Cell as SimulatedCell
+from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
-from calib_ros.files.cameras import cameras_of
+from calib_ros.files.cameras import cameras_of, lens_in
+from calib_ros.files.images import grey
 from calib_ros.files.recording import Recording
 from calib_ros.files.tables import read_journal
 from calib_ros.kinematics import se3
@@ -24,6 +28,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling import pictures
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
+from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
@@ -33,8 +38,8 @@ from photographs import CHARUCO, rendered
 
 LENS = Lens(800.0, 810.0, 322.0, 243.0)
 VIEW = Camera(LENS, 640, 480, depth=0.5)
-STOPS, EACH = 20, 3
-SPOILT = {3: 'blurred', 7: 'with too little of the board', 11: 'without the board'}
+STOPS, EACH = 36, 2
+SPOILT = {3: 'blurred', 7: 'with too little of the board'}
 """Stops whose images cannot be used."""
 
 
@@ -60,8 +65,6 @@ def shift(truth):
         if k == 7:
             image[:, :] = np.roll(image, 320, axis=1)
             image[:, :560] = 200
-        if k == 11:
-            image[:] = 200
         shots.append(image)
     recording = Recording(truth.joint_names, stamps, joints, seen, np.zeros(0, bool))
     return joint_messages(recording), shots, image_stamps.reshape(STOPS, EACH).tolist()
@@ -108,11 +111,19 @@ def sources(board, kind, more=''):
     return (f'{TOPICS[kind]} board={board} device=camera eye_in_hand=true{more}',)
 
 
+def rooted(given):
+    return tuple(f'/{each}' for each in given)
+
+
+def streams_of(given):
+    streams = {each.topic: each for each in measured(parse_sources(given), {})}
+    return {**streams, 'joint_states': Stream('joint_states', JOINT_STATE)}
+
+
 def directly(come, given):
     session = CalibrationSession(load_chain('ur10e'), Settings(sources=given))
     session.pictures.cameras, session.pictures.patient = cameras_of(given), True
-    streams = {each.topic: each for each in measured(parse_sources(given), {})}
-    streams['joint_states'] = Stream('joint_states', JOINT_STATE)
+    streams = streams_of(given)
     batch = [(streams[topic], message) for topic, message in come]
     assert feed(session, batch, lambda message, kind: message) == []
     return session
@@ -158,36 +169,137 @@ def by_topic(come):
     return found
 
 
-@pytest.mark.parametrize('kind', [Image, CompressedImage])
-def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board, kind):
-    come, given = messages(shift, kind), sources(board, kind)
+def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
+    come, given = messages(shift, Image), sources(board, Image)
     expected = directly(come, given)
-    wanted = expected.problem()
-    rooted = tuple(f'/{each}' for each in given)
-    replayed = CalibrationSession(load_chain('ur10e'), Settings(sources=rooted))
+    wanted = expected.problem().observations
+    replayed = CalibrationSession(load_chain('ur10e'), Settings(sources=rooted(given)))
     bag_of(tmp_path / 'bag', come)
     assert replay(tmp_path / 'bag', replayed).warnings == ()
-    assert_same(wanted.observations, replayed.problem().observations)
+    assert_same(wanted, replayed.problem().observations)
     with Cell(chain='ur10e', sources=list(given), data_dir=str(tmp_path)) as cell:
         played = by_topic(come)
-        cell.publisher(CameraInfo, 'cam/camera_info').publish(played.pop('cam/camera_info')[0])
-        camera = cell.node.session.pictures.cameras[TOPICS[kind]]
-        cell.spin_until(lambda: not isinstance(camera._lens, pictures.Refusal))
         live = cell.node.session
         live.pictures.patient = True  # played faster than any arm moves
+        info = cell.publisher(CameraInfo, 'cam/camera_info')
+        info.publish(played.pop('cam/camera_info')[0])
+        camera = live.pictures.cameras[TOPICS[Image]]
+        cell.spin_until(lambda: not isinstance(camera._lens, Refusal))
         cell.play(played)
         answer = cell.call('identify')
-        assert_same(wanted.observations, live.problem().observations)
-        assert live.account() == expected.account()
-        assert answer.success, answer.message
+        assert_same(wanted, live.problem().observations)
+        assert live.account().dropped == expected.account().dropped
+        assert live.account().unused == expected.account().unused
+        assert answer.success, cell.in_full(answer)
         found = live.calibration.chain
-    samples = live.samples
-    assert len(samples) == STOPS - len(SPOILT)
-    assert wanted.observations.on_flange
-    dropped = live.account().dropped
-    assert dropped == {f'poses: image {cause}': 1 for cause in SPOILT.values()}
-    away = found.forward(wanted.observations.joints) - truth.forward(wanted.observations.joints)
+    assert wanted.on_flange
+    assert len(live.samples) == STOPS - len(SPOILT)
+    dropped = {f'poses: image {cause}': 1 for cause in SPOILT.values()}
+    assert live.account().dropped == dropped
+    away = found.forward(wanted.joints) - truth.forward(wanted.joints)
     assert 1e3 * np.abs(away[:, :3, 3]).max() < 0.2
-    (journal,) = (each for each in tmp_path.glob('*.csv'))
+    (journal,) = tmp_path.glob('*.csv')
     kept, _ = read_journal(journal, 6)
-    assert_same(wanted.observations, live.problem_of(kept).observations)
+    assert_same(wanted, live.problem_of(kept).observations)
+
+
+def test_compressed_images_of_a_bag_and_of_messages(tmp_path, shift, board):
+    raw = directly(messages(shift, Image, 8), sources(board, Image)).problem().observations
+    come, given = messages(shift, CompressedImage, 8), sources(board, CompressedImage)
+    assert_same(raw, directly(come, given).problem().observations)
+    replayed = CalibrationSession(load_chain('ur10e'), Settings(sources=rooted(given)))
+    bag_of(tmp_path / 'bag', come)
+    replay(tmp_path / 'bag', replayed)
+    assert_same(raw, replayed.problem().observations)
+
+
+class Slow:
+    """A camera that looks until it may go on."""
+
+    def __init__(self):
+        self.go_on = threading.Event()
+
+    def look(self, message):
+        assert self.go_on.wait(20.0)
+        return Refusal('blurred', 'it is blurred')
+
+
+def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_nothing(shift, board):
+    given = sources(board, Image)
+    session = CalibrationSession(load_chain('ur10e'), Settings(sources=given))
+    camera = Slow()
+    session.pictures.cameras = {TOPICS[Image]: camera}
+    come = [each for each in messages(shift, Image) if not isinstance(each[1], CameraInfo)]
+    batch = [(streams_of(given)[topic], message) for topic, message in come]
+    assert feed(session, batch, lambda message, kind: message) == []
+    assert session.account().joint_states == len(shift[0])  # none has waited
+    assert session.account().dropped['poses: image while others were looked at'] > STOPS // 2
+    camera.go_on.set()
+    session.finish()
+    assert session.account().dropped['poses: image blurred'] >= pictures.MOST_WAITING
+    assert 'the last image is not used: it is blurred' in session.status()
+
+
+def test_memory_for_images_is_bounded(monkeypatch):
+    monkeypatch.setattr(pictures, 'MOST_BYTES', 1000)
+    kept = pictures.Pictures(lambda: 0.3)
+    for _ in range(50):
+        newest = kept.keep('image', 100, lambda: None)
+    assert newest in kept._kept
+    assert 4 < len(kept._kept) <= 10
+    assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
+
+
+@pytest.mark.parametrize(
+    ('change', 'said'),
+    [
+        ({'k': [0.0] * 9}, 'not calibrated'),
+        ({'binning_x': 2}, 'without roi and binning'),
+        ({'distortion_model': 'equidistant'}, 'must be plumb_bob'),
+        ({'d': [0.0] * 5 + [0.1] * 3}, 'only k1 k2 p1 p2 k3'),
+    ],
+)
+def test_a_camera_info_that_cannot_be_used(change, said):
+    info = CameraInfo(distortion_model='plumb_bob', d=[0.1, 0.2, 0.3, 0.4, 0.5])
+    info.k = [800.0, 0.0, 322.0, 0.0, 810.0, 243.0, 0.0, 0.0, 1.0]
+    lens = lens_in(info)
+    assert (lens.fx, lens.cy, lens.k1, lens.k3) == (800.0, 243.0, 0.1, 0.5)
+    for name, value in change.items():
+        setattr(info, name, value)
+    with pytest.raises(ConfigError, match=said):
+        lens_in(info)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('cam/image_raw type=Image', 'needs board=FILE'),
+        ('cam/pose type=PoseStamped board=x.yaml', 'needs board=FILE'),
+        ('cam/image_raw board=x.yaml lens=thick', 'unknown lens'),
+        ('cam/image_raw board=/nowhere.yaml', 'nowhere.yaml'),
+        ('cam/image_rect board=BOARD', 'before it is rectified'),
+    ],
+)
+def test_a_source_of_images_that_cannot_be(board, text, said):
+    with pytest.raises(CalibrationError, match=said):
+        cameras_of([text.replace('BOARD', str(board))])
+
+
+def test_what_images_need_is_told(monkeypatch, board):
+    with pytest.raises(ConfigError, match='mode must not be continuous'):
+        CalibrationSession(
+            load_chain('ur10e'), Settings(mode='continuous', sources=sources(board, Image))
+        )
+    monkeypatch.setitem(sys.modules, 'cv2', None)
+    with pytest.raises(ConfigError, match='photographs need OpenCV: sudo apt install'):
+        cameras_of(sources(board, Image))
+
+
+def test_bayer_patterns_become_grey():
+    rng = np.random.default_rng(0)
+    colours = rng.integers(0, 255, 3)
+    for encoding, places in (('bayer_rggb8', 'rggb'), ('bayer_gbrg8', 'gbrg')):
+        tile = np.array([colours['rgb'.index(each)] for each in places], np.uint8).reshape(2, 2)
+        image = np.tile(tile, (8, 8))
+        found = grey(image.ravel(), 16, 16, 16, encoding)[4:-4, 4:-4]
+        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0

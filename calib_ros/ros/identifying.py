@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An identification of the node's samples, on a snapshot of them and a thread of its own."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from visualization_msgs.msg import MarkerArray
+
+from calib_ros.files.archive import Archive
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import Identification, Outlier
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.problem import Problem
+from calib_ros.progress import Progress
+from calib_ros.report import words
+from calib_ros.ros import to_ros
+from calib_ros.ros.boundary import Answer
+from calib_ros.ros.filer import Filer
+from calib_ros.ros.outputs import Published
+from calib_ros.sampling.sample import Sample, named
+from calib_ros.sampling.session import CalibrationSession
+
+ANSWER_LENGTH = 200
+"""Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
+
+
+class Snapshot(NamedTuple):
+    """What an identification works on, and what it was called with."""
+
+    problem: Problem
+    model: str
+    samples: tuple[Sample, ...]
+    numbers: dict[Sample, int]
+    origin: dict[str, Any]
+    configuration: str
+    warnings: tuple[str, ...]
+
+    def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
+        """Return the numbers by which the operator knows the samples that are outliers."""
+        frames = named(self.samples)
+        known = {(each.stamp_ns, *frames.of(each)): self.numbers[each] for each in self.samples}
+        sets = self.problem.sets
+        return {
+            each: known[each.stamp_ns, sets[each.set].base, sets[each.set].tool]
+            for each in outliers
+        }
+
+
+class Identifying:
+    """Identifies, tells the result in words, and hands over what is accepted.
+
+    Parameters
+    ----------
+    node : Node
+    session : CalibrationSession
+    archive : Archive
+    filer : Filer
+    configuration : callable
+        Returns what the node is set to as a parameter file.
+    accepted : callable
+        Takes an accepted calibration, as what it is published, and its samples.
+    latched : QoSProfile
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        session: CalibrationSession,
+        archive: Archive,
+        filer: Filer,
+        configuration: Callable[[], str],
+        accepted: Callable[[Calibration, Published, Sequence[Sample]], None],
+        latched: QoSProfile,
+    ) -> None:
+        self._node, self._session, self._archive, self._filer = node, session, archive, filer
+        self._configuration, self._accepted = configuration, accepted
+        self._residuals = node.create_publisher(MarkerArray, '~/residuals', latched)
+        self.progress = Progress('identifying')
+        self.last = 'nothing identified yet'
+        """What came of the last identification or ~/load, in words."""
+        self.observability = ''
+
+    def snapshot(self, topics: Sequence[str], serial: str) -> Snapshot:
+        """Return the problem and all that goes with it, as they are now."""
+        session = self._session
+        problem = session.problem()
+        samples = tuple(session.usable)
+        origin = {
+            'robot_serial': serial,
+            'topics': topics,
+            'first_stamp_ns': min(sample.stamp_ns for sample in samples),
+            'last_stamp_ns': max(sample.stamp_ns for sample in samples),
+            'samples': len(samples),
+            'journal': str(self._archive.journal or ''),
+        }
+        numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
+        model, settings = session.settings.model, self._configuration()
+        found = Snapshot(problem, model, samples, numbers, origin, settings, session.warnings)
+        self.progress.begin()
+        return found
+
+    def run(self, given: Snapshot) -> Answer:
+        """Identify; publish only what is accepted."""
+        with self.progress.running():
+            result = identify_model(given.problem, given.model, self.progress)
+        self.last = words.summary(result, given.numbers_of(result.outliers), given.warnings)
+        self.observability = words.observability_in_words(result)
+        self._residuals.publish(
+            to_ros.residual_markers(
+                result,
+                given.problem.sets,
+                self._node.get_parameter('marker_scale').value,
+                self._node.get_clock().now().to_msg(),
+            )
+        )
+        if result.accepted:
+            found = Calibration.of(result, given.origin, named(given.samples).owners)
+            page = partial(_page, given, result)
+            self._accepted(
+                found, Published(found.dump(), given.configuration, page), given.samples
+            )
+        elif self._session.calibration is not None:
+            self.last += '; the last good calibration stays'
+        self.last += self._filer.identified(given.problem, result, self._session.settings)
+        return result.accepted, self.last
+
+    def shortened(self, answer: Answer) -> Answer:
+        """Return an answer cut to a few lines; all of it is in the log, and beside the journal."""
+        success, text = answer
+        if len(text) > ANSWER_LENGTH:
+            path = self._archive.note(text)
+            more = f' ... all of it: {path.name if path else "in the log"}'
+            text = textwrap.shorten(text, ANSWER_LENGTH, placeholder=more)
+        return success, text
+
+
+def _page(given: Snapshot, result: Identification) -> str | None:
+    """Return the report of an identification, None where its extra is missing."""
+    from calib_ros.report.page import Origin, inputs_of, render
+    from calib_ros.report.poses import poses_of
+    from calib_ros.report.reports import identification_report
+
+    journal, serial = given.origin['journal'], given.origin['robot_serial']
+    files = inputs_of([Path(journal)] if journal else [])
+    origin = Origin(files, serial=serial, settings=given.configuration)
+    poses = poses_of(given.problem, result)
+    return render(identification_report(given.problem, result, poses, origin))
