@@ -34,6 +34,7 @@ from calib_ros.identification.calibration import (
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.maps import workspace_report
+from calib_ros.report.markdown import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
@@ -88,12 +89,9 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
             'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
             'workspace.png': plots.workspace_png(survey),
         }
-    words = workspace.in_words(survey)
     _show(survey, screen)
     if arm.region is not None:
-        sentence = f'The calibration is {arm.region.in_words()}.'
-        words += f'\n{sentence}\n'
-        screen.bullet(sentence)
+        screen.bullet(f'The calibration is {arm.region.in_words()}.')
     found = None
     if task is not None:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
@@ -101,17 +99,16 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
             found = placement.place(
                 arm, task, options.aim, options.model, region, options.cells, options.turns
             )
-        placed = placement.in_words(found, options.aim, options.model)
-        words += f'\n{placed}'
-        screen.say(placed)
+        screen.say(placement.in_words(found, options.aim, options.model))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
     origin = origin_of(options, (calibration_file(options.result),))
     with screen.work('writing the report'):
-        contents |= page_of(workspace_report(arm, survey, origin, found), screen)
-    return contents | {'workspace.md': words}
+        report = workspace_report(arm, survey, origin, found)
+        contents['workspace.md'] = markdown(report, {})
+        return contents | page_of(report, screen)
 
 
 def _show(survey: Survey, screen: Screen) -> None:
