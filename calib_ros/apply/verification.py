@@ -193,11 +193,9 @@ def verify(
     lower, upper = rms_limits(rms, freedom, confidence)
     verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
-    limits = (float(lower[0]), float(upper[0]), float(freedom[0]))
+    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, arm.holds(rms))
-    return Verification(
-        comparison, tolerance, confidence, group, rms, *limits, *verdict, common, *known
-    )
+    return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 
 def _compared(
