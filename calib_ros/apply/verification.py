@@ -189,9 +189,7 @@ def verify(
     lost = sum(LOST[frame] for frame in fitted)
     rms = _rms(moments, lost)
     numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
-    freedom = freedom_of(moments) * (numbers - lost)
-    lower, upper = rms_limits(rms, freedom, confidence)
-    verdict, needed = _decided(tolerance, lower, upper, numbers)
+    lower, upper = rms_limits(rms, freedom_of(moments) * (numbers - lost), confidence)
     common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
     return Verification(
         comparison,
@@ -201,9 +199,8 @@ def verify(
         rms,
         float(lower[0]),
         float(upper[0]),
-        float(freedom[0]),
-        verdict,
-        needed,
+        freedom_of(moments) * (len(moments) - lost),
+        *_decided(tolerance, lower, upper, numbers),
         common,
         commanded is not None,
         fitted,

@@ -156,18 +156,7 @@ def recalibrate(
 
     """
     sets = (*problem.sets, *problem.judging)
-    if previous.covariance is None:
-        raise InputError(
-            'the earlier calibration does not hold the covariance of its parameters: identify it '
-            'again with this version, from the poses of then'
-        )
-    known = previous.chain.frame_names
-    for each in sets:
-        if not {each.base, each.tool} <= set(known):
-            raise InputError(
-                f'the earlier calibration knows the frames {", ".join(known)}, not {each.base} '
-                f'and {each.tool}'
-            )
+    _refuse_unknown(previous, sets)
     arm = _Arm.of(previous, years, growth)
     system = _system(problem, sets, previous)
     names = [name for frame in new for name in parameters_of(frame) if name in arm.names]
@@ -197,6 +186,21 @@ def recalibrate(
         before,
         after,
     )
+
+
+def _refuse_unknown(previous: Calibration, sets: Sequence[Observations]) -> None:
+    if previous.covariance is None:
+        raise InputError(
+            'the earlier calibration does not hold the covariance of its parameters: identify it '
+            'again with this version, from the poses of then'
+        )
+    known = previous.chain.frame_names
+    for each in sets:
+        if not {each.base, each.tool} <= set(known):
+            raise InputError(
+                f'the earlier calibration knows the frames {", ".join(known)}, not {each.base} '
+                f'and {each.tool}'
+            )
 
 
 @dataclass(frozen=True, eq=False)
