@@ -44,7 +44,6 @@ MOST = 100
 """Columns and rows of a board."""
 HEADER = ('image', 'corner', 'u', 'v')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
-HALF = np.pi / 2
 POSED = 'flange_pose'
 """Name of the virtual arm."""
 
@@ -229,15 +228,16 @@ def posed_arm() -> Chain:
 
     It takes the place of an arm of which only the flange's poses are known.
     """
+    half = np.pi / 2
     return Chain(
         POSED,
         'standard',
         (
-            Joint('flange_z', 'prismatic', theta=HALF, alpha=HALF),
-            Joint('flange_x', 'prismatic', theta=HALF, alpha=HALF),
-            Joint('flange_y', 'prismatic', alpha=-HALF),
-            Joint('flange_rx', alpha=HALF),
-            Joint('flange_ry', theta=HALF, alpha=HALF),
+            Joint('flange_z', 'prismatic', theta=half, alpha=half),
+            Joint('flange_x', 'prismatic', theta=half, alpha=half),
+            Joint('flange_y', 'prismatic', alpha=-half),
+            Joint('flange_rx', alpha=half),
+            Joint('flange_ry', theta=half, alpha=half),
             Joint('flange_rz'),
         ),
     )

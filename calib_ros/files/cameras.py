@@ -19,8 +19,6 @@ from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
 from calib_ros.sampling.sources import Source, parse_sources
 
-DIGITS = 4
-"""Decimals of pixels, the same as in tables of corners."""
 NO_INFO = Refusal('before any CameraInfo', 'no CameraInfo of it has come')
 
 
@@ -63,7 +61,7 @@ class BoardCamera:
         if isinstance(found, Refusal):
             return found
         number, pixels = found
-        return View(self._board.corners[number], np.round(pixels, DIGITS), lens)
+        return View(self._board.corners[number], np.round(pixels, 4), lens)  # as in a table
 
 
 def lens_in(info: Any) -> Lens:

@@ -142,9 +142,11 @@ def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: 
     """
     cv2 = opencv()
     known = {  # channels, and how they become grey; OpenCV names a Bayer pattern by its second row
-        **dict.fromkeys(('mono8', '8UC1'), (1, None)),
+        'mono8': (1, None),
+        '8UC1': (1, None),
         'rgb8': (3, cv2.COLOR_RGB2GRAY),
-        **dict.fromkeys(('bgr8', '8UC3'), (3, cv2.COLOR_BGR2GRAY)),
+        'bgr8': (3, cv2.COLOR_BGR2GRAY),
+        '8UC3': (3, cv2.COLOR_BGR2GRAY),
         'rgba8': (4, cv2.COLOR_RGBA2GRAY),
         'bgra8': (4, cv2.COLOR_BGRA2GRAY),
         'bayer_rggb8': (1, cv2.COLOR_BayerBG2GRAY),

@@ -42,7 +42,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 BENDING = ('gravity', 'compliance', 'backlash')
@@ -66,8 +66,6 @@ MOST = 2000
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
 ROUNDS = 60
-ROUNDING = 1e-12
-"""Added to the scaled precision, so that rounding cannot make it singular."""
 LEAST = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
@@ -183,19 +181,15 @@ def posterior_of(
         beside.append((lengths, SCALE))
     told = _told(chain, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
-    offsets = np.zeros(len(matrix))
-    for k, name in enumerate(names):
-        if not chain.owns_frame(name):
-            offsets[k] = chain.offset(name, nominal)
+    own = [0.0 if chain.owns_frame(n) else chain.offset(n, nominal) for n in names]
+    offsets = np.array([*own, *[0.0] * (len(matrix) - len(own))])
     vector = matrix @ offsets + told[:-1, -1]
-    groups = [None if name in known else group_of(chain, name) for name in every]
-    groups += [None] * len(beside)
+    groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
     size, near = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     stds = evidence.stds(size)
-    own = stds[: len(every)].tolist()
-    priors = {name: std for name, std in zip(every, own, strict=True) if std < np.inf}
+    priors = {name: std for name, std in zip(every, stds.tolist(), strict=False) if std < np.inf}
     arm = np.s_[: len(every)]
     mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
     doubted = []
@@ -273,7 +267,7 @@ def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, Floa
     diagonal = matrix[size, size] + precision
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
     scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
-    scaled[..., size, size] = diagonal * scale**2 + ROUNDING
+    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # which cannot make it singular
     return scaled, scale
 
 

@@ -25,9 +25,9 @@ from calib_ros.identification.leastsquares import (
     triangular_factor,
 )
 from calib_ros.identification.noise import Noise, noise_of
-from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.robust import Robust, reweighted, thorough_fit
+from calib_ros.identification.start import start_frames
 from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
@@ -87,13 +87,26 @@ class Fitted:
         )
 
 
-def excited_names(
+def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
+    """Return what arbitrary poses would determine, the nominal chain in its frames, the fit."""
+    model, separations = problem.model, problem.system(problem.sets).separation_rows
+    structural = identifiability.structurally_independent(
+        model, problem.free, problem.kinds, separations
+    )
+    _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
+    sigmas = (problem.sigma_position, problem.sigma_orientation)
+    start = start_frames(model, problem.sets, *sigmas, problem.loss)
+    names, factor = _excited_names(problem, structural, start)
+    return structural, start, _fit_all(problem, names, start, factor, simpler)
+
+
+def _excited_names(
     problem: Problem, structural: Sequence[str], start: Chain
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Return the parameters that the poses determine, and their factor by some samples."""
     priors = problem.prior_sigmas
     wanted = [n for n in problem.free if n in structural or n in priors]
-    few, every = problem.system([some(each) for each in problem.sets]), problem.sets
+    few, every = problem.system([each.spread(SOME) for each in problem.sets]), problem.sets
     factor = factor_of(start, wanted, few)
     names = identifiability.excited(factor, wanted)
     if len(names) < len(wanted) and few.count < sum(map(len, every)):  # more may determine more
@@ -103,7 +116,7 @@ def excited_names(
     return names, factor_of_some(factor, [k for k, n in enumerate(wanted) if n in names])
 
 
-def fit_all(
+def _fit_all(
     problem: Problem,
     names: tuple[str, ...],
     start: Chain,
@@ -116,7 +129,7 @@ def fit_all(
     """
     problem = _guarded(problem, names, factor, simpler)
     rough = start
-    few = problem.system([some(each) for each in problem.sets])
+    few = problem.system([each.spread(SOME) for each in problem.sets])
     if simpler is not None:
         rough = simpler.chain.with_effects([name for name, _ in problem.model.effects])
     elif few.count < sum(map(len, problem.sets)) // 2:
@@ -207,12 +220,7 @@ def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> boo
     return any(posterior.held(name) > HELD for name in names if name not in problem.given)
 
 
-def some(observations: Observations) -> Observations:
-    """Return enough pairs, evenly spread, to come close to the result and to see its rank."""
-    return observations.select(np.arange(0, len(observations), 1 + len(observations) // SOME))
-
-
-def require_enough(problem: Problem, names: Sequence[str]) -> None:
+def _require_enough(problem: Problem, names: Sequence[str]) -> None:
     """Refuse a problem with fewer equations than parameters (P,)."""
     rows = configurations = 0
     for each, kind in zip(problem.sets, problem.kinds, strict=True):

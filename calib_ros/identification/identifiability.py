@@ -18,7 +18,7 @@ from scipy import linalg
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 RANK_TOLERANCE = 1e-8
@@ -221,8 +221,6 @@ class Uncertainty(Shown):
 
 TRADE = 1e-4
 """Least share of a parameter in a trade to be named."""
-ROUNDING = 1e-12
-"""Length of a column beside the longest one from which on it is more than rounding."""
 
 
 def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:

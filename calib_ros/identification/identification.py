@@ -11,7 +11,7 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,11 @@ from calib_ros.identification.acceptance import Findings, refusals, remarks
 from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior, considered
 from calib_ros.identification.fitting import (
+    SOME,
     Fitted,
     Simpler,
-    excited_names,
-    fit_all,
+    fit,
     parameter_rows,
-    require_enough,
-    some,
 )
 from calib_ros.identification.leastsquares import System, minimise, normal_equations
 from calib_ros.identification.misfits import arms_own
@@ -38,7 +36,6 @@ from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import KNOWN, Region, region_of
 from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
-from calib_ros.identification.start import start_frames
 from calib_ros.identification.steps import Step, find_step
 from calib_ros.identification.validation import (
     Comparison,
@@ -248,22 +245,10 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     known = None
     if simpler is not None:
         known = Simpler(simpler.chain, simpler.distances, simpler.noise)
-    system = problem.system(problem.sets)
-    structural = identifiability.structurally_independent(
-        problem.model, problem.free, problem.kinds, system.separation_rows
-    )
-    require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
-    start = start_frames(
-        problem.model,
-        problem.sets,
-        problem.sigma_position,
-        problem.sigma_orientation,
-        problem.loss,
-    )
-    names, factor = excited_names(problem, structural, start)
-    fitted = fit_all(problem, names, start, factor, known)
+    structural, start, fitted = fit(problem, known)
+    names = fitted.names
     problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
-    before = minimise(start, [n for n in names if start.owns_frame(n)], fitted.system)
+    before = minimise(start, [n for n in names if start.owns_frame(n)], robust.system)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
@@ -271,32 +256,32 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     posterior = fitted.posterior(
         _size(fitted), considered(chain, names), rounding_errors(problem, coarse)
     )
+    step = find_step(problem, names, robust)
     found = Findings(
         converged=before.converged and robust.fit.converged and robust.settled,
         parameters=parameters,
         validation=validation,
         chance=_chance(problem, before.chain, names, robust),
         region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
-        step=(step := find_step(problem, names, robust)),
+        step=step,
         own_behaviour=None if step else arms_own(problem, robust),
         may_be_rounding=bool(coarse)
         and may_be_rounding(problem, before.chain, names, coarse, robust.good),
     )
-    compared = compare(before.chain, chain, problem.sets)
     result = Identification(
         chain=chain,
         before=before.chain,
         parameters=parameters,
         names=names,
         uncertainty=fitted.uncertainty,
-        fitted=replace(compared, judged=~robust.outliers),
+        fitted=compare(before.chain, chain, problem.sets, ~robust.outliers),
         validation=validation,
         validated_by=validated_by,
         noise=fitted.noise,
         distances=robust.distances,
         outliers=_outliers(problem, robust),
         gauges=_gauges(problem, chain, names),
-        observability=identifiability.observability(fitted.factor, system.count),
+        observability=identifiability.observability(fitted.factor, robust.system.count),
         priors=_priors(problem),
         world_frame=problem.world_frame,
         iterations=robust.iterations,
@@ -336,7 +321,7 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     if any(each.socket for each in problem.sets):
         return None
     sets = [
-        some(each.select(np.flatnonzero(which)))
+        each.select(np.flatnonzero(which)).spread(SOME)
         for each, which in zip(problem.sets, robust.good, strict=True)
     ]
     frames = [name for name in names if before.owns_frame(name)]
@@ -364,7 +349,7 @@ def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, l
     free = problem.free
     if len(names) == len(free):
         return {}
-    few = problem.system([some(each) for each in problem.sets])
+    few = problem.system([each.spread(SOME) for each in problem.sets])
     normal = normal_equations(chain, free, System(few.sets))
     return identifiability.trades(normal.matrix, free, names)
 

@@ -176,7 +176,7 @@ class Normal:
 
 def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Normal:
     """Return the normal equations (P, P), (P,) and the sum of squared weighted residuals."""
-    products = _products(chain, names, system)[0]
+    products = products_of(chain, names, system)[0]
     total = products.sum(axis=0)
     extra, residual = system.extra_rows(chain, names)
     if len(extra):
@@ -185,10 +185,13 @@ def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Norm
     return Normal(total[:-1, :-1], total[:-1, -1], float(total[-1, -1]), products)
 
 
-def _products(
+def products_of(
     chain: Chain, names: Sequence[str], system: System, folds: Folds | None = None
 ) -> FloatArray:
-    """Return (K, 2, P + 1, P + 1) the products of measured rows, of one or of all folds."""
+    """Return (K, 2, P + 1, P + 1) the products of measured rows by fold; K = 1 without folds.
+
+    By position and by orientation, the residual last.
+    """
     size = len(names) + 1
     count = 1 if folds is None else 1 + max(int(each.max(initial=0)) for each in folds)
     found = np.zeros((count, 2, size, size))
@@ -316,7 +319,7 @@ def without_each(
     trusted, the fit is done on the samples.
     """
     curved = [k for k, name in enumerate(names) if not Parameter(name).of_lens]  # pixels are not
-    parts = _products(chain, names, system, folds).sum(axis=1)
+    parts = products_of(chain, names, system, folds).sum(axis=1)
     extra = np.column_stack(system.extra_rows(chain, names))
     rest = parts.sum(axis=0) + extra.T @ extra - parts
     for k, normal in enumerate(rest):

@@ -48,11 +48,6 @@ POLISHED = 6
 """Suspects that are polished."""
 MEANINGLESS = 0.25
 """Share of the spread of the positions from which an error explains nothing."""
-ROWS = (1, -1, 2, -2)
-"""Rows by which joint values may stand beside another measurement."""
-QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
-"""Zeros of joints [rad] that differ between conventions."""
-SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
-from calib_ros.identification.evidence import ROUNDING, group_of
+from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
@@ -33,7 +33,7 @@ from calib_ros.identification.validation import log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 PAYS = 0.999
 """One-sided confidence that the gain of a group or harmonic must have."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,22 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
-_OPTIONAL = (
-    *('covariance', 'approach', 'distances', 'velocity', 'acceleration', 'delay'),
-    *('pixels', 'points'),
-)
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    'stamps_ns': (),
+    'joints': (None,),
+    'positions': (3,),
+    'rotations': (3, 3),
+    'oriented': (),
+    'covariance': (6, 6),
+    'approach': (None,),
+    'distances': (),
+    'velocity': (None,),
+    'acceleration': (None,),
+    'delay': (),
+    'pixels': (2,),
+    'points': (3,),
+}
+"""Shapes of a pair's share of each array; None for the number of joints."""
 TURN = 2.0 * np.pi
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
@@ -33,7 +46,7 @@ GAP = 5.0
 WIDEST = 2.0
 """Size of a configuration's visits in units of the longest step between them."""
 FEWEST = 8
-"""Configurations from which on their distances tell what a visit is."""
+"""Configurations from which on their distances tell what a visit is, or who is near."""
 NEIGHBOURS = 8
 """Nearest values among which visits are looked for."""
 
@@ -105,39 +118,25 @@ class Observations(Shown):
 
     def __post_init__(self) -> None:
         """Check that the arrays fit together and hold only numbers."""
-        count = len(self.stamps_ns)
-        shapes = {
-            'joints': (count, *self.joints.shape[1:]),
-            'positions': (count, 3),
-            'rotations': (count, 3, 3),
-            'oriented': (count,),
-        }
-        if self.covariance is not None:
-            shapes['covariance'] = (count, 6, 6)
-        if self.delay is not None:
-            shapes['delay'] = (count,)
-        for name in ('approach', 'velocity', 'acceleration'):
-            if getattr(self, name) is not None:
-                shapes[name] = self.joints.shape
-        if self.distances is not None:
-            shapes['distances'] = (count,)
-        elif self.plane:
+        if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):
             raise InputError('pixels need the points of the board that they show, and points them')
-        if self.pixels is not None:
-            shapes |= {'pixels': (count, 2), 'points': (count, 3)}
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
+        count, joints = len(self.stamps_ns), self.joints.shape[-1]
+        for name, array in self._arrays().items():
+            shape = (count, *(joints if size is None else size for size in _SHAPES[name]))
+            if array.shape != shape:
                 raise InputError(
                     f'{name} of {count} observations must have the shape {shape}, not '
-                    f'{getattr(self, name).shape}'
+                    f'{array.shape}'
                 )
-        for name in ('joints', 'positions', 'rotations', *_OPTIONAL):
-            if name == 'covariance' or getattr(self, name) is None:
-                continue
-            if not np.isfinite(getattr(self, name)).all():
+            if name != 'covariance' and not np.isfinite(array).all():
                 raise InputError(f'{name} of the observations hold NaN or infinite values')
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays that there are, a row each pair."""
+        arrays = {name: getattr(self, name) for name in _SHAPES}
+        return {name: array for name, array in arrays.items() if array is not None}
 
     def __len__(self) -> int:
         """Return the number of pairs."""
@@ -190,14 +189,16 @@ class Observations(Shown):
 
     def select(self, mask: NDArray[np.generic]) -> Observations:
         """Return the pairs chosen by a mask or by indices."""
-        names = ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
-        present = [name for name in _OPTIONAL if getattr(self, name) is not None]
-        chosen = replace(self, **{name: getattr(self, name)[mask] for name in (*names, *present)})
+        chosen = replace(self, **{name: array[mask] for name, array in self._arrays().items()})
         if 'configurations' in vars(self):  # takes longer to find than all the rest
             _, vars(chosen)['configurations'] = np.unique(
                 self.configurations[mask], return_inverse=True
             )
         return chosen
+
+    def spread(self, most: int) -> Observations:
+        """Return every so many pairs, at most so many."""
+        return self.select(np.arange(0, len(self), 1 + len(self) // most))
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
         """Return the poses the other way round: a camera on the flange sees a fixed target.

@@ -13,7 +13,7 @@ two reasons cannot be told apart, both are free.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
 
@@ -34,13 +34,18 @@ from calib_ros.identification.changes import (
     reasons_document,
     reasons_of,
 )
-from calib_ros.identification.leastsquares import System, minimise, normal_equations
+from calib_ros.identification.leastsquares import (
+    System,
+    minimise,
+    normal_equations,
+    products_of,
+)
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document
 from calib_ros.identification.region import KNOWN
-from calib_ros.identification.validation import ErrorFigures, Residuals, compare
+from calib_ros.identification.validation import ErrorFigures, left_out
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import frames_document, table_hash
@@ -156,7 +161,7 @@ def recalibrate(
 
     """
     sets = (*problem.sets, *problem.judging)
-    _refuse_unknown(previous, sets)
+    _require_known(previous, sets)
     arm = _Arm.of(previous, years, growth)
     system = _system(problem, sets, previous)
     names = [name for frame in new for name in parameters_of(frame) if name in arm.names]
@@ -178,7 +183,7 @@ def recalibrate(
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
-    before, after = _judged(previous, arm, found, problem, sets)
+    before, after = _judged(previous, arm, found, system, sets)
     return Recalibration(
         _updated(previous, arm, found, problem, tuple(changed)),
         tuple(changed),
@@ -188,7 +193,8 @@ def recalibrate(
     )
 
 
-def _refuse_unknown(previous: Calibration, sets: Sequence[Observations]) -> None:
+def _require_known(previous: Calibration, sets: Sequence[Observations]) -> None:
+    """Refuse a calibration without a covariance, and frames that it does not know."""
     if previous.covariance is None:
         raise InputError(
             'the earlier calibration does not hold the covariance of its parameters: identify it '
@@ -267,37 +273,27 @@ def _judged(
     previous: Calibration,
     arm: _Arm,
     found: _Found,
-    problem: Problem,
+    system: System,
     sets: Sequence[Observations],
 ) -> tuple[ErrorFigures, ErrorFigures]:
     """Return the errors of the new poses before, and by what the others tell."""
     groups = numbered(sets)
-    folds = min(MOST_FOLDS, len(np.unique(np.concatenate(groups))))
-    offsets = dict(zip(arm.names, found.change, strict=True))
-    chain = arm.chain.with_offsets(offsets)
-    parts = []
-    for fold in range(folds):
-        out = [
-            each.select(np.flatnonzero(g % folds == fold))
-            for each, g in zip(sets, groups, strict=True)
-        ]
-        out = [each for each in out if len(each)]
-        normal = normal_equations(chain, arm.names, _system(problem, out, previous))
+    count = min(MOST_FOLDS, len(np.unique(np.concatenate(groups))))
+    folds = [numbers % count for numbers in groups]
+    chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
+    chains = []
+    for part in products_of(chain, arm.names, system, folds).sum(axis=1):
+        matrix, gradient = part[:-1, :-1], part[:-1, -1]
         rest = Told(
             arm.names,
-            found.told.information - normal.matrix,
-            found.told.vector - normal.gradient - normal.matrix @ found.change,
+            found.told.information - matrix,
+            found.told.vector - gradient - matrix @ found.change,
         )
         change = dict(zip(arm.names, rest.mean(arm.square)[0], strict=True))
-        parts.append(compare(previous.chain, _applied(previous, arm.chain, change), out))
-    whole = [
-        Residuals(
-            *(np.concatenate([getattr(r, each.name) for r in side]) for each in fields(Residuals))
-        )
-        for side in zip(*((part.before, part.after) for part in parts), strict=True)
-    ]
-    every = np.ones(len(whole[0].position), dtype=bool)
-    return whole[0].figures(every), whole[1].figures(every)
+        chains.append((previous.chain, _applied(previous, arm.chain, change)))
+    before, after = left_out(chains, sets, groups, folds)
+    every = np.ones(len(before.position), dtype=bool)
+    return before.figures(every), after.figures(every)
 
 
 def _applied(previous: Calibration, start: Chain, change: Mapping[str, float]) -> Chain:

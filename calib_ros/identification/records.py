@@ -12,7 +12,6 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from calib_ros.errors import ConfigError
-from calib_ros.identification.evidence import ROUNDING
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.noise import Noise
@@ -21,7 +20,7 @@ from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
 from calib_ros.kinematics.parameter import DH_KINDS, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.settings import Settings
 from calib_ros.values import parse_number, parse_numbers
 

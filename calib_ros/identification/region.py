@@ -173,7 +173,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
     ends = sets[0]
-    measured = np.concatenate([_spread(each) for each in sets])
+    measured = np.concatenate([each.spread(MEASURED).joints for each in sets])
     drawn = posterior.chain.random_joints(DRAWN, np.random.default_rng(0))
     judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
     near, far = np.split(judge.sigma, [len(measured)])
@@ -208,11 +208,6 @@ def _length(rows: FloatArray, square: FloatArray) -> FloatArray:
     flat = rows.reshape(-1, rows.shape[2])
     squares = ((flat @ square) * flat).sum(axis=1).reshape(-1, 3).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
-
-
-def _spread(observations: Observations) -> FloatArray:
-    """Return joint values of some of the pairs, evenly over the session."""
-    return observations.joints[:: 1 + len(observations) // MEASURED]
 
 
 class _Judge:

@@ -33,7 +33,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from calib_ros.identification.leastsquares import Fit, System
-from calib_ros.identification.observations import stops
+from calib_ros.identification.observations import FEWEST, stops
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -47,13 +47,9 @@ NEAREST = 3
 MOST = 400
 """Stops on which sizes are estimated; of more, every so many runs of RUN are taken."""
 RUN = 20
-FEWEST = 8
-"""Stops from which on neighbours are looked at."""
 APART = 1e9
 """Distance of the stops of different sets, which are no neighbours."""
 ROUNDING = 1e-10
-FADED = 40.0
-"""Lengths after which what is shared is less than rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,7 +367,7 @@ def _successive(
                 decay = float(np.exp(-1.0 / length))
                 so_far = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
                 step = 1
-                while step < so_far.shape[2] and step < FADED * length:
+                while step < so_far.shape[2] and decay**step > ROUNDING**2:
                     so_far[..., step:] += decay**step * so_far[..., :-step]
                     step *= 2
                 before[k] = so_far[..., -1].copy()

@@ -27,10 +27,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.drift import inverse_root, slow_cosines
+from calib_ros.identification.fitting import SOME
 from calib_ros.identification.observations import stops
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.identification.robust import Robust, weights_of
+from calib_ros.identification.robust import NOISE_FREE, Robust, weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
@@ -43,14 +44,10 @@ PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST = 3
 """Stops before and after a step: fewer are gross errors."""
-MOST = 500
-"""Samples that are looked at; of more, evenly spread ones."""
 BY_CHANCE = 1e-3
 """Probability of so large a share at any place of white residuals; few samples need more."""
 SINGULAR = 1e-8
 """Eigenvalue of scaled normal equations from which a direction counts."""
-NOISE_FREE = 1e-6
-"""RMS residual [sigma] below which nothing but rounding is left."""
 ROWS_NS = 10**15
 """Whole seconds below that are the numbers of rows, in place of stamps."""
 
@@ -172,7 +169,7 @@ class _Scan:
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
         self._names = [*names, *(name for name in self._added if name not in names)]
-        share = -(-robust.system.count // MOST)
+        share = -(-robust.system.count // SOME)
         self._chosen = [np.arange(0, len(each), share) for each in problem.sets]
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
         self._oriented = any(kind.oriented for kind in problem.kinds)

@@ -26,7 +26,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.identifiability import excited
@@ -91,7 +90,7 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
         return 0.0, np.inf, 0.0
     grown = np.array([problem.model.value(n) for n in lengths])
     first = problem.sets[0]
-    joints = first.joints[_few(len(first))]
+    joints = first.spread(POSES).joints
     names = tuple(dict.fromkeys((*result.names, *lengths)))
     rows = ErrorModel(chain, names, first.base, first.tool).jacobian(joints)
     if not first.oriented.any():
@@ -151,7 +150,7 @@ def _sister(problem: Problem, result: Identification) -> str:
     ):
         return ''
     types = [joint.type for joint in problem.chain.joints]
-    joints = problem.sets[0].joints[_few(len(problem.sets[0]))]
+    joints = problem.sets[0].spread(POSES).joints
     nominal = _apart(problem.chain, result.chain, joints)
     found = []
     for each in shipped_chains():
@@ -223,7 +222,7 @@ def _explained(
     problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str], poses: int = POSES
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""
-    few = [each.select(_few(len(each), poses)) for each in problem.sets]
+    few = [each.spread(poses) for each in problem.sets]
     rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
     count = len(fitted)
     scale = np.linalg.norm(rows, axis=0)
@@ -240,7 +239,3 @@ def _explained(
     if not total > 0.0 or spare < len(rows) // 3:
         return 0.0
     return 1.0 - left / total
-
-
-def _few(count: int, poses: int = POSES) -> NDArray[np.intp]:
-    return np.arange(0, count, 1 + count // poses)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -157,7 +157,12 @@ def residuals(chain: Chain, observations: Observations) -> Residuals:
     return Residuals(position, orientation, observations.configurations, pixels)
 
 
-def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Comparison:
+def compare(
+    before: Chain,
+    after: Chain,
+    sets: Sequence[Observations],
+    judged: NDArray[np.bool_] | None = None,
+) -> Comparison:
     """Return the residuals of all sets, one after the other, by both chains."""
     parts = [(residuals(before, each), residuals(after, each)) for each in sets]
     numbers = np.concatenate(numbered(sets))
@@ -165,7 +170,7 @@ def compare(before: Chain, after: Chain, sets: Sequence[Observations]) -> Compar
     return Comparison(
         _joined([first for first, _ in parts], numbers, index),
         _joined([second for _, second in parts], numbers, index),
-        np.ones(len(numbers), dtype=bool),
+        np.ones(len(numbers), dtype=bool) if judged is None else judged,
     )
 
 
@@ -230,21 +235,32 @@ def _cross_validate(
         without_each(after, names, robust.system, numbers),
         strict=True,
     )
-    fold, pieces = np.concatenate(numbers), []
-    for k, pair in enumerate(chains):
-        pairs = zip(problem.sets, numbers, strict=True)
-        sets = [each.select(np.flatnonzero(number == k)) for each, number in pairs]
-        pieces.append([[residuals(chain, each) for each in sets] for chain in pair])
-    index = np.argsort(np.argsort(fold, kind='stable'))
-    whole = np.concatenate(groups)
-    first, second = (
-        _joined([each for piece in pieces for each in piece[side]], whole, index)
-        for side in (0, 1)
-    )
+    first, second = left_out(chains, problem.sets, groups, numbers)
     return (
         Comparison(first, second, ~robust.outliers),
         f'{folds}-fold cross-validation over {count} distinct configurations{said}',
     )
+
+
+def left_out(
+    chains: Iterable[tuple[Chain, Chain]],
+    sets: Sequence[Observations],
+    groups: Sequence[NDArray[np.intp]],
+    folds: Sequence[NDArray[np.intp]],
+) -> tuple[Residuals, Residuals]:
+    """Return the residuals of every fold by two chains of its own, before and after.
+
+    `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
+    """
+    pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
+    for k, pair in enumerate(chains):
+        for each, numbers in zip(sets, folds, strict=True):
+            out = each.select(np.flatnonzero(numbers == k))
+            for side, chain in zip(pieces, pair, strict=True):
+                side.append(residuals(chain, out))
+    index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
+    before, after = (_joined(side, np.concatenate(groups), index) for side in pieces)
+    return before, after
 
 
 def _repeated(problem: Problem) -> NDArray[np.bool_]:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.kinematics.chain import Chain
@@ -97,8 +97,6 @@ def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
 
 
 WAVES = ('sin', 'cos')
-ROUNDING = 1e-12
-"""Share of gravity below which what turns a joint is a rounding error."""
 
 
 def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:

@@ -105,23 +105,11 @@ class ErrorModel:
             Derivative of the orientation as a rotation vector in the world. Likewise.
 
         """
-        layout, walk, base = self._layout, self.chain.walk, self.chain.frame(self._ends[0]).matrix
-        count, samples = q.shape
+        layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
         own = {name: value for name, value in self.chain.effects if name not in layout.effects}
         names = (*layout.effects, *(name for name, value in own.items() if value))
         phi = effects.basis(self.chain, names, q, approach)
-        # frames before the joints, of the flange, of the world at the base, of the flange's axes
-        # at the target
-        frames = np.empty((count + 3, 4, 3, samples))
-        walk.frames(effects.moved(self.chain, names, phi, q), base, frames[: count + 1])
-        target = self.chain.at_the_tool(frames[count], self._ends[1])
-        frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
-        frames[count + 1, 3] += base[:3, 3, np.newaxis]
-        frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]
-        if layout.bent and walk.beta.any():  # a and alpha come before beta
-            behind = frames[layout.behind]
-            behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
-            behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
+        frames, target = self._frames(effects.moved(self.chain, names, phi, q))
         flat = frames.reshape(4 * len(frames), 3, samples)
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
@@ -141,6 +129,26 @@ class ErrorModel:
         if velocity is not None and layout.delay is not None:
             turn[layout.delay], shift[layout.delay] = _twist(walk, velocity, frames, target[3])
         return target[:3], target[3], shift, turn
+
+    def _frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return frames (n + 3, 4, 3, B) along the chain and the target's (4, 3, B).
+
+        They are those before the joints, of the flange, of the world at the base, and of the
+        flange's axes at the target; q (n, B) holds effective joint values.
+        """
+        count, samples = q.shape
+        base, walk = self.chain.frame(self._ends[0]).matrix, self.chain.walk
+        frames = np.empty((count + 3, 4, 3, samples))
+        walk.frames(q, base, frames[: count + 1])
+        target = self.chain.at_the_tool(frames[count], self._ends[1])
+        frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
+        frames[count + 1, 3] += base[:3, 3, np.newaxis]
+        frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]
+        if self._layout.bent and walk.beta.any():  # a and alpha come before beta
+            behind = frames[self._layout.behind]
+            behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
+            behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
+        return frames, target
 
     def jacobian(
         self,

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 FloatArray: TypeAlias = NDArray[np.float64]
+ROUNDING = 1e-12
+"""Share of the whole from which on a number is more than rounding."""
 
 
 def transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:

@@ -66,8 +66,10 @@ class Boundary:
         except Exception as err:
             self._log()
             success, text = False, f'internal error, see the log: {err!r}'
-        if text:
-            (self._logger.info if success else self._logger.warning)(f'{name}: {text}')
+        if not success:  # rclpy knows calls by their line, and takes one severity for each
+            self._logger.warning(f'{name}: {text}')
+        elif text:
+            self._logger.info(f'{name}: {text}')
         return bool(success), str(text)
 
     def _log(self) -> None:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -49,10 +49,10 @@ class Diagnostics:
         self._alike = 1
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
-    def publish(self, status: str, answers: Mapping[str, Any]) -> None:
+    def publish(self, status: str, answers: Callable[[], Mapping[str, Any]]) -> None:
         """Publish how it goes, with the status in words, and what failed since the last time.
 
-        `answers` is what came of calls and requests.
+        `answers` returns what came of calls and requests.
         """
         tried = self._boundary.tried
         tried('the rates', self._inputs.look)
@@ -62,8 +62,8 @@ class Diagnostics:
         if account is not None:
             judged = tried('judging', lambda: self._judged(account))
             level, words = judged or (level, words)
-            figures = tried('the figures', lambda: self._figures(account)) or {}
-            figures = {**answers, **figures}
+            figures = tried('the figures', lambda: {**self._figures(account), **answers()})
+        figures = figures or {}
         if failed := self._boundary.failed:
             level = DiagnosticStatus.ERROR
             words = ''.join(f'{text}; ' for text in failed.values()) + words

@@ -22,6 +22,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.progress import Progress
 from calib_ros.report import words
 from calib_ros.ros import to_ros
+from calib_ros.ros.boundary import Answer
 from calib_ros.ros.filer import Filer
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.sample import Sample, named
@@ -107,7 +108,7 @@ class Identifying:
         self.progress.begin()
         return found
 
-    def run(self, given: Snapshot) -> tuple[bool, str]:
+    def run(self, given: Snapshot) -> Answer:
         """Identify; publish only what is accepted."""
         with self.progress.running():
             result = identify_model(given.problem, given.model, self.progress)
@@ -130,16 +131,16 @@ class Identifying:
         elif self._session.calibration is not None:
             self.last += '; the last good calibration stays'
         self.last += self._filer.identified(given.problem, result, self._session.settings)
-        return result.accepted, self._shortened()
+        return result.accepted, self.last
 
-    def _shortened(self) -> str:
-        """Return the last words as an answer; all of them go to the log and beside the journal."""
-        if len(self.last) <= ANSWER_LENGTH:
-            return self.last
-        self._node.get_logger().info(f'~/identify in full: {self.last}')
-        path = self._archive.note(self.last)
-        more = f' ... all of it: {path.name if path else "in the log"}'
-        return textwrap.shorten(self.last, ANSWER_LENGTH, placeholder=more)
+    def shortened(self, answer: Answer) -> Answer:
+        """Return an answer cut to a few lines; all of it is in the log, and beside the journal."""
+        success, text = answer
+        if len(text) > ANSWER_LENGTH:
+            path = self._archive.note(text)
+            more = f' ... all of it: {path.name if path else "in the log"}'
+            text = textwrap.shorten(text, ANSWER_LENGTH, placeholder=more)
+        return success, text
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:

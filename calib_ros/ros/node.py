@@ -137,8 +137,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             ('~/save', self._to_save, self._on_save),
             ('~/check', self._to_check, self._on_check),
         )
-        answer = self._boundary.answer
-        return [DeferredTrigger(self, name, answer, *two) for name, *two in slow]
+        return [
+            DeferredTrigger(self, name, self._answer, begin, work) for name, begin, work in slow
+        ]
 
     def announce(self) -> None:
         """Say that the node is ready, once an executor serves it."""
@@ -149,7 +150,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def close(self) -> bool:
         """Stop; return False when an identification still runs and must not be waited for."""
-        ended = [each.join(JOIN_TIMEOUT) for each in (*self._working, self._guide)]
+        ended = [each.join(JOIN_TIMEOUT) for each in self._working]
+        ended.append(self._guide.join(JOIN_TIMEOUT))
         self._take_messages()
         self.session.finish()
         self._archive.close()
@@ -347,7 +349,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         tried('the journal', self._archive.write)
         status = tried('the status', self._publish_status) or ''
         tried('the next pose', self._guide.advise)
-        self._diagnostics.publish(status, self._answers())
+        self._diagnostics.publish(status, self._answers)
 
     def _publish_status(self) -> str:
         """Return how the session goes; its first words are published when they have changed."""
@@ -366,6 +368,10 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             'observability': self._identifying.observability,
             **self._guide.figures(),
         }
+
+    def _answer(self, name: str, work: Callable[[], Answer]) -> Answer:
+        answer = self._boundary.answer(name, work)
+        return self._identifying.shortened(answer) if name == '~/identify' else answer
 
     def _answering(
         self, name: str, callback: Callable[[Any], Answer]

@@ -116,15 +116,12 @@ def assert_same_result(first, second):
             assert value == pytest.approx(second['validation'][when][figure], abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ('name', 'session', 'storage'),
-    [(*key, 'mcap') for key in SMALL] + [('ur10_ipa_leica', 'B', 'sqlite3')],
-)
-def test_table_and_bag_give_the_same_parameters(capsys, tmp_path, name, session, storage):
+@pytest.mark.parametrize(('name', 'session'), SMALL)
+def test_table_and_bag_give_the_same_parameters(capsys, tmp_path, name, session):
     folder, bag = DATA / name, tmp_path / 'bag'
     chain, chosen = ('--chain', folder / 'chain.yaml'), ('--session', session)
     table = run_json(capsys, 'identify', '--csv', folder / 'uniform.csv', *chain, *chosen)
-    written = ['csv2bag', folder / 'uniform.csv', bag, *chain, *chosen, '--storage', storage]
+    written = ['csv2bag', folder / 'uniform.csv', bag, *chain, *chosen]
     assert main([str(argument) for argument in written]) == 0
     capsys.readouterr()
     assert_same_result(table, run_json(capsys, 'identify', bag, *chain))

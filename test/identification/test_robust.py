@@ -15,7 +15,7 @@ from calib_ros.kinematics.chain_file import load_chain
 UR10E = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
 POSES = 80
-SEEDS = range(5)
+SEEDS = range(3)
 
 
 def directions(count, rng):
@@ -82,64 +82,52 @@ GROSS = {
 }
 
 
-def ratios_of(spoil, oriented=True, count=POSES):
-    """Return how much worse than without them arms get by gross errors, which are named."""
-    ratios, hits, gross, false, good = [], 0, 0, 0, 0
+def assert_harmless(spoil, oriented=True, count=POSES):
+    """Gross errors are named, nothing else is, and the fit is that of the other samples."""
     for seed in SEEDS:
         rng, true, clean, unseen = cell(seed, oriented, count)
         seen, wrong = spoil(clean, true, rng)
         result = fit(seen)
-        named = {outlier.sample for outlier in result.outliers}
-        hits, gross = hits + len(named & wrong), gross + len(wrong)
-        false, good = false + len(named - wrong), good + len(seen) - len(wrong)
+        assert {outlier.sample for outlier in result.outliers} == wrong
         best = fit(clean.select(np.array([k not in wrong for k in range(count)])), loss='none')
-        ratios.append(rms(result.chain, true, unseen) / rms(best.chain, true, unseen))
+        error, least = (rms(each.chain, true, unseen) for each in (result, best))
+        assert error == pytest.approx(least, rel=1e-6)
         assert result.converged
         assert result.accepted
-    assert hits >= 0.99 * gross
-    assert false <= 0.01 * good
-    return ratios
 
 
 @pytest.mark.parametrize(
-    ('oriented', 'kind', 'share', 'limit'),
+    ('oriented', 'kind', 'share'),
     [
-        (True, 'positions', 0.3, 1.25),
-        (True, 'orientations', 0.3, 1.25),
-        (True, 'both', 0.1, 1.1),
-        (False, 'positions', 0.1, 1.1),
-        (False, 'positions', 0.3, 1.25),
+        (True, 'positions', 0.3),
+        (True, 'orientations', 0.3),
+        (True, 'both', 0.1),
+        (False, 'positions', 0.3),
     ],
 )
-def test_gross_errors_are_named_and_hardly_harm_predictions(oriented, kind, share, limit):
-    def spoil(clean, true, rng):
-        return spoiled(clean, rng, share, **GROSS[kind])
-
-    assert np.median(ratios_of(spoil, oriented)) < limit
+def test_gross_errors_are_named_and_harm_nothing(oriented, kind, share):
+    assert_harmless(lambda clean, _, rng: spoiled(clean, rng, share, **GROSS[kind]), oriented)
 
 
 @pytest.mark.parametrize('where', ['world', 'tool'])
 @pytest.mark.parametrize(
     ('count', 'oriented', 'share'), [(80, True, 0.3), (30, False, 0.3), (60, True, 0.35)]
 )
-def test_gross_errors_that_agree_are_named_and_do_no_harm(count, oriented, share, where):
+def test_gross_errors_that_agree_are_named_and_harm_nothing(count, oriented, share, where):
     def spoil(clean, true, rng):
         return displaced(clean, true, rng, share, where)
 
-    assert max(ratios_of(spoil, oriented, count)) < 1.25
+    assert_harmless(spoil, oriented, count)
 
 
 def test_a_target_bumped_twice_and_scattered_gross_errors():
-    for seed in SEEDS:
-        rng, true, clean, unseen = cell(seed)
+    def spoil(clean, true, rng):
         once, first = displaced(clean, true, rng, 0.15, 'tool')
         twice, second = displaced(once, true, rng, 0.1, 'tool')
         seen, third = spoiled(twice, rng, 0.05, shift=(5e-3, 50e-3))
-        wrong = first | second | third
-        result = fit(seen)
-        assert {outlier.sample for outlier in result.outliers} == wrong
-        best = fit(clean.select(np.array([k not in wrong for k in range(len(clean))])))
-        assert rms(result.chain, true, unseen) < 1.1 * rms(best.chain, true, unseen)
+        return seen, first | second | third
+
+    assert_harmless(spoil)
 
 
 def test_one_of_two_sessions_was_bumped_from_some_moment_on():

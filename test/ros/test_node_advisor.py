@@ -14,9 +14,7 @@ from ros_cell import (
     Child,
     joint_messages,
     pose_messages,
-    shift,
     topics,
-    true_arm,
     values_of,
 )
 from sensor_msgs.msg import JointState, PointCloud2, Range
@@ -32,22 +30,6 @@ from calib_ros.ros import advisor as guide_module
 
 UR = load_chain('ur10e')
 NODE = 'calibration_node'
-
-
-@pytest.fixture(scope='module')
-def truth():
-    return true_arm()
-
-
-@pytest.fixture(scope='module')
-def recording(truth):
-    return shift(truth)
-
-
-@pytest.fixture
-def cell(tmp_path):
-    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
-        yield cell
 
 
 @pytest.fixture
@@ -119,7 +101,7 @@ def test_candidates_that_are_none_stop_the_start(tmp_path):
         cell.start(chain='ur10e', data_dir=str(tmp_path), candidates=str(tmp_path / 'poses.csv'))
 
 
-def test_nothing_is_planned_for_distances_or_in_motion(tmp_path, recording, truth):
+def test_nothing_is_planned_for_distances_or_in_motion(tmp_path, recording):
     distances = np.linalg.norm(recording.poses.positions, axis=1)
     wire = pose_messages(recording.poses, Range, distances=distances)
     for more, parameters in (

@@ -13,16 +13,11 @@ if 'CI' not in os.environ:
 
 from diagnostic_msgs.msg import DiagnosticArray
 from mocap4r2_msgs.msg import Marker, RigidBodies, RigidBody
-from ros_cell import Cell, direct, joint_messages, pose_messages, shift, true_arm
+from ros_cell import Cell, direct, joint_messages, pose_messages
 
 from calib_ros.errors import ConfigError
 
 SOURCE = '/rigid_bodies type=RigidBodies parent=tracker child=4'
-
-
-@pytest.fixture(scope='module')
-def recording():
-    return shift(true_arm())
 
 
 def bodies(recording):

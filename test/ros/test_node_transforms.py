@@ -22,9 +22,7 @@ from ros_cell import (
     direct,
     header,
     joint_messages,
-    shift,
     stamp_ns,
-    true_arm,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -44,11 +42,6 @@ from calib_ros.settings import Settings
 STORE = get_typestore(Stores.ROS2_JAZZY)
 SOURCE = '/tf parent=tracker child=tool'
 TRACKER = se3.transform(se3.exp_rotation(np.array([0.3, -0.2, 1.0])), np.array([2.0, 1.0, 0.5]))
-
-
-@pytest.fixture(scope='module')
-def recording():
-    return shift(true_arm())
 
 
 def link(parent, child, stamp, matrix):
