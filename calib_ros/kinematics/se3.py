@@ -106,9 +106,9 @@ def left_jacobian_inverse(vector: FloatArray) -> FloatArray:
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """Return the rotation (3, 3) that is nearest to a matrix (Schönemann 1966, Umeyama 1991)."""
+    """Return the rotations (..., 3, 3) nearest to matrices (Schönemann 1966, Umeyama 1991)."""
     u, _, vt = np.linalg.svd(matrix)
-    u[:, -1] *= np.linalg.det(u @ vt)
+    u[..., -1] *= np.linalg.det(u @ vt)[..., np.newaxis]
     return np.asarray(u @ vt)
 
 

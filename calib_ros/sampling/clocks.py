@@ -16,7 +16,7 @@ from calib_ros.sampling.delay import Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
 from calib_ros.sampling.rows import Rows
-from calib_ros.sampling.slices import Piece, Slice, StreamKey, merged
+from calib_ros.sampling.slices import JOINTS, Piece, Slice, StreamKey, merged
 from calib_ros.settings import Settings
 
 WATCH_NS = 15_000_000_000
@@ -48,12 +48,14 @@ class Watch:
     chain : Chain
     sleepless : bool
         Watch all the time, as there are no stops.
+    max_gap : float
+        Longest time [s] between two joint samples whose motion is known.
 
     """
 
-    def __init__(self, chain: Chain, sleepless: bool) -> None:
+    def __init__(self, chain: Chain, sleepless: bool, max_gap: float) -> None:
         self._chain = chain
-        self._sleepless = sleepless
+        self._sleepless, self._max_gap = sleepless, max_gap
         self._joints = Rows(len(chain.joints), WATCHED)
         self._poses = Rows(7, WATCHED)
         self._last_ns = [0, 0]
@@ -67,10 +69,13 @@ class Watch:
         self.moves: deque[tuple[float, int]] = deque(maxlen=MOST_MOVES)
         """By how much [s] it changed, and after how many samples at least."""
 
-    def wake(self, unrest: int, taken: int) -> None:
-        """Watch again if more measurements at stops were not at rest, with so many samples."""
+    def wake(self, unrest: int, calm: int, taken: int) -> None:
+        """Watch again if more measurements at stops were not at rest.
+
+        Before the first of these there were `calm` samples; so many are `taken` by now.
+        """
         if unrest > self._unrest and not self.awake:
-            self.awake, self._agreed = True, self._taken
+            self.awake, self._agreed = True, calm
         self._unrest, self._taken = unrest, taken
 
     def take(self, joints: Sequence[Piece], poses: Sequence[Piece]) -> None:
@@ -91,10 +96,14 @@ class Watch:
             self._last_ns[k] = last
             rows.extend(stamps[chosen[:room]], numbers[chosen[:room]])
 
+    @property
+    def begun_ns(self) -> int | None:
+        """Return the first stamp since the last look."""
+        return int(self._joints.stamps[0]) if self._joints.count else None
+
     def look(self, now_ns: int) -> None:
         """Look what the motion shows if it is time to, and begin anew."""
-        begun = self._joints.stamps[:1]
-        if self.awake and len(begun) and abs(now_ns - int(begun[0])) > WATCH_NS:
+        if self.awake and self.begun_ns and abs(now_ns - self.begun_ns) > WATCH_NS:
             self._look()
 
     def _look(self) -> None:
@@ -109,9 +118,10 @@ class Watch:
             self._poses.stamps,
             values[:, :3],
             se3.from_quat(values[:, 3:]) if oriented else None,
+            self._max_gap,
         )
         for rows in (self._joints, self._poses):
-            rows.keep(np.zeros(rows.count, dtype=bool))
+            rows.release(rows.count)
         if found is None:
             return
         known = self.delay
@@ -141,7 +151,7 @@ class Clocks:
         self.settings = settings
         self._chain = chain
         self._continuous = settings.mode == 'continuous'
-        self._watch = Watch(chain, sleepless=self._continuous)
+        self._watch = Watch(chain, self._continuous, settings.max_gap)
         self._found: Delay | None = None  # in the motion that is sampled
         self._looked_ns = 0
 
@@ -164,13 +174,22 @@ class Clocks:
                     poses.append(each)
             self._watch.take(joints, poses)
 
-    def look(self, collector: Collector, now_ns: int | None) -> None:
+    def calm(self, given: Slice) -> tuple[int, int]:
+        """Return stamps of joints between which there is nothing to look for."""
+        begun = self._watch.begun_ns
+        if begun is None:
+            begun = int(given.times[given.where(JOINTS)[:1]].sum())
+        return begun - WATCH_NS, begun + WATCH_NS
+
+    def look(self, now_ns: int) -> None:
+        """Look whether the clocks agree if it is time to."""
+        self._watch.look(now_ns)
+
+    def find(self, collector: Collector, now_ns: int | None) -> None:
         """Look for the delay after some time of motion, until it shows.
 
         Nothing is sampled before; at the end (None) what has come must do.
         """
-        if now_ns is not None:
-            self._watch.look(now_ns)
         if not collector.holding:
             return
         if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
@@ -190,7 +209,15 @@ class Clocks:
             quats = rows[:, QUAT]
             oriented = len(rows) > 0 and not np.isnan(quats).any()
             rotations = se3.from_quat(quats) if oriented else None
-            delay = find_delay(self._chain, stamps, joints, measured, rows[:, POSITION], rotations)
+            delay = find_delay(
+                self._chain,
+                stamps,
+                joints,
+                measured,
+                rows[:, POSITION],
+                rotations,
+                self.settings.max_gap,
+            )
             if delay is not None:
                 found.append(delay)
         if not found:
@@ -200,9 +227,9 @@ class Clocks:
             collector.delay_ns = round(best.seconds * 1e9)
         return best
 
-    def wake(self, unrest: int, taken: int) -> None:
-        """Watch again if more measurements at stops were not at rest, with so many samples."""
-        self._watch.wake(unrest, taken)
+    def wake(self, unrest: int, calm: int, taken: int) -> None:
+        """Watch again if more measurements at stops were not at rest (`Watch.wake`)."""
+        self._watch.wake(unrest, calm, taken)
 
     def hints(self) -> list[Hint]:
         """Return what looks wrong with the clocks."""

@@ -11,6 +11,7 @@ live robot, and whatever is not used is counted by its cause.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -19,13 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.making import WIDTH, Maker
+from calib_ros.sampling.making import WIDTH, Maker, Numbered
 from calib_ros.sampling.names import MOST_NAMES
 from calib_ros.sampling.rests import Rests
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, Slice, StreamKey
+from calib_ros.sampling.stands import SAMPLED, Known, Plan
 from calib_ros.sampling.strays import JUMP
 from calib_ros.sampling.track import CAUSES, Track
 from calib_ros.settings import Settings
@@ -55,7 +56,7 @@ class Collector:
         self._revolute = np.array(revolute, dtype=bool)
         self.track = Track(revolute, settings.max_gap, settings.joint_buffer)
         self._waiting: dict[StreamKey, Rows] = {}
-        self._stops = Rows(1 + len(revolute), settings.pose_buffer)  # how long, and where
+        self._known = Known(self._revolute, settings.pose_buffer)
         self._lateness_ns = round(settings.lateness * 1e9)
         self._newest_ns = 0  # the last joint sample
         self._advanced_ns = 0  # that at the last round
@@ -100,8 +101,13 @@ class Collector:
         ]
         return stamps[complete], joints[complete], positions
 
-    def reach(self, given: Slice) -> int:
-        """Return how many of the first messages come up to one that gives something to do."""
+    def reach(self, given: Slice, calm: tuple[int, int]) -> int:
+        """Return how many of the first messages come up to one that gives something to do.
+
+        Rounds that would come before it are made up for with the last one, as far as no message
+        can tell: none comes late for them, and there is room. That one is the first of those
+        beyond two stamps of joints between which nobody else has anything to do.
+        """
         if self.track.full:
             self._make_room()
         count = len(given)
@@ -110,41 +116,75 @@ class Collector:
         late = joints[stamps < self.track.horizon_ns]
         if len(late):  # one by one
             count = max(int(late[0]), 1)
-        due = joints[stamps >= self._advanced_ns + ADVANCE_NS]
-        count = int(min([count, *(due[:1] + 1).tolist()]))
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
             room = self.track.room(columns)
             if room <= len(joints):
                 places = [each.places for each in given.pieces if each.key == columns]
                 full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
                 count = int(min([count, *(full + 1).tolist()]))
-        return count
+        rounds = joints[self._rounds(stamps, calm)]
+        if not len(rounds) or rounds[0] >= count:
+            return count
+        if len(rounds) > 1:
+            rounds = rounds[rounds < max(self._alike(given, int(rounds[0]) + 1, count), rounds[1])]
+        return int(rounds[-1]) + 1
 
-    def take(self, given: Slice) -> bool:
-        """Take messages up to one that gives something to do; return whether it is a round."""
+    def _rounds(self, stamps: Stamps, calm: tuple[int, int]) -> list[int]:
+        """Return at which joint samples a round is due, up to the first one that is not calm."""
+        found, last = [], self._advanced_ns
+        first, end = (0, 0) if self.holding else calm
+        for k, stamp in enumerate(stamps.tolist()):
+            if stamp - last >= ADVANCE_NS:
+                found.append(k)
+                last = stamp
+                if not first <= stamp <= end:
+                    break
+        return found
+
+    def _alike(self, given: Slice, begin: int, end: int) -> int:
+        """Return up to where, from a message on, all can be taken before or after a round."""
+        times, joints = given.times[:end], given.joints[:end]
+        newest = np.maximum.accumulate(np.where(joints, times, self._newest_ns))
+        delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # that of the slice is off
+        late = times - np.where(joints, 0, delay_ns) <= newest - self._late_ns
+        end = begin + int(np.argmax(np.append(late[begin:], True)))
+        streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
+        if len(self._waiting.keys() | {each.key for each in streams}) > MOST_STREAMS:
+            return begin
+        for key, places, *_ in streams:
+            room = self.settings.pose_buffer
+            room -= self._waiting[key].count if key in self._waiting else 0
+            end = int(min([end, *(places[room : room + 1] - given.begin).tolist()]))
+        return end
+
+    def take(self, given: Slice) -> list[int]:
+        """Take messages up to one that gives something to do; return the stamps of its rounds."""
         joints = given.where(JOINTS)
+        rounds: list[int] = []
         if len(joints):
-            newest = int(given.times[joints[-1]])
+            stamps = given.times[joints]
+            newest = int(stamps[-1])
             if newest < self.track.horizon_ns:
                 self._backwards += 1
                 if self._backwards < JUMP:
                     self.dropped['joints: later than lateness allows'] += 1
-                    return False
+                    return []
                 self.start_anew()
             self._backwards = 0
             self._newest_ns = newest
+            rounds = stamps[self._rounds(stamps, (0, newest))].tolist()
         for key, _, stamps, numbers in given.pieces:
             if isinstance(key, StreamKey):
                 self._extend(key, stamps, numbers)
             else:
                 self.track.extend(key, stamps, numbers)
-        return self._newest_ns - self._advanced_ns >= ADVANCE_NS
+        return rounds
 
-    def round(self) -> None:
-        """Make samples of what is complete."""
-        self._advanced_ns = self._newest_ns
+    def round(self, rounds: Sequence[int]) -> None:
+        """Make samples of what is complete, for rounds at some stamps of the joints."""
+        self._advanced_ns = rounds[-1]
         if not self.holding:
-            self._round(self._complete_ns)
+            self._round(self._complete_ns, rounds)
 
     def _extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray) -> None:
         """Take measurements: numbers (M, w) at stamps (M,)."""
@@ -186,7 +226,7 @@ class Collector:
         for rows in self._waiting.values():
             if rows.count:
                 self._count_causes(self.track.causes(rows.stamps - self.delay_ns))
-                rows.keep(np.zeros(rows.count, dtype=bool))
+                rows.release(rows.count)
 
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
@@ -233,7 +273,9 @@ class Collector:
             return 1, ''
         self._round(begin)  # a stop before is not waited for any longer
         before, dropped = len(self.maker.fresh), self.dropped.copy()
-        self._average(begin, newest)
+        plan = Plan(self._settled_ns, self._sampled_ns)
+        plan.sample(begin, newest)
+        self._carry_out(plan)
         count = len(self.maker.fresh) - before
         if count:
             self._sampled_ns = self._settled_ns = newest
@@ -241,13 +283,17 @@ class Collector:
         return count, '' if count else causes or 'no measurement within this stop'
 
     @property
+    def _late_ns(self) -> int:
+        """Return by how much older measurements than the joints are complete [ns]."""
+        return max(self._lateness_ns + max(self.delay_ns, 0), round(WINDOW * 1e9))
+
+    @property
     def _complete_ns(self) -> int:
         """Return the stamp of the joints up to which all has come, and stops can be told."""
-        late = self._lateness_ns + max(self.delay_ns, 0)
-        return self.track.newest_ns - max(late, round(WINDOW * 1e9))
+        return self.track.newest_ns - self._late_ns
 
-    def _round(self, until: int, ends_here: bool = False) -> None:
-        """Make samples of everything up to a stamp of the joints.
+    def _round(self, until: int, rounds: Sequence[int] = (), ends_here: bool = False) -> None:
+        """Make samples of everything up to a stamp of the joints, as of some `rounds`.
 
         With `ends_here` a stop that goes on is taken to end.
         """
@@ -255,9 +301,9 @@ class Collector:
         if until <= self._settled_ns:
             return
         if self.settings.mode == 'continuous':
-            self._take_each(until)
+            self._take_each(until, rounds)
         else:
-            until = self._take_stops(until, ends_here)
+            until = self._take_stops(until, rounds, ends_here)
         self._settled_ns = max(self._settled_ns, until)
         margin = round((WINDOW + self.settings.max_gap) * 1e9)
         self.track.release(min(until, self._complete_ns) - margin)
@@ -271,8 +317,10 @@ class Collector:
             if twice:
                 self.dropped['poses: same stamp twice'] += twice
 
-    def _take_each(self, until: int) -> None:
-        """Make a sample of every measurement up to a stamp of the joints."""
+    def _take_each(self, until: int, rounds: Sequence[int]) -> None:
+        """Make a sample of every measurement up to a stamp of the joints, round by round."""
+        ends = np.maximum.accumulate(np.array(rounds[:-1], dtype=np.int64)) - self._late_ns
+        found: list[Numbered] = []
         for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= until
@@ -281,112 +329,93 @@ class Collector:
             motion = self.track.at(stamps[due])
             self._count_causes(motion.cause)
             good = motion.cause == 0
-            stamps, values = rows.stamps[due][good], rows.values[due][good]
-            self.maker.of_each(key, stamps, values, motion.rows(good), self.delay_ns)
+            found += self.maker.of_each(
+                key,
+                np.searchsorted(ends, stamps[due][good]),
+                rows.stamps[due][good],
+                rows.values[due][good],
+                motion.rows(good),
+                self.delay_ns,
+            )
             rows.keep(~due)
+        self.maker.add(found)
 
-    def _take_stops(self, until: int, ends_here: bool) -> int:
+    def _take_stops(self, until: int, rounds: Sequence[int], ends_here: bool) -> int:
         """Make samples of the stops that end before a stamp; return what has been dealt with."""
         settings = self.settings
-        shortest, longest = (
-            round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)
-        )
         newest = self.track.newest_ns
-        done = self._settled_ns
         stands = self.track.standing(settings.still, WINDOW)
-        found = bool((np.diff(stands) >= shortest).any())
-        self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS))
-        for begin, end in stands.tolist():
-            goes_on = end >= newest
-            if ends_here:
-                end, goes_on = min(end, until), False
-            begin = max(begin, done)
-            if begin > until or end <= done:
-                continue
-            done = self._drop(done, begin, 'the arm was moving')
-            if begin <= self._sampled_ns:  # the rest of a stop that has been sampled
-                done = self._drop(done, min(end, until), 'of a stop that is sampled already')
-                self._sampled_ns = max(self._sampled_ns, done)
-                continue
-            if settings.mode == 'triggered':
-                done = self._drop(done, min(end, until), 'nobody asked for them')
-                continue
-            last = min(end, begin + longest)
-            if last > until or (goes_on and last == end):
-                return int(begin)
-            if last - begin < shortest:
-                done = self._drop(done, last, 'the stop was too short')
-                continue
-            if self._is_known(begin, last):
-                done = self._sampled_ns = self._drop(
-                    done, last, 'of a stop that is sampled already'
-                )
-            else:
-                self._average(begin, last)
-                done = self._sampled_ns = last
-            if end > last:
-                done = self._drop(done, min(end, until), 'of a stop that is sampled already')
-                self._sampled_ns = done
-        return self._drop(done, until, 'the arm was moving')
+        self._note_rests(stands, rounds or (newest,))
+        plan = Plan(self._settled_ns, self._sampled_ns)
+        plan.of_stands(stands, until, None if ends_here else newest, settings)
+        stops = plan.stops
+        if stops:
+            spans = [(plan.begins[k], plan.ends[k]) for k in stops]
+            where = self.track.where(np.sum(spans, axis=1) // 2)
+            known = self._known.meets(spans, where, 2.0 * settings.still)
+            for k in itertools.compress(stops, known):
+                plan.why[k] = SAMPLED
+        self._carry_out(plan)
+        self._sampled_ns = plan.sampled_ns
+        return plan.done_ns
 
-    def _drop(self, after: int, until: int, why: str) -> int:
-        """Drop what was measured after a stamp and until another; return the latter."""
-        for rows in self._waiting.values():
-            stamps = rows.stamps - self.delay_ns
-            due = stamps <= until
-            if due.any():
-                cause = self.track.causes(stamps[due])
-                self._count_causes(cause)
-                fine = int((cause == 0).sum())
-                if fine:
-                    self.unused[f'poses: {why}'] += fine
-                rows.keep(~due)
-        return until if until > after else after
+    def _note_rests(self, stands: Stamps, rounds: Sequence[int]) -> None:
+        """Note of each round whether it has found a stop, and the noise of the joints if not."""
+        shortest = round(self.settings.shortest_stop * 1e9)
+        times = np.array(rounds)[:, np.newaxis]
+        settled = np.concatenate([[[self._settled_ns]], times[:-1] - self._late_ns])
+        lengths = np.minimum(stands[:, 1], times) - stands[:, 0]
+        found = ((lengths >= shortest) & (stands[:, 1] > settled)).any(axis=1)
+        for seen, newest in zip(found.tolist(), rounds, strict=True):
+            self.rests.note(None if seen else self.track.noise_at_rest(ADVANCE_NS, newest))
 
-    def _is_known(self, begin: int, end: int) -> bool:
-        """Tell whether a stop was sampled before the clock jumped back; if not, remember it."""
-        where = self.track.at(np.array([(begin + end) // 2]), standing=True).joints[0]
-        begins, lengths = self._stops.stamps, self._stops.values[:, 0]
-        meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)
-        steps = unwrapped(self._stops.values[meets, 1:] - where, self._revolute)
-        if (np.abs(steps).max(axis=1) <= 2.0 * self.settings.still).any():
-            return True
-        if not self._stops.full:
-            self._stops.extend(np.array([begin]), np.array([[end - begin, *where]]))
-        return False
-
-    def _average(self, begin: int, end: int) -> None:
-        """Make one sample of each stream from what was measured in a stop."""
-        self.rests.sampled += 1
-        calm = begin + round(self.settings.settle * 1e9)
+    def _carry_out(self, plan: Plan) -> None:
+        """Make a sample of each stream at the stops of a plan, and count what is not used."""
+        self.rests.sampled += len(plan.stops)
+        ends, calm = np.array(plan.ends), np.array(plan.begins) + round(self.settings.settle * 1e9)
+        wanted = np.array([not why for why in plan.why], dtype=bool)
+        found: list[Numbered] = []
         for key, rows in sorted(self._waiting.items()):
             stamps = rows.stamps - self.delay_ns
-            due = stamps <= end
-            inside = due & (stamps >= calm)
-            motion = self.track.at(stamps[inside], standing=True)
-            good = np.flatnonzero(inside)[motion.cause == 0]
-            early = int((due & ~inside).sum())
-            if early:
-                self.unused['poses: the arm had just stopped'] += early
-            self._count_causes(motion.cause)
+            due = int(np.searchsorted(stamps, plan.done_ns, 'right')) if plan.ends else 0
+            if not due:
+                continue
+            stamps = stamps[:due]
+            numbers = np.searchsorted(ends, stamps)
+            inside = wanted[numbers]
+            if not inside.all():
+                cause = self.track.causes(stamps[~inside])
+                self._count_causes(cause)
+                for k, count in Counter(numbers[~inside][cause == 0].tolist()).items():
+                    self.unused[f'poses: {plan.why[k]}'] += count
+            early = inside & (stamps < calm[numbers])
+            if early.any():
+                self.unused['poses: the arm had just stopped'] += int(early.sum())
+            good = np.flatnonzero(inside & ~early)
             if len(good):
-                if key.images and len(good) > 1:
-                    self.unused['poses: of a stop of which one image is used'] += len(good) - 1
-                self.maker.of_stop(
+                motion = self.track.at(stamps[good], standing=True)
+                self._count_causes(motion.cause)
+                good, motion = good[motion.cause == 0], motion.rows(motion.cause == 0)
+            if len(good):
+                more = len(good) - len(np.unique(numbers[good]))
+                if key.images and more:
+                    self.unused['poses: of a stop of which one image is used'] += more
+                found += self.maker.of_stops(
                     key,
+                    numbers[good],
                     rows.stamps[good],
                     rows.values[good],
-                    motion.rows(motion.cause == 0),
+                    motion,
                     self.delay_ns,
                     self.settings.sigma_position,
                 )
-            rows.keep(~due)
+            rows.release(due)
+        self.maker.add(found)
 
     def forget(self, sample: Sample) -> None:
         """Allow a sample of the same stamp again."""
         self.maker.forget(sample)
-        since = sample.stamp_ns - round(1e9 * sample.delay) - self._stops.stamps
-        self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
+        self._known.forget(sample.stamp_ns - round(1e9 * sample.delay))
 
     def _count_causes(self, cause: NDArray[np.intp]) -> None:
         for k, text in enumerate(CAUSES[1:], start=1):

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import find_peaks
 
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -62,10 +61,12 @@ def find_delay(
     stamps: Stamps,
     positions: FloatArray,
     rotations: FloatArray | None,
+    max_gap: float = LONGEST,
 ) -> Delay | None:
     """Return the delay of measurements (N) against joint samples (M); None where none shows.
 
-    Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3).
+    Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3). Between joint
+    samples further apart than `max_gap` [s] nothing is known of their motion.
     """
     if len(joint_stamps) < FEWEST or len(stamps) < FEWEST:
         return None
@@ -78,17 +79,24 @@ def find_delay(
     begin = max(begin, end - MOST_TIME)
     grid = np.arange(begin, end, STEP)
     coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
+    heard = np.diff(joint_times, append=np.inf)[coarse.astype(int)] <= max_gap
+    if heard.sum() * STEP < LEAST_MOTION:
+        return None
     nearest = np.unique(np.round(coarse).astype(int))
     if len(nearest) < FEWEST:  # a gap
         return None
     poses = chain.forward(joints[nearest])
     first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
-    second = _speed(times, positions, rotations, rotations is not None)
     by_joints = np.interp(grid, *first)
-    if (by_joints > MOVING * np.percentile(by_joints, 95)).sum() * STEP < LEAST_MOTION:
+    moving = heard & (by_joints > MOVING * np.percentile(by_joints, 95))
+    if moving.sum() * STEP < LEAST_MOTION:
         return None
-    lags = np.arange(-LONGEST, LONGEST + STEP / 2, STEP)
-    score = np.array([_correlation(grid + lag, by_joints, second) for lag in lags])
+    second = _speed(times, positions, rotations, rotations is not None)
+    most = round(LONGEST / STEP)
+    lags = STEP * np.arange(-most, most + 1)
+    wide = begin + STEP * np.arange(-most, len(grid) + most)
+    known = int(np.sum(wide < second[0][0])), int(np.sum(wide <= second[0][-1]))
+    score = _correlations(by_joints, np.interp(wide, *second), known)
     best = int(np.argmax(score))
     if score[best] < CONVINCING or best in (0, len(lags) - 1):
         return None
@@ -104,10 +112,25 @@ def find_delay(
 
 def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
     """Return where other peaks of the correlation are nearly as high as the best."""
-    peaks, _ = find_peaks(np.pad(score, 1, constant_values=-1.0), prominence=RISE)
-    others = peaks[peaks - 1 != best] - 1
+    found = peaks(score, RISE)
+    others = found[found != best]
     left, least = (1.0 - np.maximum(score[k], 0.0) ** 2 for k in (others, best))
     return np.asarray(others[left < RIVAL * least])
+
+
+def peaks(score: FloatArray, rise: float) -> NDArray[np.intp]:
+    """Return where correlations (N,) rise by so much above the valleys towards higher ones."""
+    padded = np.pad(score, 1, constant_values=-1.0)
+    found = []
+    tops = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])
+    for k in (np.flatnonzero(tops) + 1).tolist():
+        higher = np.flatnonzero(padded > padded[k])
+        begin = int(max(higher[higher < k], default=0))
+        end = int(min(higher[higher > k], default=len(score) + 1))
+        valley = max(padded[begin:k].min(), padded[k + 1 : end + 1].min())
+        if padded[k] - valley >= rise:
+            found.append(k - 1)
+    return np.array(found, dtype=np.intp)
 
 
 def _speed(
@@ -127,14 +150,27 @@ def _speed(
     return 0.5 * (times[first] + times[last]), way / span
 
 
-def _correlation(
-    grid: FloatArray, by_joints: FloatArray, measured: tuple[FloatArray, FloatArray]
-) -> float:
-    times, speed = measured
-    inside = (grid >= times[0]) & (grid <= times[-1])
-    if inside.sum() * STEP < LEAST_MOTION:
-        return -1.0
-    first, second = by_joints[inside], np.interp(grid[inside], times, speed)
-    first, second = first - first.mean(), second - second.mean()
-    size = np.sqrt((first @ first) * (second @ second))
-    return float(first @ second / size) if size > 0.0 else -1.0
+def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int]) -> FloatArray:
+    """Return the correlations of a signal (N,) with the parts (N,) of a longer one.
+
+    Of the latter only what lies between two numbers is known; -1 stands where that is too little.
+    """
+    lags = np.arange(len(second) - len(first) + 1)
+    begin, end = (np.clip(each - lags, 0, len(first)) for each in known)
+    count = np.maximum(end - begin, 1)
+    one, other = first - first.mean(), np.zeros(len(second))
+    part = slice(*known)
+    other[part] = second[part] - second[part].mean()
+
+    def total(values: FloatArray, shift: NDArray[np.intp] | int = 0) -> FloatArray:
+        running = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray(running[end + shift] - running[begin + shift])
+
+    means = total(one) / count, total(other, lags) / count
+    squares = (total(one**2) - count * means[0] ** 2) * (
+        total(other**2, lags) - count * means[1] ** 2
+    )
+    products = np.correlate(other, one, 'valid') - count * means[0] * means[1]
+    least = np.finfo(float).eps * (one @ one) * (other @ other)
+    good = (count * STEP >= LEAST_MOTION) & (squares > least)
+    return np.where(good, products / np.sqrt(np.where(good, squares, 1.0)), -1.0)

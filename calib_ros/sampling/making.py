@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from operator import itemgetter
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +19,14 @@ from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import StreamKey
-from calib_ros.sampling.stops import RestlessError, average
+from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 
 DISTANCE, POSITION = slice(0, 1), slice(0, 3)
 QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
 WIDTH = COVARIANCE.stop
+Numbered: TypeAlias = tuple[int, Sample]
+"""A sample with the number of the round or the stop in which it was taken."""
 VIBRATING = 'poses: still vibrating, or a spike'
 RESTLESS = 'poses: a stop that spreads more than the noise'
 
@@ -44,17 +48,28 @@ class Maker:
         self._taken: dict[StreamKey, set[int]] = {}
         self.fresh: list[Sample] = []
         """Samples that nobody has taken yet."""
+        self._calm: int | None = None  # how many of them came before a stop that was not at rest
+        self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()
 
     def of_each(
-        self, key: StreamKey, stamps: Stamps, values: FloatArray, motion: Motion, delay_ns: int
-    ) -> None:
-        """Make a sample of each of some measurements: values (N, WIDTH) at stamps (N,)."""
+        self,
+        key: StreamKey,
+        numbers: NDArray[np.intp],
+        stamps: Stamps,
+        values: FloatArray,
+        motion: Motion,
+        delay_ns: int,
+    ) -> Iterator[Numbered]:
+        """Yield a sample of each of some measurements: values (N, WIDTH) at stamps (N,).
+
+        Each with the number (N,) of its round.
+        """
         oriented = ~np.isnan(values[:, QUAT.start])
         rotations = np.tile(np.eye(3), (len(values), 1, 1))
         rotations[oriented] = se3.from_quat(values[oriented, QUAT])
         for k, stamp_ns in enumerate(stamps.tolist()):
-            self._add(
+            sample = self._made(
                 key,
                 stamp_ns,
                 values[k : k + 1],
@@ -66,62 +81,97 @@ class Maker:
                 acceleration=motion.acceleration[k].copy(),
                 delay=1e-9 * delay_ns,
             )
+            if sample is not None:
+                yield int(numbers[k]), sample
 
-    def of_stop(
+    def of_stops(
         self,
         key: StreamKey,
+        numbers: NDArray[np.intp],
         stamps: Stamps,
         values: FloatArray,
         motion: Motion,
         delay_ns: int,
         sigma: float,
-    ) -> None:
-        """Make one sample of the measurements of a stop, which scatter by `sigma` [m]."""
+    ) -> Iterator[Numbered]:
+        """Yield a sample of the measurements of each stop, unless these spread too much.
+
+        Values (N, WIDTH) of the stops of some numbers (N,), which scatter by `sigma` [m].
+        """
+        begins = np.flatnonzero(np.diff(numbers, prepend=-1))
+        counts = np.diff(begins, append=len(values))
+        joints = motion.joints[begins]
+        steps = unwrapped(motion.joints - np.repeat(joints, counts, axis=0), self._revolute)
         if key.images:
-            self._of_images(key, stamps, values, motion, delay_ns)
+            joints = joints + mean_of_each(steps, begins, np.ones(len(steps), dtype=bool))
+            yield from self._of_images(
+                key, numbers, begins, stamps, values, joints, motion.approach, delay_ns
+            )
             return
-        oriented = not np.isnan(values[:, QUAT]).any()
-        rotations = se3.from_quat(values[:, QUAT]) if oriented else None
-        if not np.isnan(values[:, COVARIANCE]).any():
-            own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)]
-            sigma = float(np.sqrt(own.mean()))
-        try:
-            mean = average(values[:, DISTANCE if key.distance else POSITION], rotations, sigma)
-        except RestlessError:
-            self.dropped[RESTLESS] += len(values)
-            return
-        left_out = int((~mean.used).sum())
-        if left_out:
-            self.dropped[VIBRATING] += left_out
-        steps = unwrapped(motion.joints[mean.used] - motion.joints[0], self._revolute)
-        self._add(
-            key,
-            int(stamps[0]) + round(float((stamps[mean.used] - stamps[0]).mean())),
-            values[mean.used],
-            position=mean.value,
-            rotation=mean.rotation,
-            joints=motion.joints[0] + steps.mean(axis=0),
-            approach=motion.approach[0].copy(),  # a view would keep the whole stop
-            delay=1e-9 * delay_ns,
-            spread=mean.spread,
-        )
+        turned = ~np.isnan(values[:, QUAT]).any(axis=1)
+        own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
+        variances = np.add.reduceat(own, begins) / counts  # of NaN where any has none
+        sigmas = np.where(np.isnan(variances), sigma, np.sqrt(variances))
+        means = averages(values[:, DISTANCE if key.distance else POSITION], begins, sigmas)
+        rotations = np.tile(np.eye(3), (len(values), 1, 1))
+        rotations[turned] = se3.from_quat(values[turned, QUAT])
+        oriented = np.logical_and.reduceat(turned, begins)
+        # the chordal mean (Moakher 2002)
+        rotations = se3.nearest_rotation(mean_of_each(rotations, begins, means.used))
+        joints = joints + mean_of_each(steps, begins, means.used)
+        since = (stamps - np.repeat(stamps[begins], counts)).astype(np.float64)
+        times = stamps[begins] + np.rint(mean_of_each(since, begins, means.used)).astype(np.int64)
+        for k, (begin, count) in enumerate(zip(begins.tolist(), counts.tolist(), strict=True)):
+            number, used = int(numbers[begin]), means.used[begin : begin + count]
+            left_out = count - int(np.count_nonzero(used))
+            if left_out or not means.rests[k]:
+                self._shaken = min(self._shaken, number)
+            if not means.rests[k]:
+                self.dropped[RESTLESS] += count
+                continue
+            if left_out:
+                self.dropped[VIBRATING] += left_out
+            sample = self._made(
+                key,
+                int(times[k]),
+                values[begin : begin + count][used],
+                position=means.values[k].copy(),  # a view would keep all stops
+                rotation=rotations[k].copy() if oriented[k] else None,
+                joints=joints[k].copy(),
+                approach=motion.approach[begin].copy(),
+                delay=1e-9 * delay_ns,
+                spread=float(means.spreads[k]),
+            )
+            if sample is not None:
+                yield number, sample
 
     def _of_images(
-        self, key: StreamKey, stamps: Stamps, values: FloatArray, motion: Motion, delay_ns: int
-    ) -> None:
-        """Make a sample of the images of a stop, of which one will be looked at."""
-        middle = len(stamps) // 2
-        steps = unwrapped(motion.joints - motion.joints[0], self._revolute)
-        self._add(
-            key,
-            int(stamps[middle]),
-            values[middle : middle + 1],
-            position=np.full(3, np.nan),
-            joints=motion.joints[0] + steps.mean(axis=0),
-            approach=motion.approach[0].copy(),
-            delay=1e-9 * delay_ns,
-            images=tuple(values[:, 0].astype(int).tolist()),
-        )
+        self,
+        key: StreamKey,
+        numbers: NDArray[np.intp],
+        begins: NDArray[np.intp],
+        stamps: Stamps,
+        values: FloatArray,
+        joints: FloatArray,
+        approach: FloatArray,
+        delay_ns: int,
+    ) -> Iterator[Numbered]:
+        """Yield a sample of the images of each stop, of which one will be looked at."""
+        ends = np.append(begins[1:], len(values))
+        for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
+            middle = (begin + end) // 2
+            sample = self._made(
+                key,
+                int(stamps[middle]),
+                values[middle : middle + 1],
+                position=np.full(3, np.nan),
+                joints=joints[k].copy(),
+                approach=approach[begin].copy(),
+                delay=1e-9 * delay_ns,
+                images=tuple(values[begin:end, 0].astype(int).tolist()),
+            )
+            if sample is not None:
+                yield int(numbers[begin]), sample
 
     def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
         """Make a sample of a ball that sits in a socket, at stamps (N,) while the arm stands."""
@@ -136,41 +186,49 @@ class Maker:
         self.remember([sample])
         self.fresh.append(sample)
 
-    def _add(
+    def _made(
         self, key: StreamKey, stamp_ns: int, rows: FloatArray, position: FloatArray, **more: Any
-    ) -> None:
-        """Add a sample of measurements (N, WIDTH), unless there is one or no room."""
+    ) -> Sample | None:
+        """Return a sample of measurements (N, WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
             self.dropped['poses: a sample with this stamp is there already'] += len(rows)
-            return
+            return None
         if len(known) >= self._capacity:
             self.dropped['poses: the memory for samples is full'] += len(rows)
-            return
+            return None
         known.add(stamp_ns)
         covariance = None
         if not np.isnan(rows[:, COVARIANCE]).any():
             covariance = rows[:, COVARIANCE].mean(axis=0).reshape(6, 6)
-        self.fresh.append(
-            Sample(
-                stamp_ns=stamp_ns,
-                position=None if key.distance else position,
-                distance=float(position[0]) if key.distance else None,
-                covariance=covariance,
-                device=key.device,
-                target=key.target,
-                frame_id=key.frame_id,
-                validation=key.validation,
-                eye_in_hand=key.eye_in_hand,
-                count=len(rows),
-                **more,
-            )
+        return Sample(
+            stamp_ns=stamp_ns,
+            position=None if key.distance else position,
+            distance=float(position[0]) if key.distance else None,
+            covariance=covariance,
+            device=key.device,
+            target=key.target,
+            frame_id=key.frame_id,
+            validation=key.validation,
+            eye_in_hand=key.eye_in_hand,
+            count=len(rows),
+            **more,
         )
 
-    def take(self) -> list[Sample]:
-        """Return the samples made since the last call."""
-        fresh, self.fresh = self.fresh, []
-        return fresh
+    def add(self, found: list[Numbered]) -> None:
+        """Keep samples for who takes them, in the order of their rounds or stops."""
+        found.sort(key=itemgetter(0))
+        calm = sum(number < self._shaken for number, _ in found)
+        if self._calm is None and calm < len(found):
+            self._calm = len(self.fresh) + calm
+        self._shaken = math.inf
+        self.fresh += [sample for _, sample in found]
+
+    def take(self) -> tuple[list[Sample], int]:
+        """Return the samples made since the last call, and how many since a stop was restless."""
+        fresh, calm = self.fresh, self._calm
+        self.fresh, self._calm = [], None
+        return fresh, 0 if calm is None else len(fresh) - calm
 
     @property
     def unrest(self) -> int:

@@ -62,7 +62,7 @@ class Road:
         for held in self.gate.release():
             for given in self._up_to_work(held):
                 self._keep(given)
-        self.clocks.look(self.collector, None)
+        self.clocks.find(self.collector, None)
         self.collector.finish()
         self.hand_over()
 
@@ -73,8 +73,9 @@ class Road:
 
     def hand_over(self) -> None:
         """Hand over the samples made."""
-        count = self._taken(self.collector.maker.take())
-        self.clocks.wake(self.collector.maker.unrest, count)
+        made, shaken = self.collector.maker.take()
+        count = self._taken(made)
+        self.clocks.wake(self.collector.maker.unrest, count - shaken, count)
 
     def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
         """Yield messages up to one that gives something to do, when those before are kept."""
@@ -89,7 +90,7 @@ class Road:
         begin = 0
         while begin < len(given):
             left = given.between(begin, len(given))
-            count = self.collector.reach(left)
+            count = self.collector.reach(left, self.clocks.calm(left))
             yield left.between(0, count)
             begin += count
 
@@ -103,7 +104,10 @@ class Road:
                 if back := int((times < newest).sum()):  # nothing is lost by it
                     self.notes[f'{kind} with a stamp older than the one before'] += back
         self.clocks.take(given)
-        if self.collector.take(given):
-            self.clocks.look(self.collector, int(given.times[given.where(JOINTS)[-1]]))
-            self.collector.round()
+        rounds = self.collector.take(given)
+        if rounds:
+            self.clocks.find(self.collector, rounds[-1])
+            self.collector.round(rounds)
         self.hand_over()
+        if rounds:
+            self.clocks.look(rounds[-1])

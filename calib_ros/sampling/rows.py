@@ -56,6 +56,13 @@ class Rows:
         self._stamps[: len(stamps)] = stamps
         self.count = len(stamps)
 
+    def release(self, count: int) -> None:
+        """Let go the first rows."""
+        left = self.count - count
+        self._values[:left] = self._values[count : self.count]
+        self._stamps[:left] = self._stamps[count : self.count]
+        self.count = left
+
     def sort(self) -> int:
         """Put the rows in the order of their stamps, one row a stamp; return how many went.
 

@@ -314,7 +314,7 @@ class CalibrationSession:
             Without any sample, or when measurements came in different frames.
 
         """
-        self._clocks.look(self._collector, None)
+        self._clocks.find(self._collector, None)
         self._flush()
         if self._kept.different:
             raise InputError(f'{self._kept.different}, {ONE_FRAME}')

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 
 SPIKE = 6.0
@@ -30,65 +29,73 @@ FEW = 4
 """With fewer measurements nothing can be said about their spread."""
 
 
-class RestlessError(Exception):
-    """A stop whose measurements spread more than their noise."""
-
-
 @dataclass(frozen=True, eq=False)
-class Mean:
-    """Which of the measurements (N,) make the mean, their mean, and their spread about it.
+class Means:
+    """The means of what was measured at S stops.
 
-    `spread` is the RMS of one coordinate [m].
+    Attributes
+    ----------
+    used : (N,) bool
+        Which measurements are in the mean of their stop.
+    rests : (S,) bool
+        False for a stop whose measurements spread more than their noise.
+    values : (S, 3) or (S, 1)
+        Positions or distances [m].
+    spreads : (S,)
+        RMS of one coordinate of a stop about its mean [m].
+
     """
 
     used: NDArray[np.bool_]
-    value: FloatArray
-    rotation: FloatArray | None
-    spread: float
+    rests: NDArray[np.bool_]
+    values: FloatArray
+    spreads: FloatArray
 
 
-def average(values: FloatArray, rotations: FloatArray | None, sigma: float) -> Mean:
-    """Average measurements in the order of their stamps.
+def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -> Means:
+    """Average measurements stop by stop, in the order of their stamps.
 
     Parameters
     ----------
     values : (N, 3) or (N, 1)
         Positions or distances [m].
-    rotations : (N, 3, 3), optional
-        Where orientations were measured.
-    sigma : float
-        Standard deviation [m] of one coordinate that is expected.
-
-    Raises
-    ------
-    RestlessError
-        When they spread more than their noise; the text says by how much.
+    begins : (S,) int
+        Where the measurements of each stop begin.
+    sigmas : (S,)
+        Standard deviations [m] of one coordinate that are expected.
 
     """
-    count = len(values)
-    noise = max(sigma, _noise(values))
-    used = np.ones(count, dtype=bool)
-    if count >= FEW:
+    used, limits = np.ones(len(values), dtype=bool), np.full(len(begins), np.inf)
+    rests = np.ones(len(begins), dtype=bool)
+    ends = np.append(begins[1:], len(values))
+    for k in np.flatnonzero(ends - begins >= FEW).tolist():
+        part = slice(begins[k], ends[k])
+        noise = max(sigmas[k], _noise(values[part]))
+        limits[k] = MOST_SPREAD * noise
         reach = noise * np.sqrt(values.shape[1])
-        used[: _settled(values, reach)] = False
-        spikes = _distance(values, np.median(values[used], axis=0)) > SPIKE * reach
-        if (spikes & used).sum() > MOST_SPIKES * used.sum():
-            raise RestlessError(_words(values[used], noise))
-        used &= ~spikes
-    mean = values[used].mean(axis=0)
-    spread = float(np.sqrt(((values[used] - mean) ** 2).mean()))
-    if count >= FEW and spread > MOST_SPREAD * noise:
-        raise RestlessError(_words(values[used], noise))
-    rotation = None
-    if rotations is not None:  # the chordal mean (Moakher 2002)
-        rotation = se3.nearest_rotation(rotations[used].sum(axis=0))
-    return Mean(used, mean, rotation, spread)
+        settled = used[part]
+        settled[: _settled(values[part], reach)] = False
+        middle = np.median(values[part][settled], axis=0)
+        spikes = _distance(values[part], middle) > SPIKE * reach
+        rests[k] = (spikes & settled).sum() <= MOST_SPIKES * settled.sum()
+        settled &= ~spikes
+    means = mean_of_each(values, begins, used)
+    squares = (values - np.repeat(means, ends - begins, axis=0)) ** 2
+    spreads = np.sqrt(mean_of_each(squares, begins, used).mean(axis=1))
+    return Means(used, rests & (spreads <= limits), means, spreads)
+
+
+def mean_of_each(
+    rows: FloatArray, begins: NDArray[np.intp], used: NDArray[np.bool_]
+) -> FloatArray:
+    """Return the means (S, ...) of the rows (N, ...) in use of each stop, zero where none is."""
+    shape = (-1,) + (1,) * (rows.ndim - 1)
+    counts = np.maximum(np.add.reduceat(used, begins, dtype=np.intp), 1)
+    return np.asarray(np.add.reduceat(rows * used.reshape(shape), begins) / counts.reshape(shape))
 
 
 def _noise(values: FloatArray) -> float:
     """Return the standard deviation of one coordinate from successive differences."""
-    if len(values) < FEW:
-        return 0.0
     steps = np.abs(np.diff(values, axis=0))
     return float(1.4826 * np.median(steps) / np.sqrt(2.0))  # the median: spikes do not count
 
@@ -105,11 +112,3 @@ def _settled(values: FloatArray, reach: float) -> int:
 
 def _distance(values: FloatArray, point: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(values - point, axis=1))
-
-
-def _words(values: FloatArray, noise: float) -> str:
-    spread = np.sqrt(((values - np.median(values, axis=0)) ** 2).mean())
-    return (
-        f'the measurements of this stop spread by {1e3 * spread:.3f} mm, their noise is '
-        f'{1e3 * noise:.3f} mm'
-    )

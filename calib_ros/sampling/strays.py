@@ -67,25 +67,23 @@ class Gate:
 
     def _plain(self, given: Slice) -> int:
         """Let the first messages pass up to one that is to be held back, or frees others."""
-        count, lasts = len(given), {}
+        times, numbers = given.times, np.arange(len(given))
+        near = np.zeros(len(given), dtype=bool)  # to the last one of any kind
+        for kind, which in ((JOINTS, given.joints), (POSES, ~given.joints)):
+            before = np.maximum.accumulate(np.where(which, numbers, -1))
+            before = np.concatenate([[-1], before[:-1]])
+            known = np.where(before < 0, self._last.get(kind, 0), times[before])
+            told = (before >= 0) | (kind in self._last)
+            near |= told & (np.abs(times - known) <= self._far_ns)
+        for kind, time_ns, _ in self._held:
+            near &= given.joints != (kind == JOINTS)
+            near &= np.abs(times - time_ns) > self._far_ns
+        count = int(np.argmin(np.append(near, False)))
         for kind in (JOINTS, POSES):
             where = given.where(kind)
-            if not len(where):
-                continue
-            times = given.times[where]
-            stops = np.ones(len(where), dtype=bool)
-            if kind in self._last and not self.held(kind):
-                before = np.concatenate([[self._last[kind]], times[:-1]])
-                stops = np.abs(times - before) > self._far_ns
-                for _, time_ns, _ in self._held:
-                    stops |= np.abs(times - time_ns) <= self._far_ns
-            if stops.any():
-                count = min(count, int(where[np.argmax(stops)]))
-            lasts[kind] = where, times
-        for kind, (where, times) in lasts.items():
             passed = int(np.searchsorted(where, count))
             if passed:
-                self._last[kind] = int(times[passed - 1])
+                self._last[kind] = int(times[where[passed - 1]])
         return count
 
     def _admitted(self, given: Slice) -> tuple[list[Slice], bool]:

@@ -139,6 +139,16 @@ class Track:
                 whole[good] = part[why == 0]
         return Motion(joints, velocity, acceleration, approach, self.causes(stamps))
 
+    def where(self, stamps: Stamps) -> FloatArray:
+        """Return joint values (N, n) while the arm stands, after `sort`."""
+        joints = np.zeros((len(stamps), len(self._revolute)))
+        for columns, rows in self._by_size():
+            index = list(columns)
+            why, first, last = self._brackets(rows.stamps, stamps)
+            found, *_ = interpolated(rows, stamps, first, last, self._revolute[index], True)
+            joints[np.ix_(why == 0, index)] = found[why == 0]
+        return joints
+
     def causes(self, stamps: Stamps) -> NDArray[np.intp]:
         """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
         cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
@@ -197,16 +207,18 @@ class Track:
             common = found if common is None else intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
 
-    def noise_at_rest(self, time_ns: int) -> float | None:
+    def noise_at_rest(self, time_ns: int, newest_ns: int) -> float | None:
         """Return the standard deviation [rad or m] of the noisiest joint, after `sort`.
 
-        Second differences of the last samples of some time show it, with no motion in them (von
-        Neumann 1941). None where they are too few, or spread more than that: the arm moves.
+        Second differences of the samples of some time up to a stamp show it, with no motion in
+        them (von Neumann 1941). None where they are too few, or spread more than that: the arm
+        moves.
         """
         largest = None
         for columns, rows in self._parts.items():
-            first = int(np.searchsorted(rows.stamps, self.newest_ns - time_ns))
-            values = rows.values[max(0, min(first, rows.count - FEWEST_AT_REST)) :]
+            end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
+            first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
+            values = rows.values[max(0, min(first, end - FEWEST_AT_REST)) : end]
             if len(values) < FEWEST_AT_REST:
                 return None
             values = continuous(values, self._revolute[list(columns)])
@@ -238,7 +250,7 @@ class Track:
                 rows.values, here, rows.values[here], self._came[index], self._revolute[index]
             )
             self._came[index] = came[0]
-            rows.keep(np.arange(cut, rows.count))
+            rows.release(cut)
             gone += cut
         self.horizon_ns = max(self.horizon_ns, before_ns)
         return gone

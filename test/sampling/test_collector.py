@@ -65,7 +65,7 @@ def play(made, *events, finish=True):
     give(made, come)
     if finish:
         made.finish()
-    return made.maker.take()
+    return made.maker.take()[0]
 
 
 def give(made, come):
@@ -79,9 +79,9 @@ def give(made, come):
     ]
     left = Slice.of(pieces, round(1e9 * made.settings.delay)) if pieces else ()
     while len(left):
-        count = made.reach(left)
-        if made.take(left.between(0, count)):
-            made.round()
+        count = made.reach(left, (0, 2 * START))
+        if rounds := made.take(left.between(0, count)):
+            made.round(rounds)
         left = left.between(count, len(left))
 
 

@@ -6,11 +6,14 @@ import re
 
 import numpy as np
 import pytest
-from streams import START, hear, stamps, stops, sweep
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import find_peaks
+from streams import START, S, hear, stamps, stops, sweep
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.delay import LEAST_MOTION, find_delay
+from calib_ros.sampling.delay import LEAST_MOTION, find_delay, peaks
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -174,3 +177,22 @@ def test_a_far_stamp_costs_no_time_and_no_memory(rng, monkeypatch):
     assert find_delay(chain, *arrays) is None
     assert looked_at
     assert max(looked_at) <= 100_000
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.02, 0.2, 0.5]))
+def test_peaks_are_those_of_scipy(seed, rise):
+    rng = np.random.default_rng(seed)
+    score = np.tanh(np.convolve(rng.normal(size=200), np.ones(9) / 6.0, 'valid'))
+    expected, _ = find_peaks(np.pad(score, 1, constant_values=-1.0), prominence=rise)
+    np.testing.assert_array_equal(peaks(score, rise), expected - 1)
+
+
+def test_motion_between_joint_states_too_far_apart_tells_no_delay(rng):
+    """Of an arm that is heard for half of each second nobody knows how it moved in the other."""
+    _, motion, _ = true_cell(3)
+    chain, joint_stamps, joints, *measured = speeds(0.1, 30.0, rng, motion)
+    heard = (joint_stamps - START) % S < 5e8
+    arguments = chain, joint_stamps[heard], joints[heard], *measured
+    assert find_delay(*arguments, 0.1).seconds == pytest.approx(0.1, abs=3e-2)
+    heard &= (joint_stamps - START) % S < 5e7
+    assert find_delay(chain, joint_stamps[heard], joints[heard], *measured, 0.1) is None

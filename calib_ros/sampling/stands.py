@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which of the times in which the arm stood become samples, and what becomes of the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.interpolation import unwrapped
+from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.settings import Settings
+
+SAMPLED = 'of a stop that is sampled already'
+
+
+@dataclass
+class Plan:
+    """What becomes of measurements up to stamps, each from the end of the one before.
+
+    Attributes
+    ----------
+    done_ns : int
+        Up to which measurements have been dealt with.
+    sampled_ns : int
+        A stop that stands at this moment has been sampled.
+    ends : list of int
+        Stamps, in order.
+    why : list of str
+        Why those up to each of them are not used; empty where they are.
+    begins : list of int
+        Where the stop begins whose measurements are used.
+
+    """
+
+    done_ns: int
+    sampled_ns: int
+    ends: list[int] = field(default_factory=list)
+    why: list[str] = field(default_factory=list)
+    begins: list[int] = field(default_factory=list)
+
+    def add(self, until: int, why: str, begin: int = 0) -> None:
+        """Deal with what was measured up to a stamp."""
+        if until > self.done_ns:
+            self.done_ns = until
+            self.ends.append(until)
+            self.why.append(why)
+            self.begins.append(begin)
+
+    def sampled(self, until: int) -> None:
+        """Drop the rest of a stop."""
+        self.add(until, SAMPLED)
+        self.sampled_ns = max(self.sampled_ns, self.done_ns)
+
+    def sample(self, begin: int, end: int) -> None:
+        """Make a sample of a stop."""
+        self.add(end, '', begin)
+        self.sampled_ns = end
+
+    @property
+    def stops(self) -> list[int]:
+        """Return the numbers of the stops of which samples are made."""
+        return [k for k, why in enumerate(self.why) if not why]
+
+    def of_stands(
+        self, stands: Stamps, until: int, newest: int | None, settings: Settings
+    ) -> Plan:
+        """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there."""
+        shortest, longest = (
+            round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)
+        )
+        for begin, end in stands.tolist():
+            goes_on = newest is not None and end >= newest
+            if newest is None:
+                end = min(end, until)
+            begin = max(begin, self.done_ns)
+            if begin > until or end <= self.done_ns:
+                continue
+            self.add(begin, 'the arm was moving')
+            if begin <= self.sampled_ns:
+                self.sampled(min(end, until))
+                continue
+            if settings.mode == 'triggered':
+                self.add(min(end, until), 'nobody asked for them')
+                continue
+            last = min(end, begin + longest)
+            if last > until or (goes_on and last == end):
+                return self  # it is waited for
+            if last - begin < shortest:
+                self.add(last, 'the stop was too short')
+                continue
+            self.sample(begin, last)
+            self.sampled(min(end, until))
+        self.add(until, 'the arm was moving')
+        return self
+
+
+class Known:
+    """Where and when stops were sampled: the clock may jump back, and they come again.
+
+    Parameters
+    ----------
+    revolute : (n,) bool
+        True for the joints whose values are angles.
+    capacity : int
+        Stops that are remembered at most.
+
+    """
+
+    def __init__(self, revolute: NDArray[np.bool_], capacity: int) -> None:
+        self._revolute = revolute
+        self._stops = Rows(1 + len(revolute), capacity)  # how long, and where
+        self._last_ns = 0  # none ends later
+
+    def meets(
+        self, stops: Sequence[tuple[int, int]], joints: FloatArray, near: float
+    ) -> list[bool]:
+        """Tell which stops at joint values (S, n) were sampled before; remember the others."""
+        return [self._meets(*stop, where, near) for stop, where in zip(stops, joints, strict=True)]
+
+    def _meets(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
+        if begin <= self._last_ns:
+            begins, lengths = self._stops.stamps, self._stops.values[:, 0]
+            meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)
+            steps = unwrapped(self._stops.values[meets, 1:] - where, self._revolute)
+            if (np.abs(steps).max(axis=1) <= near).any():
+                return True
+        if not self._stops.full:
+            self._stops.extend(np.array([begin]), np.array([[end - begin, *where]]))
+            self._last_ns = max(self._last_ns, end)
+        return False
+
+    def forget(self, stamp_ns: int) -> None:
+        """Forget the stop that stands at a stamp of the joints."""
+        since = stamp_ns - self._stops.stamps
+        self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))

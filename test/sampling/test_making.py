@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib_ros.kinematics import se3
+from calib_ros.sampling.making import WIDTH, Maker
+from calib_ros.sampling.slices import StreamKey
+from calib_ros.sampling.track import Motion
+
+POSE = StreamKey('', '', False, False, False)
+NOISE = 5e-5
+
+
+def samples(rotations, rng, spikes=(), stops=1):
+    """Return the samples of stops at which rotations (N, 3, 3) were measured, alike at each."""
+    count = len(rotations)
+    values = np.full((stops * count, WIDTH), np.nan)
+    values[:, :3] = 0.5 + rng.normal(scale=NOISE, size=(stops * count, 3))
+    values[list(spikes), :3] += 0.1
+    values[:, 3:7] = np.tile(se3.to_quat(rotations), (stops, 1))
+    still = np.zeros((stops * count, 1))
+    motion = Motion(still, still, still, still, np.zeros(stops * count, dtype=np.intp))
+    stamps = 1 + np.arange(stops * count)
+    numbers = np.repeat(np.arange(stops), count)
+    made = Maker(np.array([True]), 100)
+    made.add(list(made.of_stops(POSE, numbers, stamps, values, motion, 0, NOISE)))
+    return made.take()[0]
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, np.pi - 1e-6, np.pi]))
+def test_rotations_are_averaged_as_rotations(seed, angle):
+    """Also near half a turn, where rotation vectors jump from one sign to the other."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    true = se3.exp_rotation(angle * axis[np.newaxis] / np.linalg.norm(axis))[0]
+    count, sigma = 100, 1e-3
+    turned = se3.exp_rotation(rng.normal(scale=sigma, size=(count, 3))) @ true
+    found = samples(turned, rng)[0].rotation
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(found) == pytest.approx(1.0)
+    error = se3.log_rotation((found @ true.T)[np.newaxis])[0]
+    assert np.linalg.norm(error) < 5.0 * sigma * np.sqrt(3.0 / count)
+
+
+def test_the_rotation_of_a_spike_does_not_count(rng):
+    rotations = np.tile(np.eye(3), (20, 1, 1))
+    rotations[7] = se3.exp_rotation(np.array([[0.5, 0.0, 0.0]]))[0]
+    first, second = samples(rotations, rng, (7, 27), stops=2)
+    assert first.count == second.count == 19
+    for sample in (first, second):
+        np.testing.assert_allclose(sample.rotation, np.eye(3), atol=1e-12)
