@@ -14,9 +14,6 @@ import numpy as np
 
 from calib_ros.errors import ConfigError
 
-LONGEST = 60
-"""Characters of a field's value; longer ones are told by their kind and size."""
-
 
 class Shown:
     """A dataclass whose fields are shown in brief: arrays by shape, long values by their size."""
@@ -60,7 +57,8 @@ def _briefly(value: Any) -> list[tuple[str, str]]:
     return [(each.name, _brief(getattr(value, each.name))) for each in fields(value)]
 
 
-def _brief(value: object) -> str:
+def _brief(value: object, longest: int = 60) -> str:
+    """Return a value in so many characters, a longer one by its kind and size."""
     if isinstance(value, np.ndarray):
         return f'{value.dtype}{list(value.shape)}'
     if isinstance(value, Shown):
@@ -73,8 +71,8 @@ def _brief(value: object) -> str:
     ):
         return f'<{len(value)} in a {type(value).__name__}>'
     text = repr(value)
-    if len(text) <= LONGEST:
+    if len(text) <= longest:
         return text
     if isinstance(value, tuple | list | Mapping):
         return f'<{len(value)} in a {type(value).__name__}>'
-    return text[: LONGEST - 3] + '...'
+    return text[: longest - 3] + '...'

@@ -21,7 +21,6 @@ none."""
 LARGEST_RATE = 1e12
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
 LONGEST_NAME = 200
-LARGEST_STAMP = 2**63 - 1
 SMALLEST_SIGMA, LARGEST_SIGMA = 1e-9, 1e6
 """Standard deviations [m or rad] between which a covariance is believed."""
 DEPENDENT = 1e-12
@@ -80,8 +79,8 @@ def cell_number(text: str, where: str, largest: float = LARGEST) -> float:
 
 def cell_integer(text: str, where: str) -> int:
     """Return the integer in a cell of a table; it has 64 bits at most."""
-    number = int(text) if re.fullmatch(r'-?[0-9]{1,19}', text) else LARGEST_STAMP + 1
-    if abs(number) > LARGEST_STAMP:
+    number = int(text) if re.fullmatch(r'-?[0-9]{1,19}', text) else 2**63
+    if abs(number) >= 2**63:
         raise InputError(f'{where} must be an integer of 64 bits, not {text!r}')
     return number
 

@@ -125,7 +125,7 @@ def test_the_parameter_file_states_the_defaults():
 
 def test_foxglove_shows_what_the_node_has():
     layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text())
-    rooms = ('node', 'advisor', 'outputs')
+    rooms = ('node', 'identifying', 'advisor', 'outputs')
     node = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in rooms)
     panels = layout['configById']
     names = {*re.findall('/calibration_node/([a-z_]+)', json.dumps(panels))}
@@ -139,7 +139,7 @@ def test_rviz_shows_what_the_node_publishes():
     content = yaml.safe_load((ROOT / 'config/calibration.rviz').read_text())
     manager = content['Visualization Manager']
     topics = {d['Class']: d['Topic'] for d in manager['Displays'] if 'Topic' in d}
-    rooms = ('node', 'advisor', 'outputs')
+    rooms = ('node', 'identifying', 'advisor', 'outputs')
     node = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in rooms)
     for topic in topics.values():
         assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in node

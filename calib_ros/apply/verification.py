@@ -191,24 +191,11 @@ def verify(
     numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    verdict, needed = _decided(tolerance, lower, upper, numbers)
+    verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
-    return Verification(
-        comparison,
-        tolerance,
-        confidence,
-        group,
-        rms,
-        float(lower[0]),
-        float(upper[0]),
-        float(freedom[0]),
-        verdict,
-        needed,
-        common,
-        commanded is not None,
-        fitted,
-        arm.holds(rms),
-    )
+    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
+    known = (commanded is not None, fitted, arm.holds(rms))
+    return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 
 def _compared(
@@ -352,11 +339,7 @@ def in_words(found: Verification) -> str:
             f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
             f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
         )
-    if found.each:
-        lines.append('  pose   measured   before    after   repeatability (mean + 3 sigma)')
-    for k, pose in enumerate(found.each):
-        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
-        lines.append(f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}')
+    lines += each_in_words(found)
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
     wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
     lines.append(
@@ -364,6 +347,16 @@ def in_words(found: Verification) -> str:
         f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
     )
     return '\n'.join([*lines, *remarks(found)])
+
+
+def each_in_words(found: Verification) -> list[str]:
+    """Return the lines of a table of the configurations [mm], of which there may be none."""
+    lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
+    for k, pose in enumerate(found.each, 1):
+        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
+        lines.append(line.rstrip())
+    return lines if found.each else []
 
 
 def remarks(found: Verification) -> list[str]:

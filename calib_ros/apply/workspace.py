@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -163,34 +163,3 @@ def rms_map(
     squares = np.histogram2d(first, second, edges, weights=errors**2)[0]
     rms = np.sqrt(squares / np.where(number > 0, number, np.nan))
     return first_edges, second_edges, rms
-
-
-def in_words(survey: Survey) -> str:
-    """Return the errors over the workspace as Markdown: figures, and where they are largest."""
-    rest = 'What remains is not known: the file does not say how well its numbers are known.'
-    if len(survey.parts) > 1:
-        rest = 'Expected to remain: sigma and the RMS error on poses that were not fitted.'
-    lines = [
-        f'Position errors [mm] at {len(survey.joints)} random poses of the joint range.',
-        '',
-        '| | RMS | mean | median | 95 % | max |',
-        '|---|---|---|---|---|---|',
-    ]
-    for label, errors in survey.parts.items():
-        figures = ' | '.join(f'{value:.4f}' for value in astuple(Spread.of(1e3 * errors)))
-        lines.append(f'| {label} | {figures} |')
-    lines += ['', rest]
-    for label, errors in list(survey.parts.items())[:2]:
-        found = regions(survey.positions, errors)
-        lines += ['', f'Largest RMS, {label}:', '']
-        lines += [f'- {_region_in_words(region)}' for region in found[:3]]
-        lines += ['', f'Least: {_region_in_words(found[-1])}']
-    return '\n'.join(lines) + '\n'
-
-
-def _region_in_words(region: Sector) -> str:
-    (near, far), (low, high) = region.radius, region.height
-    return (
-        f'{region.words}: {1e3 * region.rms:.4f} mm (radius {near:.2f} to {far:.2f} m, '
-        f'height {low:.2f} to {high:.2f} m, {region.poses} poses)'
-    )

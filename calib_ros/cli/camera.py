@@ -7,15 +7,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import add_out, refuse_existing
+from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen, Work
-    from calib_ros.files.images import Image
+from calib_ros.files.bags import pictures
+from calib_ros.files.boards import Board, read_board
+from calib_ros.files.images import SUFFIXES, Image, detect, files_of, image_of, marker_cells
+from calib_ros.kinematics.chain_file import dump_yaml
 
 
 def _add_board(parser: argparse.ArgumentParser) -> None:
@@ -41,12 +44,6 @@ def _add_images(parser: argparse.ArgumentParser) -> None:
 
 
 def _board(options: argparse.Namespace, screen: Screen) -> int:
-    import numpy as np
-
-    from calib_ros.atomic import write_file
-    from calib_ros.files.boards import Board
-    from calib_ros.files.images import marker_cells
-    from calib_ros.kinematics.chain_file import dump_yaml
     from calib_ros.report.plots import board_pdf
 
     keys = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary')
@@ -78,10 +75,6 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _images(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_file
-    from calib_ros.files.boards import read_board
-    from calib_ros.files.images import detect
-
     refuse_existing(options, options.out)
     if options.fewest < 1:
         raise InputError(f'--fewest must be at least 1, not {options.fewest}')
@@ -98,8 +91,6 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
 
 def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image]]:
     """Yield the images of a folder by their names, of a bag by their stamps."""
-    from calib_ros.files.images import SUFFIXES, files_of, image_of
-
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
     folder = options.images.is_dir()
@@ -111,27 +102,18 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
         return
     if folder and not (options.images / 'metadata.yaml').exists():
         raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
-    from calib_ros.files.bags import pictures
 
     for stamp, message in pictures(options.images, options.topic):
         yield str(stamp), image_of(message)
 
 
-COMMANDS = (
-    Command(
-        'board',
-        'Before measuring',
-        'print a board for cameras, as PDF in its true size',
+COMMANDS = {
+    'board': Command(
         _add_board,
         _board,
         ('board charuco --columns 9 --rows 7 --square 0.03 --marker 0.022 --out board.pdf',),
     ),
-    Command(
-        'images',
-        'Before measuring',
-        'find the corners of a board in photographs',
-        _add_images,
-        _images,
-        ('images photographs/ --board board.yaml --out corners.csv',),
+    'images': Command(
+        _add_images, _images, ('images photographs/ --board board.yaml --out corners.csv',)
     ),
-)
+}

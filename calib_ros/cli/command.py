@@ -1,34 +1,27 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a command is. Each module of this folder with `COMMANDS` adds its own."""
+"""The commands, by the groups of the overview; a module is imported when its command is given."""
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from calib_ros.cli.screen import Screen
 
-GROUPS = ('First steps', 'Before measuring', 'Calibrate', 'Use the calibration', 'Convert files')
-"""Where commands stand in the overview."""
-
 
 @dataclass(frozen=True)
 class Command:
-    """A command of the command line.
+    """What a command does.
 
     Attributes
     ----------
-    name, group, text : str
-        Its name, one of `GROUPS`, and what it does.
     add : callable
-        Adds its options to a parser; called for the command given only.
+        Adds its options to a parser.
     run : callable
         Does it, with the options and the screen, and returns the exit status.
     examples : tuple of str
@@ -36,22 +29,55 @@ class Command:
 
     """
 
-    name: str
-    group: str
-    text: str
     add: Callable[[argparse.ArgumentParser], None]
     run: Callable[[Any, Screen], int]
     examples: tuple[str, ...]
 
 
-@cache
-def commands() -> dict[str, Command]:
-    """Return all commands by name, in the order of the overview."""
-    package = importlib.import_module('calib_ros.cli')
-    found: list[Command] = []
-    for module in pkgutil.iter_modules(package.__path__):
-        if module.name != 'main':
-            loaded = importlib.import_module(f'calib_ros.cli.{module.name}')
-            found += getattr(loaded, 'COMMANDS', ())
-    found.sort(key=lambda each: (GROUPS.index(each.group), each.name))
-    return {each.name: each for each in found}
+GROUPS = {
+    'First steps': {
+        'chain': 'print the chain file of a robot, to read and to edit',
+        'demo': 'simulate an arm, identify it, and compare the result with the truth',
+        'robots': 'list the arms that come with calib_ros',
+        'simulate': 'write the bag of a simulated robot cell, with the true chain',
+    },
+    'Before measuring': {
+        'board': 'print a board for cameras, as PDF in its true size',
+        'images': 'find the corners of a board in photographs',
+        'plan': 'choose the poses to measure, and say how accurate they make',
+    },
+    'Calibrate': {
+        'fleet': 'identify what is new of all robots of a plant, and tell which ones changed',
+        'history': 'list results over time',
+        'identify': 'identify the errors of an arm from a bag or a table of measured poses',
+        'verify': 'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
+    },
+    'Use the calibration': {
+        'compare': 'test what has changed between two calibrations of one robot',
+        'compensate': 'correct the joint values of a program by a calibration',
+        'export': 'write a calibration in the forms that controllers and others read',
+        'workspace': 'map errors over the workspace, and place a task where they are least',
+    },
+    'Convert files': {
+        'bag2csv': 'write the samples of a bag as a table',
+        'csv2bag': 'write a table of measured poses as a bag',
+        'import': 'write a table of others as one of ours',
+    },
+}
+"""Commands by the groups of the overview, and what they do."""
+TEXTS = {name: text for group in GROUPS.values() for name, text in group.items()}
+HOMES = {
+    **dict.fromkeys(('chain',), 'robots'),
+    **dict.fromkeys(('demo',), 'simulate'),
+    **dict.fromkeys(('board', 'images'), 'camera'),
+    **dict.fromkeys(('history',), 'fleet'),
+    **dict.fromkeys(('bag2csv', 'csv2bag', 'import'), 'convert'),
+}
+"""Modules of other names than that of their command."""
+
+
+def load(name: str) -> Command:
+    """Return what a command does."""
+    module = importlib.import_module(f'calib_ros.cli.{HOMES.get(name, name)}')
+    found: Command = module.COMMANDS[name]
+    return found

@@ -7,13 +7,12 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import NOT_ACCEPTED
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
+from calib_ros.cli.screen import Screen
+from calib_ros.identification.calibration import load_calibration
+from calib_ros.identification.difference import difference
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -29,9 +28,6 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.identification.calibration import load_calibration
-    from calib_ros.identification.difference import difference
-
     pair = [load_calibration(path) for path in (options.first, options.second)]
     with screen.work('comparing'):
         found = difference(*pair)
@@ -44,13 +40,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     return 0 if found.same else NOT_ACCEPTED
 
 
-COMMANDS = (
-    Command(
-        'compare',
-        'Use the calibration',
-        'test what has changed between two calibrations of one robot',
-        _add,
-        _run,
-        ('compare monday/ tuesday/', 'compare before.yaml after.yaml --json'),
+COMMANDS = {
+    'compare': Command(
+        _add, _run, ('compare monday/ tuesday/', 'compare before.yaml after.yaml --json')
     ),
-)
+}

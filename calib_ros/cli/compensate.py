@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from calib_ros.apply.compensation import POSITIVE, Compensator, in_words
+from calib_ros.apply.program import compensate_program
+from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
@@ -17,15 +19,14 @@ from calib_ros.cli.options import (
     add_out,
     refuse_existing,
 )
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
+from calib_ros.files.trajectories import read_program
+from calib_ros.identification.calibration import load_calibration
+from calib_ros.kinematics.chain_file import load_chain
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.apply.compensation import Compensator
-
     group = parser.add_argument_group('what to correct')
     group.add_argument(
         'program',
@@ -66,13 +67,6 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.apply.compensation import POSITIVE, Compensator, in_words
-    from calib_ros.apply.program import compensate_program
-    from calib_ros.atomic import write_file
-    from calib_ros.files.trajectories import read_program
-    from calib_ros.identification.calibration import load_calibration
-    from calib_ros.kinematics.chain_file import load_chain
-
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
     refuse_existing(options, options.out)
     if options.out.exists() and options.out.samefile(options.program):
@@ -101,11 +95,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-COMMANDS = (
-    Command(
-        'compensate',
-        'Use the calibration',
-        'correct the joint values of a program by a calibration',
+COMMANDS = {
+    'compensate': Command(
         _add,
         _run,
         (
@@ -113,4 +104,4 @@ COMMANDS = (
             'compensate path.yaml --chain ur10e --calibration result/ --out corrected.yaml',
         ),
     ),
-)
+}

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.kinds import refuse_others
@@ -23,10 +25,14 @@ from calib_ros.cli.options import (
     sessions_of,
     settings_of,
 )
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
+from calib_ros.files.foreign import Foreign, as_csv
+from calib_ros.files.layouts import Layout
+from calib_ros.files.recording import Recording, write_bag
+from calib_ros.files.tables import check_table, read_table, table_text
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain_file import load_chain
 
 
 def _add_import(parser: argparse.ArgumentParser) -> None:
@@ -56,12 +62,6 @@ def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
 
 
 def _import(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_file
-    from calib_ros.files.foreign import Foreign, as_csv
-    from calib_ros.files.layouts import Layout
-    from calib_ros.files.tables import check_table
-    from calib_ros.kinematics.chain_file import load_chain
-
     refuse_others(options.table, 'import', 'table')
     refuse_existing(options, options.out)
     chain = None if options.chain is None else load_chain(options.chain)
@@ -78,13 +78,6 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
-    import numpy as np
-
-    from calib_ros.files.recording import Recording, write_bag
-    from calib_ros.files.tables import read_table
-    from calib_ros.identification.observations import Observations
-    from calib_ros.kinematics.chain_file import load_chain
-
     refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
     table = read_table(options.csv, len(chain.joints), sessions_of(options))
@@ -107,10 +100,6 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_file
-    from calib_ros.files.tables import table_text
-    from calib_ros.kinematics.chain_file import load_chain
-
     refuse_others(options.bag, 'bag2csv', 'bag')
     refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
@@ -126,27 +115,14 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-COMMANDS = (
-    Command(
-        'bag2csv',
-        'Convert files',
-        'write the samples of a bag as a table',
-        _add_bag2csv,
-        _bag2csv,
-        ('bag2csv recording/ measured.csv --chain ur10e',),
-    ),
-    Command(
-        'csv2bag',
-        'Convert files',
-        'write a table of measured poses as a bag',
+COMMANDS = {
+    'bag2csv': Command(_add_bag2csv, _bag2csv, ('bag2csv recording/ measured.csv --chain ur10e',)),
+    'csv2bag': Command(
         _add_csv2bag,
         _csv2bag,
         ('csv2bag measured.csv measured_bag --chain ur10e --session monday',),
     ),
-    Command(
-        'import',
-        'Convert files',
-        'write a table of others as one of ours',
+    'import': Command(
         _add_import,
         _import,
         (
@@ -155,4 +131,4 @@ COMMANDS = (
             '--out measured.csv',
         ),
     ),
-)
+}

@@ -6,33 +6,29 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from calib_ros.cli.inputs import Loaded, table
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
-    from calib_ros.kinematics.chain import Chain
-    from calib_ros.settings import Settings
+from calib_ros.files.boards import (
+    POSED,
+    observed,
+    read_board,
+    read_detections,
+    read_lens,
+    read_places,
+)
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.kinematics.chain import Chain
+from calib_ros.sampling.problems import with_lenses
+from calib_ros.settings import Settings
 
 
 def detected(
     options: argparse.Namespace, chain: Chain, settings: Settings, screen: Screen
 ) -> Loaded:
     """Return what is to be fitted of corners of a board, and of a table besides."""
-    from calib_ros.files.boards import (
-        POSED,
-        observed,
-        read_board,
-        read_detections,
-        read_lens,
-        read_places,
-    )
-    from calib_ros.identification.problem import Problem
-    from calib_ros.identification.reasons import Reason, Rule
-    from calib_ros.sampling.problems import with_lenses
-
     for name in ('board', 'places'):
         if getattr(options, name) is None:
             raise InputError(f'--detections need --{name} as well')

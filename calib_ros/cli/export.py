@@ -6,13 +6,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import add_chain, add_out, results
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
+from calib_ros.cli.screen import Screen
+from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
+from calib_ros.files.vendors import VENDOR_FILES, vendor_files
+from calib_ros.files.waypoints import read_joints
+from calib_ros.identification.calibration import load_calibration
+from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
+from calib_ros.kinematics.urdf import corrected_urdf
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -42,14 +46,6 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_files
-    from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
-    from calib_ros.files.vendors import VENDOR_FILES, vendor_files
-    from calib_ros.files.waypoints import read_joints
-    from calib_ros.identification.calibration import load_calibration
-    from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
-    from calib_ros.kinematics.urdf import corrected_urdf
-
     nominal = load_chain(options.chain)
     calibration = load_calibration(options.calibration, nominal)
     chain, origin = calibration.chain, calibration.record
@@ -74,11 +70,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-COMMANDS = (
-    Command(
-        'export',
-        'Use the calibration',
-        'write a calibration in the forms that controllers and others read',
+COMMANDS = {
+    'export': Command(
         _add,
         _run,
         (
@@ -86,4 +79,4 @@ COMMANDS = (
             'export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/',
         ),
     ),
-)
+}

@@ -7,15 +7,14 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import NOT_ACCEPTED
-from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
-    from calib_ros.files.rows import Row
+from calib_ros.cli.screen import Screen
+from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.files.history import History
+from calib_ros.files.rows import Row
 
 INCOMPLETE = 4
 """Exit status when measurements of some robots could not be used, and no robot needs a look."""
@@ -45,8 +44,6 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_file
-    from calib_ros.files.history import History
     from calib_ros.fleet.page import write_report
     from calib_ros.fleet.plant import read_plant
     from calib_ros.fleet.run import Cluster, run
@@ -96,9 +93,6 @@ def _add_history(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_history(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.errors import UnknownNameError
-    from calib_ros.files.history import History
-
     history = History(options.history)
     serials = history.serials()
     if not serials:
@@ -121,11 +115,8 @@ def _line(row: Row) -> str:
     return f'{when}  {row.kind:8}  {row.verdict:9}  {row.poses:5}  {rms:>8}  {row.source}'
 
 
-COMMANDS = (
-    Command(
-        'fleet',
-        'Calibrate',
-        'identify what is new of all robots of a plant, and tell which ones changed',
+COMMANDS = {
+    'fleet': Command(
         _add_fleet,
         _run_fleet,
         (
@@ -133,12 +124,5 @@ COMMANDS = (
             'fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786',
         ),
     ),
-    Command(
-        'history',
-        'Calibrate',
-        'list results over time',
-        _add_history,
-        _run_history,
-        ('history history/ --robot 0042',),
-    ),
-)
+    'history': Command(_add_history, _run_history, ('history history/ --robot 0042',)),
+}

@@ -8,11 +8,11 @@ import argparse
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
-from calib_ros.cli.inputs import of_bag, of_table
+from calib_ros.cli.detections import detected
+from calib_ros.cli.inputs import Loaded, of_bag, of_table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
@@ -37,13 +37,13 @@ from calib_ros.cli.results import (
     result_files,
     show,
 )
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.inputs import Loaded
-    from calib_ros.cli.screen import Screen
-    from calib_ros.files.history import History
-    from calib_ros.settings import Settings
+from calib_ros.files.boards import POSED, posed_arm
+from calib_ros.files.history import History
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report import words
+from calib_ros.settings import Settings
 
 LAYOUT = (
     *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
@@ -126,8 +126,6 @@ def _add_detections(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.report import words
-
     if options.tolerance is not None and not 0.0 < options.tolerance < math.inf:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
@@ -180,15 +178,10 @@ def _source(options: argparse.Namespace) -> str:
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
     """Return what there is to identify in a table or a bag, and the settings."""
-    from calib_ros.files.boards import POSED, posed_arm
-    from calib_ros.kinematics.chain_file import load_chain
-
     source = _source(options)
     chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
     settings = settings_of(options)
     if options.detections is not None:
-        from calib_ros.cli.detections import detected
-
         loaded = detected(options, chain, settings, screen)
     elif source == 'table':
         loaded = of_table(options, chain, settings, screen)
@@ -199,19 +192,14 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     """Return what is identified."""
-    from calib_ros.report import words
-
     loaded, settings = _loaded(options, screen)
     configuration = words.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
     return identified(loaded, settings, screen, origin_of(options, read, configuration))
 
 
-COMMANDS = (
-    Command(
-        'identify',
-        'Calibrate',
-        'identify the errors of an arm from a bag or a table of measured poses',
+COMMANDS = {
+    'identify': Command(
         _add,
         _run,
         (
@@ -221,4 +209,4 @@ COMMANDS = (
             'identify measured.csv --chain ur10e --session monday --json',
         ),
     ),
-)
+}

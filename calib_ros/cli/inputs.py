@@ -8,20 +8,19 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calib_ros.cli.options import foreign_of, sessions_of
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
-    from calib_ros.files.bags import Replayed
-    from calib_ros.files.tables import Table
-    from calib_ros.identification.problem import Problem
-    from calib_ros.identification.reasons import Reason
-    from calib_ros.identification.records import Owner
-    from calib_ros.kinematics.chain import Chain
-    from calib_ros.sampling.session import CalibrationSession
-    from calib_ros.settings import Settings
+from calib_ros.cli.screen import Screen
+from calib_ros.files.bags import Replayed, replay
+from calib_ros.files.tables import Table, read_table
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason
+from calib_ros.identification.records import Owner
+from calib_ros.kinematics.chain import Chain
+from calib_ros.sampling.sample import named
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +46,6 @@ def replayed(
     path: Path, chain: Chain, settings: Settings, screen: Screen
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has taken a bag."""
-    from calib_ros.files.bags import replay
-    from calib_ros.sampling.session import CalibrationSession
-
     session = CalibrationSession(chain, settings)
     with screen.work(f'reading {path.name}') as work:
         return session, replay(path, session, lambda share: work(share=share))
@@ -59,8 +55,6 @@ def of_bag(
     path: Path, chain: Chain, settings: Settings, screen: Screen, largest_loss: float = 1.0
 ) -> Loaded:
     """Return what is to be fitted of a bag, of which no more than a share may be lost."""
-    from calib_ros.sampling.sample import named
-
     session, read = replayed(path, chain, settings, screen)
     problem = session.problem()
     account = session.account()
@@ -79,8 +73,6 @@ def table(
     eye_in_hand: bool = False,
 ) -> Table:
     """Return a table of measurements, laid out as the options say."""
-    from calib_ros.files.tables import read_table
-
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     foreign = foreign_of(options, chain)
     with screen.work(f'reading {path.name}'):

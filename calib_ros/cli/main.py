@@ -22,7 +22,7 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
-from calib_ros.cli.command import GROUPS, Command, commands
+from calib_ros.cli.command import GROUPS, TEXTS, load
 from calib_ros.cli.kinds import proposal
 from calib_ros.cli.screen import WIDTH, Screen
 from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
@@ -78,10 +78,10 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
     if name == '--version':
         print(f'calib_ros {__version__}')
         raise SystemExit(0)
-    if name not in commands():
+    if name not in TEXTS:
         words = proposal(Path(name))
         if words is None:
-            words = str(UnknownNameError('command', name, commands()))
+            words = str(UnknownNameError('command', name, TEXTS))
         raise SystemExit(_failed(words, 2))
     return _parser(given).parse_args(given)
 
@@ -93,28 +93,31 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
     """
     parser = argparse.ArgumentParser(prog='calib_ros', add_help=False)
     names = parser.add_subparsers(required=True, metavar='COMMAND')
-    for command in commands().values():
+    for name, text in TEXTS.items():
+        if name not in given:
+            names.add_parser(name, add_help=False)
+            continue
+        command = load(name)
         added = names.add_parser(
-            command.name,
+            name,
             add_help=False,
-            description=textwrap.fill(f'{command.text[0].upper()}{command.text[1:]}.', WIDTH),
-            epilog=_foot(command),
+            description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', WIDTH),
+            epilog=_foot(command.examples),
             formatter_class=_Help,
         )
         added.set_defaults(run=command.run)
-        if command.name in given:
-            command.add(added)
-            more = added.add_argument_group('on the screen')
-            more.add_argument(
-                '--quiet', action='store_true', help='only warnings, errors and what is asked for'
-            )
-            more.add_argument('-h', '--help', action='help', help='this text')
+        command.add(added)
+        more = added.add_argument_group('on the screen')
+        more.add_argument(
+            '--quiet', action='store_true', help='only warnings, errors and what is asked for'
+        )
+        more.add_argument('-h', '--help', action='help', help='this text')
     return parser
 
 
-def _foot(command: Command) -> str:
+def _foot(examples: Iterable[str]) -> str:
     lines = ['examples:']
-    for each in command.examples:
+    for each in examples:
         parts = textwrap.wrap(f'calib_ros {each}', WIDTH - 8, break_on_hyphens=False)
         lines.append('  ' + ' \\\n      '.join(parts))
     return '\n'.join(lines)
@@ -164,15 +167,13 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 def _overview() -> str:
     """Return what all commands do, and the way from here."""
     lines = [f'calib_ros {__version__}: kinematic calibration of industrial arms.']
-    for group in GROUPS:
+    for group, entries in GROUPS.items():
         lines += ['', f'{group}:']
-        for each in commands().values():
-            if each.group == group:
-                head = f'  {each.name:12}'
-                text = textwrap.fill(
-                    each.text, WIDTH, initial_indent=head, subsequent_indent=' ' * 14
-                )
-                lines.append(text)
+        for name, text in entries.items():
+            head = f'  {name:12}'
+            lines.append(
+                textwrap.fill(text, WIDTH, initial_indent=head, subsequent_indent=' ' * 14)
+            )
     lines += ['', 'The way:']
     for command, words in WAY:
         lines.append(f'  {command:45}{words}'.rstrip())

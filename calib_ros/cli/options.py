@@ -10,20 +10,29 @@ from contextlib import AbstractContextManager
 from dataclasses import fields
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from calib_ros.atomic import whole_folder
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
-    from calib_ros.files.foreign import Foreign
-    from calib_ros.files.history import History
-    from calib_ros.files.rows import Filing
-    from calib_ros.identification.observations import Observations
-    from calib_ros.kinematics.chain import Chain
-    from calib_ros.report.page import Origin, Report
-    from calib_ros.settings import Settings
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.history import History
+from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.rows import Filing, content_hash, measured_at
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import shipped_robots
+from calib_ros.report.page import (
+    MISSING,
+    MISSING_PDF,
+    Origin,
+    Report,
+    input_of,
+    inputs_of,
+    on_paper,
+    render,
+)
+from calib_ros.settings import Settings
 
 NOT_ACCEPTED = 3
 """Exit status when the input was used, but what came out does not do."""
@@ -65,15 +74,11 @@ def _robots(prefix: str, **_: Any) -> list[str]:
     """Return what may be meant by the beginning of the name of a robot or file."""
     from glob import glob
 
-    from calib_ros.kinematics.chain_file import shipped_robots
-
     return [*shipped_robots(), *glob(f'{prefix}*')]
 
 
 def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
     """Add options for the settings of some names, or for all, in their groups."""
-    from calib_ros.settings import Settings
-
     known = {item.name: item for item in fields(Settings)}
     for title, members in SETTINGS.items():
         wanted = [known[name] for name in members if not names or name in names]
@@ -134,42 +139,25 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group(
         'tables of others (docs/tables.md); what is not given is guessed'
     ).add_argument
-    add('--preset', default='', metavar='NAME', help='a layout by name, or your own .yaml')
-    add(
-        '--columns',
-        action='append',
-        default=[],
-        metavar='OURS=THEIRS,...',
-        help='q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints',
-    )
-    add('--length', default='', metavar='UNIT', help='of lengths: m, cm, mm, um, in')
-    add(
-        '--angle',
-        default='',
-        metavar='UNIT',
-        help='unit of angles, joint values included: rad, deg',
-    )
-    add(
-        '--joint-angle',
-        default='',
-        metavar='UNIT',
-        help='unit of joint values where it is another one',
-    )
-    add('--euler', default='', metavar='ZYX', help='rx ry rz are Euler angles; zyx: fixed axes')
-    add('--quaternion', default='', metavar='wxyz', help='order of qx qy qz qw, else xyzw')
+    for name, metavar, text in (
+        ('preset', 'NAME', 'a layout by name, or your own .yaml'),
+        ('length', 'UNIT', 'of lengths: m, cm, mm, um, in'),
+        ('angle', 'UNIT', 'unit of angles, joint values included: rad, deg'),
+        ('joint-angle', 'UNIT', 'unit of joint values where it is another one'),
+        ('euler', 'ZYX', 'rx ry rz are Euler angles; zyx: fixed axes'),
+        ('quaternion', 'wxyz', 'order of qx qy qz qw, else xyzw'),
+        ('separator', 'NAME', 'comma, semicolon, tab or space; guessed if not given'),
+        ('decimal', 'NAME', 'point or comma'),
+        ('sheet', 'NAME', 'of a workbook (.xlsx), else its first'),
+        ('joints-preset', 'NAME', 'layout of the log --joints'),
+    ):
+        add(f'--{name}', default='', metavar=metavar, help=text)
+    text = 'q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints'
+    add('--columns', action='append', default=[], metavar='OURS=THEIRS,...', help=text)
     add('--rotation-vector', action='store_true', help='rx ry rz are a rotation vector')
     add('--inverse', action='store_true', help='the poses are those of the device in the target')
     add('--shift', type=int, default=0, metavar='ROWS', help='joint values stand so much below')
-    add(
-        '--separator',
-        default='',
-        metavar='NAME',
-        help='comma, semicolon, tab or space; guessed if not given',
-    )
-    add('--decimal', default='', metavar='NAME', help='point or comma')
-    add('--sheet', default='', metavar='NAME', help='of a workbook (.xlsx), else its first')
     add('--joints', type=Path, metavar='FILE', help='log of the joint values, row by row')
-    add('--joints-preset', default='', metavar='NAME', help='layout of that log')
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
@@ -179,8 +167,6 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     given = {name: getattr(options, name) for name in names}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
-    from calib_ros.files.foreign import Foreign
-    from calib_ros.files.layouts import Layout, layout_of
 
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
     if options.joints_preset and options.joints is None:
@@ -193,8 +179,6 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
 
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings that are among the options, the others by default."""
-    from calib_ros.settings import Settings
-
     given: dict[str, Any] = {
         f.name: getattr(options, f.name) for f in fields(Settings) if hasattr(options, f.name)
     }
@@ -244,7 +228,6 @@ def history_of(options: argparse.Namespace) -> History | None:
     """Return where a result is filed, if it is to be; refuse one without a serial number."""
     if options.history is None:
         return None
-    from calib_ros.files.history import History
 
     if not options.serial:
         raise InputError('--history files by serial number: give --serial as well')
@@ -255,9 +238,6 @@ def filing_of(
     options: argparse.Namespace, sets: Sequence[Observations], measured: Path, settings: str
 ) -> Filing:
     """Return what is filed of a result besides the result; `settings` is a hash."""
-    from calib_ros.files.rows import Filing, content_hash, measured_at
-    from calib_ros.report.page import input_of
-
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
@@ -267,8 +247,6 @@ def origin_of(
     options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
 ) -> Origin:
     """Return whence a result comes: the options, and the files that were read."""
-    from calib_ros.report.page import Origin, inputs_of
-
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     names = ('operator', 'serial', 'device')
@@ -283,8 +261,6 @@ def page_of(
 
     That is said once. `pdf` asks for report.pdf as well.
     """
-    from calib_ros.report.page import MISSING, MISSING_PDF, on_paper, render
-
     found: dict[str, str | bytes | None] = {name: render(report)}
     if found[name] is None:
         screen.warn(MISSING, 'note')

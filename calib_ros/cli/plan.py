@@ -6,8 +6,17 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from calib_ros.apply import planning
+from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.choice import CRITERIA
+from calib_ros.apply.design import ASSUMED_TOOL, Design
+from calib_ros.apply.iso9283 import iso_9283_poses
+from calib_ros.apply.planning import Plan
+from calib_ros.apply.simulation import measure
+from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import (
     add_chain,
@@ -19,24 +28,19 @@ from calib_ros.cli.options import (
     refuse_existing,
     settings_of,
 )
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from calib_ros.apply.candidates import Visibility
-    from calib_ros.apply.design import Design
-    from calib_ros.apply.planning import Plan
-    from calib_ros.cli.screen import Screen
-    from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.files.waypoints import joints_csv, read_joints
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report.maps import plan_report
 
 TASK_POSES = 300
 """Random poses at which a plan is to be accurate when no task is given."""
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.apply.choice import CRITERIA
-
     group = parser.add_argument_group('what is wanted')
     add_chain(group)
     add = group.add_argument
@@ -85,17 +89,6 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    import numpy as np
-
-    from calib_ros.apply.candidates import Visibility
-    from calib_ros.apply.design import ASSUMED_TOOL, Design
-    from calib_ros.apply.simulation import measure
-    from calib_ros.atomic import write_file
-    from calib_ros.files.waypoints import joints_csv
-    from calib_ros.identification.problem import Problem
-    from calib_ros.kinematics.chain_file import load_chain
-    from calib_ros.report.maps import plan_report
-
     _check(options)
     chain = load_chain(options.chain)
     rng = np.random.default_rng(options.seed)
@@ -140,12 +133,6 @@ def _measurement(
     options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
 ) -> tuple[FloatArray, str, Plan | None]:
     """Return the poses to measure in the order of visit, what they promise, and the plan."""
-    import numpy as np
-
-    from calib_ros.apply import planning
-    from calib_ros.apply.candidates import draw_candidates
-    from calib_ros.files.waypoints import read_joints
-
     size = len(design.chain.joints)
     if len(options.velocity) not in (1, size):
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
@@ -177,8 +164,6 @@ def _tests(
     options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
 ) -> tuple[FloatArray, str, Plan | None]:
     """Return the test poses of ISO 9283, and what to do with them; there is no plan."""
-    from calib_ros.apply.iso9283 import iso_9283_poses
-
     found = iso_9283_poses(design, rng, visibility)
     words = (
         f'P1 to P5 of ISO 9283 in a cube of {found.edge:.3f} m, one orientation: go to them in '
@@ -209,11 +194,8 @@ def _page_beside(path: Path) -> Path:
     return path.with_name(f'{path.stem}.report.html')
 
 
-COMMANDS = (
-    Command(
-        'plan',
-        'Before measuring',
-        'choose the poses to measure, and say how accurate they make',
+COMMANDS = {
+    'plan': Command(
         _add,
         _run,
         (
@@ -222,4 +204,4 @@ COMMANDS = (
             'plan --chain ur10e --iso9283 --out tests.csv',
         ),
     ),
-)
+}

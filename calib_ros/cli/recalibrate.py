@@ -6,26 +6,21 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from calib_ros.atomic import write_files
+from calib_ros.cli.inputs import Loaded
 from calib_ros.cli.options import NOT_ACCEPTED, results
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from calib_ros.cli.inputs import Loaded
-    from calib_ros.cli.screen import Screen
-    from calib_ros.identification.recalibration import Recalibration
+from calib_ros.identification.calibration import load_calibration
+from calib_ros.identification.recalibration import GROWTH, Recalibration, recalibrate, years_since
 
 FILES = ('calibration.yaml', 'result.json')
 
 
 def add_previous(parser: argparse.ArgumentParser) -> None:
     """Add the options of an earlier calibration."""
-    from calib_ros.identification.recalibration import GROWTH
-
     add = parser.add_argument_group('an earlier calibration (docs/history.md)').add_argument
     add(
         '--previous',
@@ -62,9 +57,6 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
 
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
-    from calib_ros.identification.calibration import load_calibration
-    from calib_ros.identification.recalibration import recalibrate, years_since
-
     if not options.growth >= 0.0:
         raise InputError(f'--growth must not be negative, not {options.growth}')
     previous = load_calibration(options.previous, loaded.problem.chain)

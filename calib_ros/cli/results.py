@@ -7,17 +7,22 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from calib_ros.cli.inputs import Loaded
 from calib_ros.cli.options import page_of
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, TooFewObservationsError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.inputs import Loaded
-    from calib_ros.cli.screen import Screen
-    from calib_ros.identification.identification import Identification
-    from calib_ros.report.page import Origin
-    from calib_ros.settings import Settings
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.report import words
+from calib_ros.report.advice import advice
+from calib_ros.report.markdown import markdown
+from calib_ros.report.page import Origin
+from calib_ros.report.poses import poses_of
+from calib_ros.report.reports import identification_report
+from calib_ros.settings import Settings
 
 RESULT_FILES = (
     'calibration.yaml',
@@ -46,8 +51,6 @@ class Identified:
 
 def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origin) -> Identified:
     """Identify, and refuse the result where too much of the input is lost."""
-    from calib_ros.identification.model_choice import identify_model
-
     with screen.work('identifying') as work:
         try:
             result = identify_model(loaded.problem, settings.model, work)
@@ -62,9 +65,6 @@ def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origi
 
 def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     """Print a result: the verdict, six rows, and each reason or note once."""
-    from calib_ros.report import words
-    from calib_ros.report.advice import advice
-
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
@@ -115,8 +115,6 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
 
 def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
     """Return the content of result.json; `tolerance` is the wanted error [mm]."""
-    from calib_ros.report import words
-
     content = words.as_document(found.result, found.loaded.samples)
     content |= {'warnings': list(found.warnings), 'tolerance_mm': tolerance}
     return content | {'origin': found.origin.document()}
@@ -134,18 +132,13 @@ def result_files(
     A chain that was accepted earlier, in `out`, is kept under another name when this result is
     not: it does not belong to the files beside it any more. `tolerance` is the wanted error [mm].
     """
-    from calib_ros.identification.calibration import Calibration
-    from calib_ros.report.markdown import markdown
     from calib_ros.report.plots import before_after_png
-    from calib_ros.report.poses import poses_of
-    from calib_ros.report.reports import identification_report
 
     loaded, result = found.loaded, found.result
     with screen.work('writing the report'):
         poses = poses_of(loaded.problem, result, loaded.lines)
         contents: dict[str, str | bytes] = {
             'result.json': json.dumps(document(found, tolerance), indent=2) + '\n',
-            'report.md': markdown(result, loaded.samples, found.warnings),
             'residuals.csv': poses.table(),
             'before_after.png': before_after_png(result),
             'settings.yaml': found.origin.settings,
@@ -154,6 +147,7 @@ def result_files(
         report = identification_report(
             loaded.problem, result, poses, found.origin, found.warnings, wanted
         )
+        contents['report.md'] = markdown(report, loaded.samples)
         contents |= page_of(report, screen, pdf=pdf)
     earlier = out / 'calibration.yaml'
     if result.accepted:

@@ -6,14 +6,23 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
+from calib_ros.kinematics.chain_file import (
+    URDF_SUFFIXES,
+    chain_document,
+    dump_chain,
+    load_chain,
+    read_urdf,
+    shipped_robots,
+)
 
 
 def _add_robots(parser: argparse.ArgumentParser) -> None:
@@ -21,10 +30,6 @@ def _add_robots(parser: argparse.ArgumentParser) -> None:
 
 
 def _robots(options: argparse.Namespace, screen: Screen) -> int:
-    import numpy as np
-
-    from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-
     del options
     lines = [f'{"--chain":21}{"joints":>6}  {"DH table":10}{"length":>8}']
     for name in shipped_robots():
@@ -48,17 +53,6 @@ def _add_chain(parser: argparse.ArgumentParser) -> None:
 
 
 def _chain(options: argparse.Namespace, screen: Screen) -> int:
-    from dataclasses import replace
-
-    from calib_ros.atomic import write_file
-    from calib_ros.kinematics.chain_file import (
-        URDF_SUFFIXES,
-        chain_document,
-        dump_chain,
-        load_chain,
-        read_urdf,
-    )
-
     names = ('base_link', 'tip_link', 'convention')
     given = {name: getattr(options, name) for name in names if getattr(options, name)}
     path = Path(options.robot)
@@ -82,21 +76,9 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-COMMANDS = (
-    Command(
-        'robots',
-        'First steps',
-        'list the arms that come with calib_ros',
-        _add_robots,
-        _robots,
-        ('robots',),
+COMMANDS = {
+    'robots': Command(_add_robots, _robots, ('robots',)),
+    'chain': Command(
+        _add_chain, _chain, ('chain ur10e', 'chain robot.urdf --tip-link tool0 --out robot.yaml')
     ),
-    Command(
-        'chain',
-        'First steps',
-        'print the chain file of a robot, to read and to edit',
-        _add_chain,
-        _chain,
-        ('chain ur10e', 'chain robot.urdf --tip-link tool0 --out robot.yaml'),
-    ),
-)
+}

@@ -23,7 +23,7 @@ FIRST_S = 0.5
 """Time after which work shows on a terminal that it goes on."""
 EVERY_S = 2.0
 """Time between two signs of life; where they stay, as in a log, each time doubles it."""
-LONGEST_S = 32.0
+LONGEST_S = 16.0 * EVERY_S
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 

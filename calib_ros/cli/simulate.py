@@ -6,9 +6,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from calib_ros.apply.simulation import Cell, drive, faulty, measure
+from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
+from calib_ros.cli.inputs import of_bag
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
@@ -17,11 +21,14 @@ from calib_ros.cli.options import (
     origin_of,
     results,
 )
+from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from calib_ros.cli.screen import Screen
-    from calib_ros.kinematics.chain import Chain
+from calib_ros.files.recording import Recording, write_bag
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
+from calib_ros.report import words
+from calib_ros.settings import Settings
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -46,8 +53,6 @@ def _add_simulation(parser: argparse._ArgumentGroup) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.kinematics.chain_file import load_chain
-
     with screen.work('simulating'):
         truth = _write_simulation(load_chain(options.chain), options, options.bag)
     screen.say(f'wrote {options.bag} and the true chain {truth}')
@@ -55,13 +60,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _demo(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_files
-    from calib_ros.cli.inputs import of_bag
-    from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
-    from calib_ros.kinematics.chain_file import load_chain
-    from calib_ros.report import words
-    from calib_ros.settings import Settings
-
     chain, settings = load_chain(options.chain), Settings()
     own = (*RESULT_FILES, 'bag_truth.yaml', 'bag/bag.*', 'bag/metadata.yaml')
     with results(options, own) as folder:
@@ -87,12 +85,6 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
 
 def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
     """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
-    import numpy as np
-
-    from calib_ros.apply.simulation import Cell, drive, faulty, measure
-    from calib_ros.files.recording import Recording, write_bag
-    from calib_ros.kinematics.chain_file import dump_chain
-
     if options.poses < 1 or options.seed < 0:
         raise InputError(
             f'--poses must be at least 1 and --seed at least 0, not {options.poses} and '
@@ -112,21 +104,7 @@ def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> P
     return truth
 
 
-COMMANDS = (
-    Command(
-        'demo',
-        'First steps',
-        'simulate an arm, identify it, and compare the result with the truth',
-        _add_demo,
-        _demo,
-        ('demo', 'demo --chain franka_panda --out demo_panda/'),
-    ),
-    Command(
-        'simulate',
-        'First steps',
-        'write the bag of a simulated robot cell, with the true chain',
-        _add,
-        _run,
-        ('simulate cell_bag --chain kuka_iiwa14 --poses 60',),
-    ),
-)
+COMMANDS = {
+    'demo': Command(_add_demo, _demo, ('demo', 'demo --chain franka_panda --out demo_panda/')),
+    'simulate': Command(_add, _run, ('simulate cell_bag --chain kuka_iiwa14 --poses 60',)),
+}

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
+from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
@@ -28,17 +30,18 @@ from calib_ros.cli.options import (
     results,
     settings_of,
 )
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from calib_ros.apply.verification import Verification
-    from calib_ros.cli.screen import Screen
-    from calib_ros.files.history import History
-    from calib_ros.identification.calibration import Calibration
-    from calib_ros.identification.observations import Observations
-    from calib_ros.kinematics.chain import Chain
+from calib_ros.files.history import History
+from calib_ros.files.rows import settings_hash, verified
+from calib_ros.files.waypoints import read_joints
+from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import load_chain, table_hash
+from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verified import verification_report
+from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
 TITLES = {
@@ -87,8 +90,6 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_files
-
     if options.out is None:
         return _verified(options, screen)[0]
     with results(options, VERIFICATION_FILES) as folder:
@@ -100,13 +101,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[str, str | bytes]]:
     """Judge, and print what comes out; return the exit status and the files of --out."""
-    from calib_ros.apply.verification import in_words, verify
-    from calib_ros.files.waypoints import read_joints
-    from calib_ros.identification.calibration import calibration_file, load_calibration
-    from calib_ros.kinematics.chain_file import load_chain
-    from calib_ros.report.poses import poses_to_verify
-    from calib_ros.report.verified import verification_report
-
     history = history_of(options)
     nominal = load_chain(options.chain)
     arm = load_calibration(options.calibration, nominal)
@@ -146,8 +140,6 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
 
 def show(found: Verification, screen: Screen) -> None:
     """Print a verdict, six rows, the poses if they are few, and what to do."""
-    from calib_ros.apply.verification import remarks
-
     before, after = found.comparison.figures
     orientation = 'not measured'
     if before.rms_mrad is not None and after.rms_mrad is not None:
@@ -171,12 +163,7 @@ def show(found: Verification, screen: Screen) -> None:
         )
     )
     if found.each:
-        screen.say('position error [mm] by configuration')
-        screen.say('  pose   measured   before    after   repeatability (mean + 3 sigma)')
-    for k, pose in enumerate(found.each):
-        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
-        line = f'  {k + 1:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
-        screen.say(line.rstrip())
+        screen.say('\n'.join(['position error [mm] by configuration', *each_in_words(found)]))
     for remark in remarks(found):
         screen.bullet(remark)
 
@@ -189,9 +176,6 @@ def _file(
     nominal: Chain,
     sets: Sequence[Observations],
 ) -> None:
-    from calib_ros.files.rows import settings_hash, verified
-    from calib_ros.kinematics.chain_file import table_hash
-
     judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
     hashed = settings_hash(nominal, settings_of(options), table_hash(arm.chain), *judged_by)
     history.file(verified(arm.chain, found, filing_of(options, sets, options.measured, hashed)))
@@ -205,7 +189,6 @@ def _sets(
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
         found = table(options, options.measured, nominal, settings, screen)
         return (*found.fitted, *found.held_out), found.warnings, found.by_line
-    from calib_ros.sampling.sample import collect
 
     session, read = replayed(options.measured, nominal, settings, screen)
     screen.say(f'{read}; {session.account()}')
@@ -216,11 +199,8 @@ def _sets(
     return (*fitted, *held_out), read.warnings, False
 
 
-COMMANDS = (
-    Command(
-        'verify',
-        'Calibrate',
-        'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
+COMMANDS = {
+    'verify': Command(
         _add,
         _run,
         (
@@ -229,4 +209,4 @@ COMMANDS = (
             'verify new.csv --chain ur10e --calibration result/ --commanded tests.csv',
         ),
     ),
-)
+}

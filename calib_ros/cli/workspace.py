@@ -6,8 +6,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from calib_ros.apply import placement, workspace
+from calib_ros.apply.placement import AIMS, task_of
+from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import (
     add_chain,
@@ -17,15 +22,19 @@ from calib_ros.cli.options import (
     page_of,
     results,
 )
+from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from calib_ros.apply.workspace import Survey
-    from calib_ros.cli.screen import Screen
-    from calib_ros.identification.calibration import Calibration
-    from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
+from calib_ros.identification.calibration import (
+    MODELS,
+    Calibration,
+    calibration_file,
+    load_calibration,
+)
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report.maps import workspace_report
+from calib_ros.report.markdown import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
@@ -34,9 +43,6 @@ BOX_POSES = 30
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.apply.placement import AIMS
-    from calib_ros.identification.calibration import MODELS
-
     group = parser.add_argument_group('what to map')
     add = group.add_argument
     add(
@@ -61,8 +67,6 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.atomic import write_files
-
     for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
         if getattr(options, name) < lowest:
             raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
@@ -74,14 +78,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes]:
     """Map, place, print what comes out, and return the files of it."""
-    import numpy as np
-
-    from calib_ros.apply import placement, workspace
-    from calib_ros.files.waypoints import csv_of, joints_csv
-    from calib_ros.identification.calibration import calibration_file, load_calibration
-    from calib_ros.kinematics.chain_file import load_chain
     from calib_ros.report import plots
-    from calib_ros.report.maps import workspace_report
 
     arm = load_calibration(options.result, load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
@@ -92,12 +89,9 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
             'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
             'workspace.png': plots.workspace_png(survey),
         }
-    words = workspace.in_words(survey)
     _show(survey, screen)
     if arm.region is not None:
-        sentence = f'The calibration is {arm.region.in_words()}.'
-        words += f'\n{sentence}\n'
-        screen.bullet(sentence)
+        screen.bullet(f'The calibration is {arm.region.in_words()}.')
     found = None
     if task is not None:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
@@ -105,23 +99,20 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
             found = placement.place(
                 arm, task, options.aim, options.model, region, options.cells, options.turns
             )
-        placed = placement.in_words(found, options.aim, options.model)
-        words += f'\n{placed}'
-        screen.say(placed)
+        screen.say(placement.in_words(found, options.aim, options.model))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
     origin = origin_of(options, (calibration_file(options.result),))
     with screen.work('writing the report'):
-        contents |= page_of(workspace_report(arm, survey, origin, found), screen)
-    return contents | {'workspace.md': words}
+        report = workspace_report(arm, survey, origin, found)
+        contents['workspace.md'] = markdown(report, {})
+        return contents | page_of(report, screen)
 
 
 def _show(survey: Survey, screen: Screen) -> None:
     """Print six rows."""
-    from calib_ros.apply.workspace import Spread, regions
-
     rows = [('position error', f'at {len(survey.joints)} random poses of the joint range')]
     for label, errors in survey.parts.items():
         s = Spread.of(1e3 * errors)
@@ -137,12 +128,6 @@ def _task(
     options: argparse.Namespace, arm: Calibration, rng: np.random.Generator
 ) -> FloatArray | None:
     """Return the poses (K, 4, 4) of the task to place, if there is one."""
-    import numpy as np
-
-    from calib_ros.apply.placement import task_of
-    from calib_ros.apply.workspace import in_base
-    from calib_ros.files.waypoints import read_poses
-
     if options.task is not None and options.joint_box is not None:
         raise InputError('give either --task or --joint-box')
     if options.task is not None:
@@ -162,11 +147,8 @@ def _task(
     return task_of(in_base(arm.commanded_by(options.model), joints))
 
 
-COMMANDS = (
-    Command(
-        'workspace',
-        'Use the calibration',
-        'map errors over the workspace, and place a task where they are least',
+COMMANDS = {
+    'workspace': Command(
         _add,
         _run,
         (
@@ -174,4 +156,4 @@ COMMANDS = (
             'workspace result/ --chain ur10e --task task.csv --out map/ --aim max',
         ),
     ),
-)
+}

@@ -228,16 +228,16 @@ def posed_arm() -> Chain:
 
     It takes the place of an arm of which only the flange's poses are known.
     """
-    half = np.pi / 2
+    quarter = np.pi / 2
     return Chain(
         POSED,
         'standard',
         (
-            Joint('flange_z', 'prismatic', theta=half, alpha=half),
-            Joint('flange_x', 'prismatic', theta=half, alpha=half),
-            Joint('flange_y', 'prismatic', alpha=-half),
-            Joint('flange_rx', alpha=half),
-            Joint('flange_ry', theta=half, alpha=half),
+            Joint('flange_z', 'prismatic', theta=quarter, alpha=quarter),
+            Joint('flange_x', 'prismatic', theta=quarter, alpha=quarter),
+            Joint('flange_y', 'prismatic', alpha=-quarter),
+            Joint('flange_rx', alpha=quarter),
+            Joint('flange_ry', theta=quarter, alpha=quarter),
             Joint('flange_rz'),
         ),
     )

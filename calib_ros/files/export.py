@@ -93,7 +93,8 @@ def exports(
     rng = np.random.default_rng(0)
     q = chain.random_joints(POSES, rng)
     arm = replace(chain, effects=())
-    lost = _distance(chain.forward(q), arm.forward(q)) if chain.effects else 0.0
+    wanted = arm.forward(q)
+    lost = _distance(chain.forward(q), wanted) if chain.effects else 0.0
     digest = table_hash(chain)
     found = []
     for convention in ('standard', 'modified'):
@@ -101,12 +102,12 @@ def exports(
         what = f'{convention} Denavit-Hartenberg table'
         text = _csv(form, what, lost, digest)
         again = _read_csv(text, form)
-        found.append(_checked(f'dh_{convention}.csv', text, arm, again.forward(q), q, lost))
+        found.append(checked(f'dh_{convention}.csv', text, again.forward(q), wanted, lost))
         text = head(form, what, lost, digest) + dump_chain(form, origin)
         again = parse_chain(text)
-        found.append(_checked(f'dh_{convention}.yaml', text, arm, again.forward(q), q, lost))
+        found.append(checked(f'dh_{convention}.yaml', text, again.forward(q), wanted, lost))
     text = f'# calibrated table {digest}\n' + kinematics_yaml(arm, origin)
-    found.append(_checked('kinematics.yaml', text, arm, forward_of(text, arm, q), q, lost))
+    found.append(checked('kinematics.yaml', text, forward_of(text, arm, q), wanted, lost))
     region = q if joints is None else np.asarray(joints, dtype=np.float64)
     for name, kinds, what in (
         ('dh_without_beta.csv', DH_KINDS[:4], 'table without beta, the best one'),
@@ -191,17 +192,26 @@ def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
 
     document = yaml.safe_load(text)
     poses, signs = document['kinematics'], document['signs']
-    pose = np.broadcast_to(chain.frame('base').matrix, (len(q), 4, 4))
-    for joint, values in zip(chain.joints, q.T, strict=True):
+    places = [pose_matrix(poses[name]) for name in chain.joint_names]
+    slides = [joint.type == 'prismatic' for joint in chain.joints]
+    moved = walked(places, q * [signs[name] for name in chain.joint_names], slides)
+    end = pose_matrix(poses['flange']) @ chain.frame('tool').matrix
+    return np.asarray(chain.frame('base').matrix @ moved @ end)
+
+
+def walked(
+    places: Sequence[FloatArray], q: FloatArray, slides: Sequence[bool] | None = None
+) -> FloatArray:
+    """Return the poses (N, 4, 4) behind frames that turn about their z, or slide along it."""
+    pose = np.tile(np.eye(4), (len(q), 1, 1))
+    for k, place in enumerate(places):
         moved = np.tile(np.eye(4), (len(q), 1, 1))
-        if joint.type == 'revolute':
-            turn = np.zeros((len(q), 3))
-            turn[:, 2] = signs[joint.name] * values
-            moved[:, :3, :3] = se3.exp_rotation(turn)
+        if slides is not None and slides[k]:
+            moved[:, 2, 3] = q[:, k]
         else:
-            moved[:, 2, 3] = signs[joint.name] * values
-        pose = pose @ pose_matrix(poses[joint.name]) @ moved
-    return np.asarray(pose @ pose_matrix(poses['flange']) @ chain.frame('tool').matrix)
+            moved[:, :3, :3] = se3.exp_rotation(q[:, k, np.newaxis] * [0.0, 0.0, 1.0])
+        pose = pose @ place @ moved
+    return np.asarray(pose)
 
 
 def xyz_rpy(matrix: FloatArray) -> dict[str, float]:
@@ -255,10 +265,9 @@ def _read_csv(text: str, form: Chain) -> Chain:
     return replace(form, joints=tuple(joints))
 
 
-def _checked(
-    name: str, text: str, chain: Chain, again: FloatArray, q: FloatArray, lost: float
-) -> Export:
-    difference = float(np.abs(again - chain.forward(q)).max())
+def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: float) -> Export:
+    """Return a file that, read back, gives the poses (N, 4, 4) that are wanted."""
+    difference = float(np.abs(again - wanted).max())
     if not difference <= EXACT:
         raise ExportError(
             f'{name}, read back, differs from the calibration by {difference:.3g} m or more in '

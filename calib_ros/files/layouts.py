@@ -20,7 +20,9 @@ import numpy as np
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics.chain_file import shared_files
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.urdf import MOST_JOINTS
 from calib_ros.texts import parse_yaml, read_text
+from calib_ros.values import LONGEST_NAME
 
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""
@@ -39,9 +41,7 @@ SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')
 """Texts that are taken over."""
 NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
-MOST_COLUMNS_GIVEN = 400
-LONGEST = 200
-"""Characters of an expression."""
+MOST_COLUMNS_GIVEN = 8 * MOST_JOINTS
 UNREADABLE = (
     '"{}" is no expression of columns: give names, {{names with blanks}} or numbers of columns '
     '(#7) with + - * / and brackets'
@@ -69,7 +69,7 @@ class Expression:
         code, at = '', 0
         while at < len(text):
             match = TOKEN.match(text, at)
-            if match is None or len(text) > LONGEST:
+            if match is None or len(text) > LONGEST_NAME:
                 raise ConfigError(UNREADABLE.format(text))
             braced, column, number, plain, sign = match.groups()
             name = braced or plain or (f'#{column}' if column else '')
@@ -257,7 +257,9 @@ def parse_columns(text: str) -> dict[str, str]:
         if not equals or not ours or not theirs:
             raise ConfigError(f'columns are given as OURS=THEIRS,..., not "{part.strip()}"')
         if re.fullmatch(r'[qsva]\*', ours):
-            found |= {f'{ours[0]}{k}': theirs.replace('*', str(k)) for k in range(1, 51)}
+            found |= {
+                f'{ours[0]}{k}': theirs.replace('*', str(k)) for k in range(1, MOST_JOINTS + 1)
+            }
         else:
             found[ours] = theirs
     return found

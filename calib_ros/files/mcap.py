@@ -17,13 +17,12 @@ from typing import Any, TypeAlias, TypeVar
 MAGIC = b'\x89MCAP0\r\n'
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 CHUNK_INDEX, STATISTICS = 0x08, 0x0B
-MESSAGE_HEAD = 22
-"""Bytes before the data of a message."""
 _HEAD = struct.Struct('<BQ')  # kind and size
-_LOGGED = struct.Struct('<HIQ')  # channel, sequence and log time
+_LOGGED = struct.Struct('<HIQQ')  # channel, sequence, and when it was logged and published
+MESSAGE_HEAD = _LOGGED.size
 _CHUNK = struct.Struct('<QQQI')  # first and last log time, uncompressed size and checksum
 
-FOOTER = 37
+FOOTER = _HEAD.size + struct.calcsize('<QQI') + len(MAGIC)
 """Bytes of the last record, with the place of the index, and of the magic after it."""
 MODULES = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
 Channel = TypeVar('Channel')
@@ -119,7 +118,7 @@ def logged(
     try:
         for kind, record in records(content, nested=True):
             if kind == MESSAGE:
-                key, _, time = _LOGGED.unpack_from(record)
+                key, _, time, _ = _LOGGED.unpack_from(record)
                 if key in channels and begin <= time <= end:
                     found.append((time, channels[key], record[MESSAGE_HEAD:]))
     except (EOFError, ValueError, struct.error) as err:

@@ -25,8 +25,6 @@ from calib_ros.texts import parse_yaml, read_text
 
 LARGEST_METADATA = 1_000_000
 """Bytes of a metadata.yaml."""
-PART = 1 << 20
-"""Bytes of a file that are unpacked at once."""
 NOT_CLOSED = 'the recording was not closed'
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
@@ -81,7 +79,7 @@ def _unpack_file(file: Path, target: Path) -> None:
     left = mcap.LARGEST_CHUNK + mcap.LARGEST_RATIO * file.stat().st_size
     try:
         with target.open('wb') as out, mcap.open_zstd(file) as packed:
-            while part := packed.read(PART):
+            while part := packed.read(1 << 20):
                 left -= len(part)
                 if left < 0:
                     raise InputError(f'{file} unpacks to {mcap.LARGEST_RATIO} times its size')

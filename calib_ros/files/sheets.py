@@ -30,7 +30,7 @@ SAMPLE = 30
 """Lines by which separators are guessed."""
 SEPARATOR = '\x1f'
 """Between cells that are no regular text."""
-LARGEST_SHEET = 300_000_000
+LARGEST_SHEET = 3 * LARGEST_TABLE
 """Bytes of a workbook unpacked."""
 SHEETS = ('.xlsx', '.xlsm')
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')

@@ -28,8 +28,6 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
-AHEAD = 3
-"""Pieces of work for each worker that the scheduler knows of: none waits for more."""
 SPAN = 2.0
 """Time [s] that a piece of several tasks takes: much to dask's 4 ms for it, little to lose."""
 PATIENCE = 60.0
@@ -237,10 +235,10 @@ def _done(
 
     def submitted() -> list[Any]:
         chosen: list[tuple[Task, ...]] = []
-        while (waiting or alone) and len(running) + len(chosen) < AHEAD * workers:
+        while (waiting or alone) and len(running) + len(chosen) < 3 * workers:  # none waits
             fair = len(waiting) // (2 * workers)
             fit = SPAN * count / max(seconds, 1e-9)
-            most = 1 if alone else max(1, min(fair, int(min(fit, len(waiting)))))
+            most = 1 if alone else max(1, int(min(fair, fit)))
             source = alone or waiting
             chosen.append(tuple(source.popleft() for _ in range(most)))
         futures = client.map(_all, chosen, [work] * len(chosen), pure=False) if chosen else []

@@ -84,7 +84,7 @@ class Shifts:
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
             length = len(begins)
             again = np.concatenate([circle, series], axis=1)  # as far as a moved series reaches
-            self._circles.append(fft.rfft(again, fft.next_fast_len(3 * length, real=True)))
+            self._circles.append(fft.rfft(again, _period(length)))
             squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
             slow = _correlated(slow_cosines(length)[:, np.newaxis], self._circles[-1], each=True)
             energy = squares[length : 3 * length] - squares[: 2 * length]
@@ -152,6 +152,14 @@ def slow_cosines(length: int) -> FloatArray:
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 
 
+def _period(length: int) -> int:
+    """Return the period of the transforms of a series: that of its circle where that is fast."""
+    circle = 2 * length
+    if fft.next_fast_len(circle, real=True) == circle:
+        return circle
+    return int(fft.next_fast_len(3 * length, real=True))
+
+
 def _correlated(
     series: FloatArray, circle: NDArray[np.complex128], each: bool = False
 ) -> FloatArray:
@@ -159,7 +167,7 @@ def _correlated(
 
     Summed over the components c; (P, c, 2 n) of `each` if asked.
     """
-    length = fft.next_fast_len(3 * series.shape[-1], real=True)
+    length = _period(series.shape[-1])
     spectrum = np.conj(fft.rfft(series, length)) * circle
     found = fft.irfft(spectrum if each else spectrum.sum(axis=1), length)
     return np.asarray(found[..., : 2 * series.shape[-1]])

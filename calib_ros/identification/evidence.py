@@ -177,8 +177,7 @@ def posterior_of(
     every = (*names, *more)
     beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
     lengths = _lengths(chain, system) if more else {}
-    if lengths:
-        beside.append((lengths, SCALE))
+    beside += [(lengths, SCALE)] if lengths else []
     told = _told(chain, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
     own = [0.0 if chain.owns_frame(n) else chain.offset(n, nominal) for n in names]
@@ -192,20 +191,11 @@ def posterior_of(
     priors = {name: std for name, std in zip(every, stds.tolist(), strict=False) if std < np.inf}
     arm = np.s_[: len(every)]
     mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
-    doubted = []
-    for weight, other in near:
-        there, its_root = _solved(matrix, vector, evidence.stds(other) ** -2)
-        doubted.append((weight, there[arm], its_root[arm] @ its_root[arm].T))
-    return Posterior(
-        chain,
-        every,
-        offsets[arm],
-        mean - offsets[arm],
-        root @ root.T,
-        priors,
-        evidence.named(size),
-        tuple(doubted),
-    )
+    solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
+    doubted = [(w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved]
+    own, sizes = offsets[arm], evidence.named(size)
+    square = root @ root.T
+    return Posterior(chain, every, own, mean - own, square, priors, sizes, tuple(doubted))
 
 
 def _lengths(chain: Chain, system: System) -> dict[str, float]:

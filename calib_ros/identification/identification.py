@@ -10,7 +10,7 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,7 @@ from calib_ros.identification.fitting import (
     fit,
     parameter_rows,
 )
-from calib_ros.identification.leastsquares import System, minimise, normal_equations
+from calib_ros.identification.leastsquares import Fit, System, minimise, normal_equations
 from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Problem
@@ -256,18 +256,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     posterior = fitted.posterior(
         _size(fitted), considered(chain, names), rounding_errors(problem, coarse)
     )
-    step = find_step(problem, names, robust)
-    found = Findings(
-        converged=before.converged and robust.fit.converged and robust.settled,
-        parameters=parameters,
-        validation=validation,
-        chance=_chance(problem, before.chain, names, robust),
-        region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
-        step=step,
-        own_behaviour=None if step else arms_own(problem, robust),
-        may_be_rounding=bool(coarse)
-        and may_be_rounding(problem, before.chain, names, coarse, robust.good),
-    )
+    found = _findings(fitted, before, posterior, validation, parameters, coarse)
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -291,11 +280,35 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
         posterior=posterior,
         region=found.region,
         weak=_weak(problem, parameters),
-        step=step,
-        remarks=remarks(problem, step, coarse),
+        step=found.step,
+        remarks=remarks(problem, found.step, coarse),
     )
     named = mistakes.remarked(problem, result)
     return suspicions.remarked(problem, named, another=named is result)
+
+
+def _findings(
+    fitted: Fitted,
+    before: Fit,
+    posterior: Posterior,
+    validation: Comparison | None,
+    parameters: Sequence[ParameterRow],
+    coarse: Mapping[str, float],
+) -> Findings:
+    """Return what the rules of acceptance go by; `coarse` are the steps of rounded joints."""
+    problem, robust, names = fitted.problem, fitted.robust, fitted.names
+    step = find_step(problem, names, robust)
+    return Findings(
+        converged=before.converged and robust.fit.converged and robust.settled,
+        parameters=parameters,
+        validation=validation,
+        chance=_chance(problem, before.chain, names, robust),
+        region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
+        step=step,
+        own_behaviour=None if step else arms_own(problem, robust),
+        may_be_rounding=bool(coarse)
+        and may_be_rounding(problem, before.chain, names, coarse, robust.good),
+    )
 
 
 def _size(fitted: Fitted) -> float:

@@ -207,7 +207,8 @@ class Chain(Shown):
             if name.partition('.')[0] not in self._joints:
                 raise UnknownNameError('parameter', name, self.parameter_names)
             effects.check(name, self.joint_names)
-        return _with(self, {'effects': (*self.effects, *added)})
+        kept = ('joint_names', 'frame_names', 'walk', '_frames', '_joints')
+        return _with(self, {'effects': (*self.effects, *added)}, kept)
 
     def with_effect_values(self, values: Mapping[str, float]) -> Chain:
         """Return the chain with effects of given values."""
@@ -231,7 +232,7 @@ class Chain(Shown):
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
             values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in DH_KINDS}
-            joints.append(_with(joint, values) if values else joint)
+            joints.append(_with(joint, values, ('parameters', 'driven')) if values else joint)
         frames = {
             key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
             for key, frame in self._frames.items()
@@ -243,7 +244,9 @@ class Chain(Shown):
             'frames': tuple(frames.items()),
             'effects': tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
         }
-        return _with(self, found)
+        same = all(new is old for new, old in zip(joints, self.joints, strict=True))
+        kept = ('joint_names', 'frame_names', *(('walk', '_joints') if same else ()))
+        return _with(self, found, kept)
 
     def forward(
         self,
@@ -350,9 +353,13 @@ def _parameters(
 Value = TypeVar('Value', Joint, Chain)
 
 
-def _with(value: Value, changes: dict[str, object]) -> Value:
-    """Return a value with other numbers in it: what was checked is not checked again."""
+def _with(value: Value, changes: Mapping[str, object], kept: Sequence[str]) -> Value:
+    """Return a value with other numbers in it: what was checked is not checked again.
+
+    Nor is what of it was worked out before and is `kept`.
+    """
     found = object.__new__(type(value))
     known = vars(value)
-    vars(found).update({name: known[name] for name in value.__dataclass_fields__} | changes)
+    vars(found).update({name: known[name] for name in value.__dataclass_fields__})
+    vars(found).update({name: known[name] for name in kept if name in known} | dict(changes))
     return found

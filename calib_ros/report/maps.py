@@ -32,8 +32,10 @@ def workspace_report(
     spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
     first, last = spreads[0][1], spreads[-1][1]
     text = [f'The calibration removes {first.rms:.3f} mm RMS, {first.max:.3f} mm at most.']
+    rest = 'What remains is not known: the file does not say how well its numbers are known.'
     if len(spreads) > 1:
         text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm at most.')
+        rest = 'Expected to remain: sigma and the RMS error on poses that were not fitted.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
     about = 'Radius: distance from the axis of the base. Height: above its origin.'
@@ -45,7 +47,7 @@ def workspace_report(
         accuracy=Section(
             'accuracy',
             'Position errors [mm]',
-            (f'At {len(found.joints):,} random poses of the joint range.',),
+            (f'At {len(found.joints):,} random poses of the joint range.', rest),
             head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
@@ -63,9 +65,12 @@ def _worst(found: Survey) -> Iterator[Section]:
         'Where the sigma of what remains is most',
     )
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
+        sectors = regions(found.positions, errors)
+        shown = sectors if len(sectors) <= MOST_REGIONS else (*sectors[:MOST_REGIONS], sectors[-1])
         yield Section(
             f'regions-{label.split()[0]}',
             title,
+            (f'The {MOST_REGIONS} regions of the largest errors, and that of the least.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
             rows=tuple(
                 (
@@ -74,7 +79,7 @@ def _worst(found: Survey) -> Iterator[Section]:
                     f'{1e3 * each.rms:.4f}',
                     *(f'{low:.2f} to {high:.2f}' for low, high in (each.radius, each.height)),
                 )
-                for each in regions(found.positions, errors)[:MOST_REGIONS]
+                for each in shown
             ),
         )
 
@@ -93,16 +98,17 @@ def _placed(placed: Placements) -> Section:
     return Section(
         'placements',
         'Where to put the task',
-        (
+        (),
+        figures.space(
+            cloud, figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
+        ),
+        height=560,
+        said=(
             f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
             f'vertical: {1e3 * placed.errors[placed.best]:.4f} mm; in the centre of the region '
             f'{1e3 * placed.errors[placed.centre]:.4f} mm. '
             f'{int(reached.sum())} of {len(reached)} places can be reached.',
         ),
-        figures.space(
-            cloud, figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
-        ),
-        height=560,
     )
 
 

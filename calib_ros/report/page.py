@@ -47,7 +47,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Section:
-    """Words, a figure of plotly (`data` and `layout`), a table, or some of them."""
+    """Words, a figure of plotly (`data` and `layout`), a table, or some of them.
+
+    `text` explains a figure, what is `said` holds without it.
+    """
 
     name: str
     title: str
@@ -56,6 +59,7 @@ class Section:
     head: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     height: int = 420
+    said: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
 from calib_ros.report.sections import (
-    HEAD,
     ISO_9283,
     accuracy_rows,
+    accuracy_section,
     coverage,
     distribution,
     gain,
@@ -62,8 +62,7 @@ def identification_report(
         robot=result.chain.name,
         verdict=_verdict(result, limits, tolerance),
         advice=advice(result.refusals),
-        accuracy=Section(
-            'accuracy',
+        accuracy=accuracy_section(
             'Accuracy before and after',
             (
                 f'"Before" is {words.BEFORE}. Judged by {result.validated_by}. The interval is '
@@ -72,8 +71,7 @@ def identification_report(
                 'moves the tip of a tool of 1 m by 1 mm.',
                 ISO_9283,
             ),
-            head=HEAD,
-            rows=tuple(accuracy),
+            accuracy,
         ),
         steps=_steps(result, limits, tolerance),
         remarks=(*warnings, *words.remarks(result)),
@@ -179,25 +177,17 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
             'If nothing but the stated noise of the measuring device were left, all dots '
             'would lie on the dotted line. A steeper line: more is left, or the stated noise '
             'is too small.',
-            f'In figures: {words.noise_in_words(result)}.',
-            *words.chance_in_words(result),
         ),
         figures.against_noise(poses),
+        said=(f'In figures: {words.noise_in_words(result)}.', *words.chance_in_words(result)),
     )
     if result.outliers:
         yield _outliers(result, poses)
     yield from _offsets(problem, result)
     yield _parameters(result)
     yield _correlations(result)
-    gauges = tuple(
-        f'{name} cannot be told apart from {", ".join(partners)}: only their combination shows, '
-        f'and {name} keeps its nominal value.'
-        if partners
-        else f'{name}: no measured pose depends on it; it keeps its nominal value.'
-        for name, partners in result.gauges.items()
-    )
-    if gauges:
-        yield Section('gauges', 'What no measurement of this kind can tell', gauges)
+    said = tuple(words.identifiability_in_words(result))
+    yield Section('determined', 'What the poses determine', said)
     yield coverage(result.chain, poses.joints, 'How far each joint was moved')
     if result.verdicts:
         yield _effects(result)
@@ -279,18 +269,21 @@ def _parameters(result: Identification) -> Section:
     rows = []
     for p in result.parameters:
         unit = p.name.unit
-        width = p.half_width()
-        offset = '' if p.std is None else f'{1e3 * p.offset:+.4f}'
-        within = '' if width is None else f'{1e3 * width:.4f}'
-        rows.append((p.name, f'{p.value:.9f} {unit}', offset, within, f'm{unit}', p.status))
+        scale, small = (1.0, unit) if p.name.of_lens else (1e3, f'm{unit}')
+        found = (p.offset if p.std is not None else None, p.std, p.half_width())
+        forms = zip(found, ('+.4f', '.4f', '.4f'), strict=True)
+        numbers = ['' if x is None else f'{scale * x:{form}}' for x, form in forms]
+        rows.append((p.name, f'{p.value:.9f} {unit}', *numbers, small, p.status))
     return Section(
         'parameters',
         'All parameters',
         (
             'gauge: redundant by the structure of the chain, kept nominal. not excited: the '
             'poses do not determine it, kept nominal. fixed: held on request.',
+            f'{result.rank} are fitted, in {result.iterations} iterations.',
+            *words.priors_in_words(result),
         ),
-        head=('parameter', 'value', 'offset', '± (95 %)', 'unit', 'status'),
+        head=('parameter', 'value', 'offset', 'std', '± (95 %)', 'unit', 'status'),
         rows=tuple(rows),
     )
 

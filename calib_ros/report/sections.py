@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from datetime import datetime, timezone
 
 import numpy as np
@@ -26,7 +27,17 @@ ISO_9283 = (
     'and the mean of the poses attained. Where a pose was measured once, its repeatability is '
     'part of the figure.'
 )
-HEAD = ('', 'poses', 'RMS [mm]', '95 % interval', 'mean', 'max', 'mean + 3 sigma', 'RMS [mrad]')
+HEAD = (
+    '',
+    'poses',
+    'RMS [mm]',
+    '95 % interval',
+    'mean',
+    'max',
+    'mean + 3 sigma',
+    'RMS [mrad]',
+    'RMS [px]',
+)
 
 
 def gain(which: Comparison) -> str:
@@ -58,13 +69,22 @@ def accuracy_rows(label: str, which: Comparison) -> list[tuple[str, ...]]:
     ]
 
 
+def accuracy_section(
+    title: str, text: tuple[str, ...], rows: Sequence[tuple[str, ...]]
+) -> Section:
+    """Return the table of accuracy; without its last column where no pixels were measured."""
+    end = None if any(row[-1] for row in rows) else -1
+    cut = tuple(row[:end] for row in rows)
+    return Section('accuracy', title, text, head=HEAD[:end], rows=cut)
+
+
 def row_of(label: str, found: ErrorFigures, limits: tuple[float, float] | None) -> tuple[str, ...]:
     """Return a row of the table of accuracy, with limits [m] of the RMS if they are known."""
     between = '' if limits is None else _between(limits)
-    turned = '' if found.rms_mrad is None else f'{found.rms_mrad:.3f}'
+    turned, seen = ('' if x is None else f'{x:.3f}' for x in (found.rms_mrad, found.rms_px))
     lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
     shown = (f'{each:.3f}' for each in lengths)
-    return (label, f'{found.count:,}', f'{found.rms_mm:.3f}', between, *shown, turned)
+    return (label, f'{found.count:,}', f'{found.rms_mm:.3f}', between, *shown, turned, seen)
 
 
 def identity_of(

@@ -15,9 +15,9 @@ from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
 from calib_ros.report.sections import (
-    HEAD,
     ISO_9283,
     accuracy_rows,
+    accuracy_section,
     coverage,
     distribution,
     gain,
@@ -60,12 +60,10 @@ def verification_report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
         verdict=replace(state, text=(limits, *wanted), gain=gain(found.comparison)),
-        accuracy=Section(
-            'accuracy',
+        accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
-            head=HEAD,
-            rows=tuple(accuracy_rows('measured', found.comparison)),
+            accuracy_rows('measured', found.comparison),
         ),
         steps=NEXT[found.verdict],
         remarks=(*warnings, *remarks(found)),

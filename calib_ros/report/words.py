@@ -21,6 +21,7 @@ from calib_ros.identification.validation import Comparison, ErrorFigures, Parame
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_yaml
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 
@@ -267,9 +268,28 @@ def chance_in_words(result: Identification) -> list[str]:
     if result.chance is None:
         return []
     return [
-        'the improvement may only be tracker drift: time-shifted residuals are explained just as '
-        f'well in {100.0 * result.chance:.1f} % of cases'
+        'time-shifted residuals are explained just as well in '
+        f'{100.0 * result.chance:.1f} % of cases: the chance that the improvement is only tracker '
+        'drift'
     ]
+
+
+def priors_in_words(result: Identification) -> list[str]:
+    """Return the priors, those of effects by group."""
+    known = dict(result.chain.effects)
+    why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
+    lines = [
+        f'prior on {name}: {sigma:.3g} {Parameter(name).unit}{why.get(name, "")}'
+        for name, sigma in result.priors.items()
+        if name not in known
+    ]
+    groups: dict[str, list[str]] = {}
+    for name in known:
+        groups.setdefault(effects.group_of(name), []).append(name)
+    for group, names in groups.items():
+        sigma, of = result.priors[names[0]], Parameter(names[0]).unit
+        lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
+    return lines
 
 
 def identifiability_in_words(result: Identification) -> list[str]:
@@ -277,9 +297,12 @@ def identifiability_in_words(result: Identification) -> list[str]:
     lines = []
     for name, partners in result.gauges.items():
         if partners:
-            lines.append(f'{name} against {", ".join(partners)}: only their combination shows')
+            lines.append(
+                f'{name} cannot be told apart from {", ".join(partners)}: only their combination '
+                f'shows, and {name} keeps its nominal value'
+            )
         else:
-            lines.append(f'{name}: no measured pose depends on it')
+            lines.append(f'{name}: no measured pose depends on it; it keeps its nominal value')
     weak = weakly_determined(result)
     if weak:
         lines.append(f'weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}')

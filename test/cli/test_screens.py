@@ -22,7 +22,7 @@ import pytest
 from measured import TEST, UR, measured, rows_of, write_csv
 
 from calib_ros.cli import screen
-from calib_ros.cli.command import commands
+from calib_ros.cli.command import TEXTS
 from calib_ros.cli.main import main
 from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
@@ -99,7 +99,7 @@ def test_the_overview(shown):
     assert shown('--help') == (0, text)
 
 
-@pytest.mark.parametrize('name', commands())
+@pytest.mark.parametrize('name', TEXTS)
 def test_the_help_of_a_command(shown, name):
     status, text = shown(name, '--help')
     assert status == 0
@@ -143,7 +143,7 @@ def test_a_wrong_command_proposes_the_right_one(shown):
 
 def test_every_command_has_a_screen():
     apart = {'images', 'compare', 'fleet', 'history'}  # in tests of their own, with more data
-    assert {*RESULTS, *apart} >= {*commands()}
+    assert {*RESULTS, *apart} >= {*TEXTS}
 
 
 @pytest.mark.parametrize('name', [*RESULTS, *MORE])
@@ -254,7 +254,7 @@ def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error
     def fail(*_):
         raise error
 
-    monkeypatch.setattr('calib_ros.kinematics.chain_file.load_chain', fail)
+    monkeypatch.setattr('calib_ros.cli.robots.load_chain', fail)
     found, text = shown('chain', 'ur5e')
     assert found == status
     assert words in text

@@ -105,7 +105,7 @@ def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
         open_archive(tmp_path, joints=3).resume()
     (path,) = tmp_path.glob('*.csv')
     path.write_text(path.read_text().replace('spread', 'width'))
-    with pytest.raises(InputError, match='not the columns of a journal'):
+    with pytest.raises(InputError, match="does not have this robot's columns"):
         open_archive(tmp_path, joints=2).resume()
 
 

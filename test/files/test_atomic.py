@@ -20,7 +20,7 @@ from measured import measured, rows_of, write_csv
 from rosbags.rosbag2 import Writer
 
 from calib_ros.atomic import confined, whole_folder, write_file, write_files
-from calib_ros.cli import identify, main
+from calib_ros.cli import identify, main, options, results
 from calib_ros.cli.inputs import Loaded
 from calib_ros.cli.results import Identified
 from calib_ros.errors import InputError
@@ -31,7 +31,7 @@ from calib_ros.identification.identification import identify as identified_from
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report import page, plots, reports, words
+from calib_ros.report import plots, words
 from calib_ros.report.page import Origin
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -454,8 +454,9 @@ def identified(monkeypatch):
         return Identified(loaded, result, origin)
 
     monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
-    monkeypatch.setattr(reports, 'identification_report', lambda *of: of[1])
-    monkeypatch.setattr(page, 'render', lambda result: f'page of {result.names}')
+    monkeypatch.setattr(results, 'identification_report', lambda *of: of[1])
+    monkeypatch.setattr(options, 'render', lambda result: f'page of {result.names}')
+    monkeypatch.setattr(results, 'markdown', lambda result, samples: f'{samples} {result.names}')
     monkeypatch.setattr(
         calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
     )

@@ -6,9 +6,10 @@ from distributed import LocalCluster
 
 from calib_ros.errors import ConfigError
 from calib_ros.files.history import History
+from calib_ros.files.rows import Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
-from calib_ros.fleet.run import Cluster, run
+from calib_ros.fleet.run import Cluster, LostError, run
 from calib_ros.fleet.standing import standings
 from calib_ros.fleet.work import Outcome, Source, Task
 
@@ -88,6 +89,12 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     first, second = standings(plant, history, found)
     assert (first.robot.serial, first.state, first.last) == ('A', 'unreadable', None)
     assert (second.robot.serial, second.state) == ('B', 'fine')
+    for number, rms in enumerate((0.1, 0.1, 0.5)):
+        errors = {'rms_mm': rms, 'rms_freedom': 30.0}
+        history.file(Row('B', 'verify', plants.when(number), 'JUDGED', str(number), 's', **errors))
+    worst = standings(plant, history, found)[0]
+    assert (worst.robot.serial, worst.state) == ('B', 'worse')
+    assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
 
 
 def test_small_tasks_go_together_and_the_one_that_ends_a_worker_is_found(plant, cluster):
@@ -97,6 +104,17 @@ def test_small_tasks_go_together_and_the_one_that_ends_a_worker_is_found(plant, 
     assert len(done) == 200
     assert done.pop('150').error.startswith('its worker ended: 150')
     assert all(outcome.error == url for url, outcome in done.items())
+
+
+def test_a_scheduler_that_dies_is_told_of(plant):
+    tasks = [Task(plant[0], Source(str(number))) for number in range(50)]
+    local = LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=':0')
+    with local, running._client(Cluster(local.scheduler_address)) as client:
+        found = running._done(client, tasks, echoed)
+        next(found)
+        local.close()
+        with pytest.raises(LostError, match='results so far are filed, run again'):
+            list(found)
 
 
 def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeypatch):

@@ -25,7 +25,7 @@ from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, summary
 
-EXAMPLES = int(os.environ.get('AWKWARD', '30'))
+EXAMPLES = int(os.environ.get('AWKWARD', '15'))
 MOST = 40
 """Poses of a design."""
 POSITIONER = Chain(

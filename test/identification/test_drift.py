@@ -16,8 +16,7 @@ from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.markdown import markdown
-from calib_ros.report.words import as_document
+from calib_ros.report.words import as_document, chance_in_words
 
 UR10E = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -167,4 +166,4 @@ def test_few_poses_with_priors(count):
 def test_the_report_tells_the_chance():
     result = identify(Problem(UR10E, session(0, 0.0, 'swing'), **SIGMAS))
     assert as_document(result, {})['chance_of_gain'] == result.chance > 0.05
-    assert f'in {100 * result.chance:.1f} % of the shifts' in markdown(result, {}, ())
+    assert f'well in {100 * result.chance:.1f} % of cases' in chance_in_words(result)[0]

@@ -89,8 +89,8 @@ def test_lengths_along_parallel_axes_trade_where_no_tilt_is_modelled(exact, rng)
     assert f'{ALIGNED[0]}.d' in result.names
     assert_trades_hold(result, UR10E.random_joints(100, rng))
     words = ' '.join(identifiability_in_words(result))
-    assert 'wrist_3_joint.d against tool.z' in words
-    assert 'elbow_joint.d against ' in words
+    assert 'wrist_3_joint.d cannot be told apart from tool.z' in words
+    assert 'elbow_joint.d cannot be told apart from ' in words
 
 
 def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):

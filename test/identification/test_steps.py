@@ -15,8 +15,7 @@ from calib_ros.identification.robust import Robust
 from calib_ros.identification.steps import find_step
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.markdown import markdown
-from calib_ros.report.words import as_document
+from calib_ros.report.words import as_document, remarks
 
 UR10E = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -161,7 +160,7 @@ def test_a_step_beside_the_fit_is_told_and_harms_nothing():
     assert result.step.outside
     assert result.remarks == (str(result.step),)
     assert 'carries no weight' in result.remarks[0]
-    assert result.remarks[0] in markdown(result, {}, ())
+    assert result.remarks[0] in remarks(result)
     assert as_document(result, {})['remarks'] == list(result.remarks)
 
 

@@ -48,7 +48,7 @@ from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(seed=SEEDS)
 def test_any_serial_arm_moves_as_its_urdf(convention, seed):
     rng = np.random.default_rng(seed)
@@ -360,7 +360,7 @@ def stripped(text):
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=100)
+@settings(max_examples=40)
 @given(seed=SEEDS)
 def test_a_corrected_urdf_moves_as_the_corrected_arm(convention, seed):
     rng = np.random.default_rng(seed)

@@ -22,7 +22,10 @@ from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report.markdown import markdown
+from calib_ros.report.page import Origin
 from calib_ros.report.plots import before_after_png
+from calib_ros.report.poses import poses_of
+from calib_ros.report.reports import identification_report
 from calib_ros.sampling.sample import Sample
 
 HOSTILE = (
@@ -86,7 +89,14 @@ def result():
 @pytest.mark.parametrize('name', HOSTILE[:-3])
 def test_a_report_is_of_one_form_whatever_the_names(result, name):
     """Of the robot, a joint, what was dropped, and in a warning."""
-    usual = markdown(result, {'samples': 3, 'dropped': {'x': 1}}, ('x',))
+
+    def text_of(found, dropped, warning):
+        problem = Problem(load_chain('ur5e'), measured())
+        poses = poses_of(problem, result)
+        report = identification_report(problem, found, poses, Origin(), (warning,))
+        return markdown(report, {'samples': 3, 'dropped': dropped})
+
+    usual = text_of(result, {'x': 1}, 'x')
     joint = result.parameters[0].name
     first = replace(result.parameters[0], name=Parameter(name, 'a'))
     renamed = replace(
@@ -94,7 +104,7 @@ def test_a_report_is_of_one_form_whatever_the_names(result, name):
         chain=replace(result.chain, name=name),
         parameters=(first, *result.parameters[1:]),
     )
-    found = markdown(renamed, {'samples': 3, name: {name: 1}}, (name,))
+    found = text_of(renamed, {name: 1}, name)
     assert len(found.splitlines()) == len(usual.splitlines())
     assert '<' not in found
     row = next(line for line in usual.splitlines() if line.startswith(f'| {joint} |'))
