@@ -20,24 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.hints import Hint, restless, sparse
 from calib_ros.sampling.making import WIDTH, Maker, Numbered
-from calib_ros.sampling.names import MOST_NAMES
-from calib_ros.sampling.rests import Rests
-from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.sampling.rests import Rests, seen_stops
+from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, Slice, StreamKey
 from calib_ros.sampling.stands import SAMPLED, Known, Plan
 from calib_ros.sampling.strays import JUMP
-from calib_ros.sampling.track import CAUSES, Track
+from calib_ros.sampling.track import APART, CAUSES, Track
+from calib_ros.sampling.waiting import Waiting
 from calib_ros.settings import Settings
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = 500_000_000
 """Time of the newest joint sample between two rounds of taking samples."""
-MOST_STREAMS = MOST_NAMES
-"""Streams of measurements that are told apart: a tracker may number markers without end."""
-TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
 
 
 class Collector:
@@ -55,7 +53,6 @@ class Collector:
         self.settings = settings
         self._revolute = np.array(revolute, dtype=bool)
         self.track = Track(revolute, settings.max_gap, settings.joint_buffer)
-        self._waiting: dict[StreamKey, Rows] = {}
         self._known = Known(self._revolute, settings.pose_buffer)
         self._lateness_ns = round(settings.lateness * 1e9)
         self._newest_ns = 0  # the last joint sample
@@ -70,20 +67,10 @@ class Collector:
         """True while the delay is being looked for, so that nothing may be taken."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
+        self.waiting = Waiting(WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
         self.unused: Counter[str] = Counter()
         """What no sample is made of in the ordinary course of things, by cause."""
         self.notes: Counter[str] = Counter()
-
-    @property
-    def images(self) -> set[int]:
-        """Return the numbers of the images that wait for their time."""
-        found = [rows.values[:, 0] for key, rows in self._waiting.items() if key.images]
-        return {int(number) for numbers in found for number in numbers.tolist()}
-
-    @property
-    def waiting(self) -> int:
-        """Return how many measurements wait for their time."""
-        return sum(rows.count for rows in self._waiting.values())
 
     def known(self, now_ns: int | None) -> tuple[Stamps, FloatArray, list[Any]]:
         """Return stamps and joint values, and stamps and rows (N, WIDTH) of waiting positions.
@@ -96,7 +83,7 @@ class Collector:
         complete = stamps <= until
         positions = [
             (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
-            for key, rows in self._waiting.items()
+            for key, rows in self.waiting.items()
             if not (key.distance or key.eye_in_hand or key.images)
         ]
         return stamps[complete], joints[complete], positions
@@ -148,14 +135,8 @@ class Collector:
         delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # that of the slice is off
         late = times - np.where(joints, 0, delay_ns) <= newest - self._late_ns
         end = begin + int(np.argmax(np.append(late[begin:], True)))
-        streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
-        if len(self._waiting.keys() | {each.key for each in streams}) > MOST_STREAMS:
-            return begin
-        for key, places, *_ in streams:
-            room = self.settings.pose_buffer
-            room -= self._waiting[key].count if key in self._waiting else 0
-            end = int(min([end, *(places[room : room + 1] - given.begin).tolist()]))
-        return end
+        room = self.waiting.room(given)
+        return begin if room is None else min(end, room)
 
     def take(self, given: Slice) -> list[int]:
         """Take messages up to one that gives something to do; return the stamps of its rounds."""
@@ -175,7 +156,7 @@ class Collector:
             rounds = stamps[self._rounds(stamps, (0, newest))].tolist()
         for key, _, stamps, numbers in given.pieces:
             if isinstance(key, StreamKey):
-                self._extend(key, stamps, numbers)
+                self.waiting.extend(key, stamps, numbers, self._settled_ns + self.delay_ns)
             else:
                 self.track.extend(key, stamps, numbers)
         return rounds
@@ -186,44 +167,26 @@ class Collector:
         if not self.holding:
             self._round(self._complete_ns, rounds)
 
-    def _extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray) -> None:
-        """Take measurements: numbers (M, w) at stamps (M,)."""
-        rows = self._stream(key)
-        if rows is None:
-            self.dropped[TOO_MANY] += len(stamps)
-            return
-        due = np.flatnonzero(stamps - self.delay_ns > self._settled_ns)
-        taken = due[: rows.capacity - rows.count]
-        if len(due) < len(stamps):
-            self.dropped['poses: later than lateness allows'] += len(stamps) - len(due)
-        if len(taken) < len(due):
-            self.dropped['poses: pose buffer full'] += len(due) - len(taken)
-        rows.extend(stamps[taken], numbers[taken])
-
-    def _stream(self, key: StreamKey) -> Rows | None:
-        """Return the buffer of a stream; None when too many others are in use."""
-        rows = self._waiting.get(key)
-        if rows is None:
-            if len(self._waiting) >= MOST_STREAMS:  # forget those without any use
-                idle = [key for key, rows in self._waiting.items() if not rows.count]
-                for each in idle:
-                    if not self.maker.has(each):
-                        del self._waiting[each]
-            if len(self._waiting) >= MOST_STREAMS:
-                return None
-            rows = self._waiting[key] = Rows(WIDTH, self.settings.pose_buffer)
-        return rows
+    def hints(self, measurements: int) -> list[Hint]:
+        """Return what looks wrong with the joint states, of so many measurements."""
+        needed = self.rests.needed(self.settings.still)
+        between = self.dropped[f'poses: {APART}']
+        found = [
+            None if needed is None else restless(needed, self.settings.still),
+            sparse(between, measurements, self.settings.max_gap),
+        ]
+        return [hint for hint in found if hint is not None]
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
-        newest = [int(rows.stamps.max()) for rows in self._waiting.values() if rows.count]
+        newest = [int(rows.stamps.max()) for rows in self.waiting.values() if rows.count]
         if newest:
             self._round(min(self.track.newest_ns, min(newest) - self.delay_ns), ends_here=True)
 
     def finish(self) -> None:
         """Deal with everything; nothing more will come."""
         self._round(self.track.newest_ns, ends_here=True)
-        for rows in self._waiting.values():
+        for rows in self.waiting.values():
             if rows.count:
                 self._count_causes(self.track.causes(rows.stamps - self.delay_ns))
                 rows.release(rows.count)
@@ -312,7 +275,7 @@ class Collector:
         twice = self.track.sort()
         if twice:
             self.dropped['joints: same stamp twice'] += twice
-        for rows in self._waiting.values():
+        for rows in self.waiting.values():
             twice = rows.sort()
             if twice:
                 self.dropped['poses: same stamp twice'] += twice
@@ -321,7 +284,7 @@ class Collector:
         """Make a sample of every measurement up to a stamp of the joints, round by round."""
         ends = np.maximum.accumulate(np.array(rounds[:-1], dtype=np.int64)) - self._late_ns
         found: list[Numbered] = []
-        for key, rows in sorted(self._waiting.items()):
+        for key, rows in sorted(self.waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = stamps <= until
             if not due.any():
@@ -345,7 +308,10 @@ class Collector:
         settings = self.settings
         newest = self.track.newest_ns
         stands = self.track.standing(settings.still, WINDOW)
-        self._note_rests(stands, rounds or (newest,))
+        shortest = round(settings.shortest_stop * 1e9)
+        seen = seen_stops(stands, rounds or (newest,), self._settled_ns, self._late_ns, shortest)
+        for found, now in zip(seen, rounds or (newest,), strict=True):
+            self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS, now))
         plan = Plan(self._settled_ns, self._sampled_ns)
         plan.of_stands(stands, until, None if ends_here else newest, settings)
         stops = plan.stops
@@ -359,23 +325,13 @@ class Collector:
         self._sampled_ns = plan.sampled_ns
         return plan.done_ns
 
-    def _note_rests(self, stands: Stamps, rounds: Sequence[int]) -> None:
-        """Note of each round whether it has found a stop, and the noise of the joints if not."""
-        shortest = round(self.settings.shortest_stop * 1e9)
-        times = np.array(rounds)[:, np.newaxis]
-        settled = np.concatenate([[[self._settled_ns]], times[:-1] - self._late_ns])
-        lengths = np.minimum(stands[:, 1], times) - stands[:, 0]
-        found = ((lengths >= shortest) & (stands[:, 1] > settled)).any(axis=1)
-        for seen, newest in zip(found.tolist(), rounds, strict=True):
-            self.rests.note(None if seen else self.track.noise_at_rest(ADVANCE_NS, newest))
-
     def _carry_out(self, plan: Plan) -> None:
         """Make a sample of each stream at the stops of a plan, and count what is not used."""
         self.rests.sampled += len(plan.stops)
         ends, calm = np.array(plan.ends), np.array(plan.begins) + round(self.settings.settle * 1e9)
         wanted = np.array([not why for why in plan.why], dtype=bool)
         found: list[Numbered] = []
-        for key, rows in sorted(self._waiting.items()):
+        for key, rows in sorted(self.waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = int(np.searchsorted(stamps, plan.done_ns, 'right')) if plan.ends else 0
             if not due:

@@ -63,6 +63,15 @@ class JointNames:
             raise MessageError('none of the joints in the message')
         return layout
 
+    def foreign_ones(self, missing: Sequence[int]) -> str:
+        """Return in words that other joints come than those of some numbers; empty if none do."""
+        if not (missing and self.foreign):
+            return ''
+        return (
+            f'waiting for joint states, set joint_names? Those that come name '
+            f'{", ".join(self.foreign)}, not {", ".join(self._names[k] for k in missing)}'
+        )
+
 
 class FrameNames:
     """The frames in which each device has measured; there should be one of each."""

@@ -19,6 +19,23 @@ from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 
 
+def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
+    """Refuse names of joints in messages that are not one for each joint of a chain.
+
+    Raises
+    ------
+    ConfigError
+        With the joints of the chain.
+
+    """
+    count = len(chain.joints)
+    if not len(names) == len(set(names)) == count:
+        raise ConfigError(
+            f'joint_names must be {count} different names, one for each of '
+            f'{", ".join(chain.joint_names)}; not {", ".join(names)}'
+        )
+
+
 def check_settings(chain: Chain, settings: Settings) -> None:
     """Refuse settings that no identification of a chain could use, before anything is measured.
 

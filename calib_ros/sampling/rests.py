@@ -4,7 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+
+from calib_ros.sampling.rows import Stamps
 
 AT_REST = 6.0
 """What `still` must be at least [noise of the joints] for a stop to show as one."""
@@ -32,3 +36,18 @@ class Rests:
             return None
         needed = AT_REST * float(np.median(self._unseen))
         return needed if needed > still else None
+
+
+def seen_stops(
+    stands: Stamps, rounds: Sequence[int], settled_ns: int, late_ns: int, shortest_ns: int
+) -> list[bool]:
+    """Tell of each round whether a stop shows in what the one before has not dealt with.
+
+    Stands (K, 2) of the joints, and stamps of the rounds, of which each deals with what is older
+    than it by `late_ns`.
+    """
+    times = np.array(rounds)[:, np.newaxis]
+    settled = np.concatenate([[[settled_ns]], times[:-1] - late_ns])
+    lengths = np.minimum(stands[:, 1], times) - stands[:, 0]
+    found = ((lengths >= shortest_ns) & (stands[:, 1] > settled)).any(axis=1)
+    return [bool(each) for each in found]

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
+from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.model_choice import identify_model
@@ -21,25 +21,18 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, Part
-from calib_ros.sampling.hints import Hint, restless, sparse
+from calib_ros.sampling.hints import Hint
+from calib_ros.sampling.judging import in_frames_of, problem_since, refuse_other_joints
 from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.names import FrameNames, JointNames
 from calib_ros.sampling.pictures import Pictures
-from calib_ros.sampling.problems import check_settings, problem_of, with_lenses
+from calib_ros.sampling.problems import check_joint_names, check_settings, problem_of
 from calib_ros.sampling.progress import progress
 from calib_ros.sampling.road import Road
-from calib_ros.sampling.sample import (
-    SOCKETS,
-    Frames,
-    Sample,
-    collect,
-    named,
-    socket_place,
-)
+from calib_ros.sampling.sample import SOCKETS, Sample, named, socket_place
 from calib_ros.sampling.slices import POSES
 from calib_ros.sampling.strays import STRAY
-from calib_ros.sampling.track import APART
 from calib_ros.settings import Settings
 
 SILENT_NS = 5_000_000_000
@@ -80,12 +73,7 @@ class CalibrationSession:
         self.on_sample = on_sample or (lambda sample: None)
         self.on_removed = on_removed or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
-        count = len(chain.joints)
-        if not len(self.joint_names) == len(set(self.joint_names)) == count:
-            raise ConfigError(
-                f'joint_names must be {count} different names, one for each of '
-                f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
-            )
+        check_joint_names(chain, self.joint_names)
         check_settings(chain, self.settings)
         self.recording = True
         self.socket_distance = SOCKETS
@@ -216,33 +204,24 @@ class CalibrationSession:
         silent = [self.joint_names[k] for k in track.silent(SILENT_NS)]
         if silent:
             return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
-        missing = [self.joint_names[k] for k in track.missing]
-        if missing and self._names.foreign:
-            return (
-                f'waiting for joint states, set joint_names? Those that come name '
-                f'{", ".join(self._names.foreign)}, not {", ".join(missing)}'
-            )
-        return self._collector.state()
+        return self._names.foreign_ones(track.missing) or self._collector.state()
 
     def account(self) -> Account:
         """Return what became of the messages so far."""
         fitted = [sample.joints for sample in self.samples if not sample.validation]
-        usable = self.usable
-        distinct = len(fitted)
+        usable, distinct = self.usable, len(fitted)
         if self.settings.mode != 'continuous' and fitted:
             distinct = len(np.unique(configurations(np.array(fitted))))
         collector = self._collector
         notes = self._road.notes + collector.notes
-        if len(usable) < len(self.samples):
-            notes['samples left out, in another frame or of a target measured once'] += len(
-                self.samples
-            ) - len(usable)
+        if left_out := len(self.samples) - len(usable):
+            notes['samples left out, in another frame or of a target measured once'] += left_out
         strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._road.gate.dropped.items()})
         dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + strays
         return Account(
             self.received['joints'],
             self.received['poses'],
-            collector.waiting + self._road.gate.held(POSES),
+            collector.waiting.count + self._road.gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
@@ -260,16 +239,11 @@ class CalibrationSession:
     @property
     def hints(self) -> list[Hint]:
         """Return what looks wrong in what is heard."""
-        found: list[Hint | None] = []
+        found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         found += self._clocks.hints()
-        needed = self._collector.rests.needed(self.settings.still)
-        if needed is not None:
-            found.append(restless(needed, self.settings.still))
-        between = self._collector.dropped[f'poses: {APART}']
-        found.append(sparse(between, self.received[POSES], self.settings.max_gap))
-        return [hint for hint in found if hint is not None]
+        return found + self._collector.hints(self.received[POSES])
 
     @property
     def delay(self) -> Delay | None:
@@ -358,12 +332,7 @@ class CalibrationSession:
             When it has other joints.
 
         """
-        theirs = calibration.chain.joint_names
-        if theirs != self.chain.joint_names:
-            raise InputError(
-                f'the calibration has the joints {", ".join(theirs)}, the robot has '
-                f'{", ".join(self.chain.joint_names)}'
-            )
+        refuse_other_joints(calibration, self.chain)
         self._known = frozenset(self.samples if samples is None else samples)
         self.calibration = calibration
 
@@ -393,12 +362,7 @@ class CalibrationSession:
 
         """
         calibration, sets = self._since(RECENT)
-        first, *more = sets
-        cameras = {each.camera for each in sets if each.pixels is not None}
-        known = {name: calibration.chain.frame(name).lens for name in cameras}
-        chain = with_lenses(self.chain, {name: lens for name, lens in known.items() if lens})
-        settings = self.settings.for_problem()
-        return calibration, Problem(chain, first, more=tuple(more), **settings)
+        return calibration, problem_since(calibration, self.chain, sets, self.settings)
 
     def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
         """Return the calibration, and the samples since, or the last of them, in its frames."""
@@ -406,22 +370,9 @@ class CalibrationSession:
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
         self._flush()
-        settings = self.settings
-        sigmas = (settings.sigma_position, settings.sigma_orientation)
-        # the first device and target are those of a file that does not name any
-        frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
         since = [each for each in self.usable if each not in self._known]
         since = since[-most:] if most else since
-        sets = [each for part in collect(since, sigmas, frames) for each in part]
-        if not sets:
-            raise InputError('no samples have been taken since: measure some new poses first')
-        known = calibration.chain.frame_names
-        if not all(each.base in known and each.tool in known for each in sets):
-            raise InputError(
-                'the samples since were measured by a device or on a target that the '
-                'calibration does not know'
-            )
-        return calibration, sets
+        return calibration, in_frames_of(calibration, since, self.usable, self.settings)
 
     def _flush(self) -> None:
         """Make samples of everything that has come, as if nothing came late."""
@@ -431,7 +382,7 @@ class CalibrationSession:
     def _settle(self, wait: bool = False) -> None:
         """Take the samples of images that were looked at, of all of them if asked."""
         self._take((), wait)
-        self.pictures.keep_only(self._collector.images)
+        self.pictures.keep_only(self._collector.waiting.images)
 
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
         """Keep the samples that were made; return how many there are now."""

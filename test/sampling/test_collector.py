@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
-from calib_ros.sampling.collector import MOST_STREAMS, TOO_MANY, Collector
+from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import Piece, Slice, StreamKey
+from calib_ros.sampling.waiting import MOST_STREAMS, TOO_MANY
 from calib_ros.settings import Settings
 
 POSE = StreamKey('', '', False, False, False)
@@ -549,7 +550,7 @@ def test_targets_without_end_are_dropped_and_counted():
     made = collector()
     play(made, [glimpse(k, 0.5 + 1e-4 * k) for k in range(200)], finish=False)
     play(made, [glimpse(200, time) for time in (0.6, 0.7)], finish=False)
-    assert made.waiting == MOST_STREAMS
+    assert made.waiting.count == MOST_STREAMS
     assert made.dropped == {TOO_MANY: 200 - MOST_STREAMS + 2}
 
 
@@ -568,7 +569,7 @@ def test_targets_that_gave_no_sample_make_room_for_others():
 
 
 def test_a_target_that_was_sampled_makes_no_room(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.collector.MOST_STREAMS', 2)
+    monkeypatch.setattr('calib_ros.sampling.waiting.MOST_STREAMS', 2)
     motion = tour()
     made = collector()
     both = [pose_events(motion, 1.5, key=marker(k)) for k in (1, 2)]
@@ -577,4 +578,4 @@ def test_a_target_that_was_sampled_makes_no_room(monkeypatch):
     assert made.dropped == {TOO_MANY: 1}
     made.forget(samples[0])
     play(made, [glimpse(3, 9.6)], finish=False)
-    assert made.waiting == 1
+    assert made.waiting.count == 1

@@ -104,7 +104,7 @@ def outcome(session):
 def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     rng = np.random.default_rng(seed)
     if seed == 4:  # the first stream that comes when none is in use takes the only place
-        monkeypatch.setattr('calib_ros.sampling.collector.MOST_STREAMS', 1)
+        monkeypatch.setattr('calib_ros.sampling.waiting.MOST_STREAMS', 1)
     first, second = shift(rng), shift(rng)
     # The clock jumps back when the recording begins again.
     messages = first + (second if seed % 2 else [])
@@ -153,7 +153,7 @@ def test_two_stray_stamps_in_a_batch_cost_two_messages(rng, off):
 
 
 def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.collector.MOST_STREAMS', 1)
+    monkeypatch.setattr('calib_ros.sampling.waiting.MOST_STREAMS', 1)
     quat = [0.0, 0.0, 0.0, 1.0]
     messages = [pose(START, [np.nan, 0.0, 0.0], quat)]
     for k in range(1, 5):
@@ -161,7 +161,7 @@ def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
     session = CalibrationSession(ARM)
     assert feed(session, messages, STORE.deserialize_cdr) == []
     assert session.account().waiting == 4
-    assert [key.device for key in session._collector._waiting] == ['camera']
+    assert [key.device for key in session._collector.waiting] == ['camera']
 
 
 def test_a_damaged_message_is_told_and_the_others_are_taken():
