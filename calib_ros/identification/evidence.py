@@ -180,8 +180,9 @@ def posterior_of(
     beside += [(lengths, SCALE)] if lengths else []
     told = _told(chain, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
-    own = [0.0 if chain.owns_frame(n) else chain.offset(n, nominal) for n in names]
-    offsets = np.array([*own, *[0.0] * (len(matrix) - len(own))])
+    offsets = np.zeros(len(matrix))
+    arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
+    offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
     vector = matrix @ offsets + told[:-1, -1]
     groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
