@@ -3,9 +3,10 @@
 """After a collision: what a few poses and the earlier calibration tell, against a full one.
 
 A simulated UR10e is calibrated from 60 random poses (noise 0.05 mm, 0.2 mrad). Then a joint's
-zero slips by 0.5 mrad (`zero`), a link is bent (`bent`: a, alpha, d and beta of a joint, some
-tenths of a millimetre and of a milliradian), or nothing happens (`none`), and 8 poses (--poses),
-the same for all arms, chosen before by `plan`, are measured.
+zero slips by 0.5 mrad (`zero`), a link is twisted by as much (`twisted`: alpha of a joint) or bent
+at random (`bent`: a, alpha, d and beta of a joint, some tenths of a millimetre and of a
+milliradian), or nothing happens (`none`), and 8 poses (--poses), the same for all arms, chosen
+before by `plan`, are measured.
 
 - `ratio`: RMS error over the joint range, in the best frames, of the arm brought up to date over
   that of a full calibration from 60 new poses
@@ -44,6 +45,7 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
+SLIPS = {'zero': 'theta', 'twisted': 'alpha'}
 BENT = {'a': 3e-4, 'alpha': 5e-4, 'd': 3e-4, 'beta': 5e-4}
 MANY = 60
 SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
@@ -66,8 +68,8 @@ def few_poses(count):
 def changed(true, kind, rng):
     """Return the arm after what happened, and the joint that it happened to."""
     joint = UR.joint_names[rng.integers(6 if kind == 'zero' else 5)]
-    if kind == 'zero':
-        return true.with_offsets({f'{joint}.theta': rng.choice([-5e-4, 5e-4])}), joint
+    if kind in SLIPS:
+        return true.with_offsets({f'{joint}.{SLIPS[kind]}': rng.choice([-5e-4, 5e-4])}), joint
     if kind == 'bent':
         offsets = {f'{joint}.{key}': rng.normal(scale=size) for key, size in BENT.items()}
         return true.with_offsets(offsets), joint
@@ -113,7 +115,8 @@ def bound(few, kind):
         many = information(UR.random_joints(MANY, rng))
         for joint in UR.joint_names[: 6 if kind == 'zero' else 5]:
             sets = [own for owner, own in columns.sets if owner == joint]
-            own = columns.of(sets[-1] if kind == 'bent' else sets[0])
+            wanted = (f'{joint}.{SLIPS[kind]}',) if kind in SLIPS else ()
+            own = columns.of(next((each for each in sets if each == wanted), sets[-1]))
             shown = many @ own
             kept = many - shown @ np.linalg.solve(own.T @ shown, shown.T)  # of the rest
             ratios.append(mean_square(kept + information(few)) / mean_square(many))
@@ -149,9 +152,9 @@ def main():
     parser.add_argument('--poses', type=int, default=8, help='after the collision')
     options = parser.parse_args()
     counts = (
-        {'zero': 20, 'bent': 20, 'none': 40}
+        {'zero': 20, 'twisted': 20, 'bent': 20, 'none': 40}
         if options.quick
-        else {'zero': 200, 'bent': 200, 'none': 500}
+        else {'zero': 200, 'twisted': 200, 'bent': 200, 'none': 500}
     )
     few = few_poses(options.poses)
     figures = {}
