@@ -77,10 +77,14 @@ class Shifts:
         self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
         count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
         self._share = np.arange(count) / count
+        self._moments = [
+            _moments(samples.observations.pixels, begins, len(samples.observations))
+            for samples, begins in zip(system.sets, self._begins, strict=True)
+        ]
         self._circles: list[NDArray[np.complex128]] = []
         self._energy = np.zeros(count)
-        for begins, residual in zip(self._begins, residuals, strict=True):
-            series = _by_stop(residual, begins)
+        for begins, moments, residual in zip(self._begins, self._moments, residuals, strict=True):
+            series = _by_stop(residual, begins, moments)
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
             length = len(begins)
             again = np.concatenate([circle, series], axis=1)  # as far as a moved series reaches
@@ -100,8 +104,10 @@ class Shifts:
         for lot in columns:
             parts = []
             products.append(np.zeros((len(lot[0]), len(self._share))))
-            for begins, circle, column in zip(self._begins, self._circles, lot, strict=True):
-                series = _by_stop(column, begins)
+            for begins, moments, circle, column in zip(
+                self._begins, self._moments, self._circles, lot, strict=True
+            ):
+                series = _by_stop(column, begins, moments)
                 whole = np.linalg.norm(series, axis=(1, 2))
                 slow = slow_cosines(len(begins))
                 series -= series @ slow.T @ slow
@@ -139,10 +145,30 @@ class Shifts:
         return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
 
 
-def _by_stop(values: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
-    """Return (..., n) the sums over each stop of (..., N), by the root of their number."""
+def _by_stop(values: FloatArray, begins: NDArray[np.intp], moments: FloatArray) -> FloatArray:
+    """Return (..., m c, n) the moments (m, N) over each stop of (..., c, N), by its root."""
     count = np.diff([*begins.tolist(), values.shape[-1]])
-    return np.asarray(np.add.reduceat(values, begins, axis=-1) / np.sqrt(count))
+    parts = [np.add.reduceat(moment * values, begins, axis=-1) for moment in moments]
+    return np.asarray(np.concatenate(parts, axis=-2) / np.sqrt(count))
+
+
+def _moments(pixels: FloatArray | None, begins: NDArray[np.intp], count: int) -> FloatArray:
+    """Return the weights (m, N) of a stop's rows: 1, and with pixels (N, 2) where they are.
+
+    A sum over the corners of an image tells of its shift alone; with the first moments, of mean
+    square 1 in each image, it tells of the whole pose of the camera.
+    """
+    one = np.ones((1, count))
+    if pixels is None:
+        return one
+    number = np.repeat(np.arange(len(begins)), np.diff([*begins.tolist(), count]))
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray((np.add.reduceat(values, begins) / np.bincount(number)[:, None])[number])
+
+    centred = pixels - mean(pixels)
+    scale = np.sqrt(mean(centred**2))
+    return np.concatenate([one, (centred / np.maximum(scale, 1e-9)).T])
 
 
 def slow_cosines(length: int) -> FloatArray:

@@ -220,7 +220,7 @@ class Collector:
         newest = self.track.newest_ns
         if not newest:
             return 0, 'no joint states have come'
-        if not (self.waiting or place):
+        if not (self.waiting.count or place):
             return 0, 'no measurements have come since the last sample'
         shortest = round(self.settings.shortest_stop * 1e9)
         if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
