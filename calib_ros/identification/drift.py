@@ -15,7 +15,8 @@ Of residuals r, columns A beside the columns F of the model before them explain 
 
 where L holds the inverse variances of priors. A series is closed to a circle by its mirror image,
 and its slowest part, which is not stationary, is taken out of residuals and columns: a few
-cosines over the session. All shifts of X^T r are one circular correlation, by fast Fourier
+cosines over the session. Samples of one stop move together, as their sum, and of pixels with their
+first moments. All shifts of X^T r are one circular correlation, by fast Fourier
 transforms.
 """
 
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from calib_ros.identification.leastsquares import System
-from calib_ros.identification.observations import stops
+from calib_ros.identification.observations import Observations, stops
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -77,14 +78,14 @@ class Shifts:
         self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
         count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
         self._share = np.arange(count) / count
-        self._moments = [
-            _moments(samples.observations.pixels, begins, len(samples.observations))
+        self._weights = [
+            _weights(samples.observations, begins)
             for samples, begins in zip(system.sets, self._begins, strict=True)
         ]
         self._circles: list[NDArray[np.complex128]] = []
         self._energy = np.zeros(count)
-        for begins, moments, residual in zip(self._begins, self._moments, residuals, strict=True):
-            series = _by_stop(residual, begins, moments)
+        for begins, weights, residual in zip(self._begins, self._weights, residuals, strict=True):
+            series = _by_stop(residual, begins, weights)
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
             length = len(begins)
             again = np.concatenate([circle, series], axis=1)  # as far as a moved series reaches
@@ -104,10 +105,10 @@ class Shifts:
         for lot in columns:
             parts = []
             products.append(np.zeros((len(lot[0]), len(self._share))))
-            for begins, moments, circle, column in zip(
-                self._begins, self._moments, self._circles, lot, strict=True
+            for begins, weights, circle, column in zip(
+                self._begins, self._weights, self._circles, lot, strict=True
             ):
-                series = _by_stop(column, begins, moments)
+                series = _by_stop(column, begins, weights)
                 whole = np.linalg.norm(series, axis=(1, 2))
                 slow = slow_cosines(len(begins))
                 series -= series @ slow.T @ slow
@@ -145,30 +146,30 @@ class Shifts:
         return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
 
 
-def _by_stop(values: FloatArray, begins: NDArray[np.intp], moments: FloatArray) -> FloatArray:
-    """Return (..., m c, n) the moments (m, N) over each stop of (..., c, N), by its root."""
-    count = np.diff([*begins.tolist(), values.shape[-1]])
-    parts = [np.add.reduceat(moment * values, begins, axis=-1) for moment in moments]
-    return np.asarray(np.concatenate(parts, axis=-2) / np.sqrt(count))
+def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) -> FloatArray:
+    """Return (..., m c, n) the sums over each stop of (..., c, N) with weights (m, N)."""
+    parts = [np.add.reduceat(each * values, begins, axis=-1) for each in weights]
+    return np.asarray(np.concatenate(parts, axis=-2))
 
 
-def _moments(pixels: FloatArray | None, begins: NDArray[np.intp], count: int) -> FloatArray:
-    """Return the weights (m, N) of a stop's rows: 1, and with pixels (N, 2) where they are.
+def _weights(observations: Observations, begins: NDArray[np.intp]) -> FloatArray:
+    """Return the weights (m, N) of the rows of each stop: one by the root of their number.
 
-    A sum over the corners of an image tells of its shift alone; with the first moments, of mean
-    square 1 in each image, it tells of the whole pose of the camera.
+    Of pixels also where they are, of mean square 1 in each stop: their sum tells of a shift alone,
+    with the first moments of the whole pose of the camera.
     """
-    one = np.ones((1, count))
-    if pixels is None:
-        return one
-    number = np.repeat(np.arange(len(begins)), np.diff([*begins.tolist(), count]))
+    count = np.diff(begins, append=len(observations))
+    number = np.repeat(np.arange(len(begins)), count)
+    root = 1.0 / np.sqrt(count)[number]
+    if observations.pixels is None:
+        return root[np.newaxis]
 
     def mean(values: FloatArray) -> FloatArray:
-        return np.asarray((np.add.reduceat(values, begins) / np.bincount(number)[:, None])[number])
+        return np.asarray((np.add.reduceat(values, begins) / count[:, np.newaxis])[number])
 
-    centred = pixels - mean(pixels)
-    scale = np.sqrt(mean(centred**2))
-    return np.concatenate([one, (centred / np.maximum(scale, 1e-9)).T])
+    centred = observations.pixels - mean(observations.pixels)
+    centred /= np.maximum(np.sqrt(mean(centred**2)), 1e-9)  # corners in a line
+    return np.concatenate([root[np.newaxis], root * centred.T])
 
 
 def slow_cosines(length: int) -> FloatArray:
