@@ -41,9 +41,6 @@ from calib_ros.kinematics.se3 import FloatArray
 
 EXACT = 1e-9
 """Largest difference [m, and in rotation matrices] of an export that is called exact."""
-POSES = 1000
-FITTED = 200
-"""Poses to which a table that cannot be exact is fitted; it is judged on all."""
 FILES = (
     *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
     *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
@@ -90,8 +87,7 @@ def exports(
         When a file, read back, differs from the chain.
 
     """
-    rng = np.random.default_rng(0)
-    q = chain.random_joints(POSES, rng)
+    q = anywhere(chain)
     arm = replace(chain, effects=())
     wanted = arm.forward(q)
     lost = _distance(chain.forward(q), wanted) if chain.effects else 0.0
@@ -118,6 +114,11 @@ def exports(
         text = _csv(best, f'{nominal.convention} {what}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
+
+
+def anywhere(chain: Chain) -> FloatArray:
+    """Return the joint values (N, n) at which files are held against a chain."""
+    return chain.random_joints(1000, np.random.default_rng(0))
 
 
 def converted(chain: Chain, convention: str) -> Chain:
@@ -301,7 +302,7 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         or Parameter(name).kind in kinds
         or ('zero' in kinds and name in driven)
     ]
-    joints = joints[:: max(1, len(joints) // FITTED)]
+    joints = joints[:: max(1, len(joints) // 200)]  # to be fitted; it is judged on all
     poses = chain.forward(joints)
     observations = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     system = System((Samples(observations, 1e-4, 1e-3),))

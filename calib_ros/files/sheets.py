@@ -17,17 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from calib_ros.errors import InputError
+from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.csv_columns import TextColumns, regular
 from calib_ros.files.layouts import SEPARATORS, Layout
-from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, read_bytes
+from calib_ros.texts import LARGEST_TABLE, read_bytes
 
-ABOVE = 100
-"""Lines above the header at most."""
-UNDER = 3
-"""Lines between the header and the first row at most: units."""
-SAMPLE = 30
-"""Lines by which separators are guessed."""
+HEAD = 100
+"""Lines that the header and the first row of numbers are looked for in."""
 SEPARATOR = '\x1f'
 """Between cells that are no regular text."""
 LARGEST_SHEET = 3 * LARGEST_TABLE
@@ -93,7 +89,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         if separator == ' ':
             text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
             text = re.sub(r'[ \t]+', ' ', text)
-        rows = _cells(path, '\n'.join(text.split('\n', ABOVE + SAMPLE)[:-1] or [text]), separator)
+        rows = _cells(path, '\n'.join(text.split('\n', HEAD)[:-1] or [text]), separator)
     decimal = layout.decimal or _decimal(rows, separator, notes)
     at, header = _header(path, rows, names, known)
     used = [header.index(n) for n in names if not n.startswith('#') and n in header]
@@ -157,8 +153,8 @@ def _workbook(path: Path, name: str) -> list[tuple[int, list[str]]]:
         sheet = book[name] if name else book.worksheets[0]
         rows = []
         for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-            if len(row) > MOST_COLUMNS:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_COLUMNS}')
+            if len(row) > MOST_ENTRIES:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
             cells = [_cell(value) for value in row]
             if any(cells):
                 rows.append((number, cells))
@@ -184,8 +180,8 @@ def _cell(value: object) -> str:
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
     """Return the separator by which most lines have the same number of cells, more than one."""
-    lines = [line for line in text.split('\n', ABOVE + SAMPLE)[: ABOVE + SAMPLE] if line.strip()]
-    lines = lines[-SAMPLE:]
+    lines = [line for line in text.split('\n', HEAD)[:HEAD] if line.strip()]
+    lines = lines[-30:]  # under most of what stands above the header
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most = ',', 0
@@ -220,8 +216,8 @@ def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]
     try:
         found = []
         for row in reader:
-            if len(row) > MOST_COLUMNS:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_COLUMNS}')
+            if len(row) > MOST_ENTRIES:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
             if any(cell.strip() for cell in row):
                 cells = [' '.join(cell.replace(SEPARATOR, ' ').split()) for cell in row]
                 found.append((reader.line_num, cells))
@@ -242,7 +238,7 @@ def _header(
     wanted = {name for name in names if not name.startswith('#')}
     low = {name.lower() for name in known}
     best: tuple[int, set[str]] = (0, wanted)
-    for k, (_, cells) in enumerate(rows[:ABOVE]):
+    for k, (_, cells) in enumerate(rows[:HEAD]):
         missing = wanted - set(cells)
         if wanted and not missing:
             return k, tuple(cells)
@@ -269,7 +265,7 @@ def _first(
     notes: list[str],
 ) -> int:
     """Return which row is the first of numbers, after the header and lines of units."""
-    limit = ABOVE if at < 0 else at + 1 + UNDER
+    limit = HEAD if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]
         if not used or any(_is_number(cell, decimal) for cell in cells):
