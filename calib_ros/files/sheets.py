@@ -12,20 +12,20 @@ import io
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.csv_columns import TextColumns, regular
+from calib_ros.files.columns import Columns, MadeColumns
+from calib_ros.files.csv_columns import regular
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD = 100
 """Lines that the header and the first row of numbers are looked for in."""
-SEPARATOR = '\x1f'
-"""Between cells that are no regular text."""
 LARGEST_SHEET = 3 * LARGEST_TABLE
 """Bytes of a workbook unpacked."""
 SHEETS = ('.xlsx', '.xlsm')
@@ -41,7 +41,7 @@ class Sheet:
 
     header: tuple[str, ...]
     above: tuple[tuple[str, ...], ...]
-    columns: TextColumns
+    columns: Columns
     notes: tuple[str, ...]
 
     def number(self, name: str) -> str | None:
@@ -76,7 +76,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     notes: list[str] = []
     if path.suffix.lower() in SHEETS:
         rows = _workbook(path, layout.sheet)
-        text, separator = '', SEPARATOR
+        text, separator = '', ''
     else:
         text, coding = _text(path)
         if coding:
@@ -99,7 +99,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     if not header:
         header = ('',) * width
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
-    columns = None
+    columns: Columns | None = None
     start = rows[first][0]
     if text:
         body = text.split('\n', start - 1)[-1]
@@ -111,7 +111,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
             rows = _cells(path, text, separator)
             first = next(k for k, (line, _) in enumerate(rows) if line >= start)
     if columns is None:
-        columns = _ragged(path, rows[first:], max(width, len(header)), decimal)
+        columns = _ragged(path, rows[first:], decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
 
@@ -175,7 +175,7 @@ def _cell(value: object) -> str:
     if isinstance(value, bool):
         return str(int(value))
     text = repr(value) if isinstance(value, float) else str(value)
-    return ' '.join(text.replace(SEPARATOR, ' ').split())
+    return ' '.join(text.split())
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
@@ -219,8 +219,7 @@ def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
             if any(cell.strip() for cell in row):
-                cells = [' '.join(cell.replace(SEPARATOR, ' ').split()) for cell in row]
-                found.append((reader.line_num, cells))
+                found.append((reader.line_num, [' '.join(cell.split()) for cell in row]))
     except csv.Error as err:
         raise InputError(f'cannot read {path}: {err}') from err
     if not found:
@@ -284,17 +283,11 @@ def _is_number(cell: str, decimal: str) -> bool:
     return True
 
 
-def _ragged(
-    path: Path, rows: Sequence[tuple[int, Sequence[str]]], width: int, decimal: str
-) -> TextColumns:
+def _ragged(path: Path, rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> MadeColumns:
     """Return the columns of rows that may end early or have cells in quotes."""
-    width = max(width, max(len(cells) for _, cells in rows))
-    filled = [[*cells, *[''] * (width - len(cells))] for _, cells in rows]
-    if decimal == ',':
-        filled = [[cell.replace(',', '.') for cell in row] for row in filled]
-    names = [f'#{k + 1}' for k in range(width)]
-    text = '\n'.join(SEPARATOR.join(row) for row in filled)
-    found = regular(path, text, SEPARATOR, names)
-    if found is None:
-        raise InputError(f'cannot read {path}: it holds quotes or zeros within cells')
-    return replace(found, lines=np.array([line for line, _ in rows], dtype=np.intp))
+    cells = zip_longest(*(row for _, row in rows), fillvalue='')
+    words = {
+        f'#{k}': [cell.replace(',', '.') if decimal == ',' else cell for cell in column]
+        for k, column in enumerate(cells, start=1)
+    }
+    return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)

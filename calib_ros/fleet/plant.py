@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
+from calib_ros.files.loading import LARGEST_LOSS
 from calib_ros.files.rows import parse_serial, settings_hash
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
@@ -51,7 +52,7 @@ class Robot:
     measured: tuple[Measured, ...]
     settings: Settings = field(default_factory=Settings)
     tolerance: float | None = None
-    largest_loss: float = 0.1
+    largest_loss: float = LARGEST_LOSS
     since: datetime | None = None
 
     def compares(self, time: datetime) -> bool:
