@@ -8,8 +8,9 @@ with any number of digits. The stream of its events is looked at before anything
 
 from __future__ import annotations
 
+import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,13 @@ def csv_lines(text: str, where: str) -> io.StringIO:
             f'{where} has a line of {longest} characters, more than {most}: is it a table?'
         )
     return io.StringIO(text, newline='')
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Return rows as the text of a table."""
+    text = io.StringIO(newline='')
+    csv.writer(text, lineterminator='\n').writerows(rows)
+    return text.getvalue()
 
 
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:

@@ -18,6 +18,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.recording import STORAGES
 from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
@@ -124,9 +125,7 @@ def add_out(
 
 def add_storage(parser: Group) -> None:
     """Add the option that says how a bag is stored."""
-    parser.add_argument(
-        '--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of the bag'
-    )
+    parser.add_argument('--storage', choices=STORAGES, default='mcap', help='of the bag')
 
 
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:

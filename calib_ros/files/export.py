@@ -38,6 +38,7 @@ from calib_ros.kinematics.chain import Chain, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import csv_text
 
 EXACT = 1e-9
 """Largest difference [m, and in rotation matrices] of an export that is called exact."""
@@ -245,14 +246,11 @@ def urdf_foot(chain: Chain) -> str:
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
     """Return the table of a chain with a line that says what it is."""
-    text = io.StringIO()
-    text.write(head(chain, what, error, digest))
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(ROW)
-    for joint in chain.joints:
-        numbers = [repr(float(getattr(joint, kind))) for kind in DH_KINDS]
-        writer.writerow([to_cell(joint.name), joint.type, joint.sign, *numbers])
-    return text.getvalue()
+    rows = [
+        (to_cell(each.name), each.type, each.sign, *(getattr(each, kind) for kind in DH_KINDS))
+        for each in chain.joints
+    ]
+    return head(chain, what, error, digest) + csv_text([ROW, *rows])
 
 
 def _read_csv(text: str, form: Chain) -> Chain:

@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -35,6 +33,7 @@ from calib_ros.files.turns import finished
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import MOST_JOINTS
+from calib_ros.texts import csv_text
 
 MEASURED = (*POSITION, 'distance')
 UNITS = {
@@ -97,12 +96,8 @@ class Foreign:
 
 def as_csv(columns: MadeColumns) -> str:
     """Return the text of a table; numbers are exact."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
     names = sorted(columns.header, key=_place)
-    writer.writerow(names)
-    writer.writerows(zip(*(columns.texts(name) for name in names), strict=True))
-    return out.getvalue()
+    return csv_text([names, *zip(*map(columns.texts, names), strict=True)])
 
 
 def _place(name: str) -> tuple[int, int]:

@@ -21,7 +21,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.waypoints import joint_columns, joint_values
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, parse_yaml, read_text
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, parse_yaml, read_text
 from calib_ros.values import parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
@@ -73,9 +73,7 @@ def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
         for row, values in zip(rows, corrected.positions.tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value)
-        out = io.StringIO()
-        csv.writer(out, lineterminator='\n').writerows([header, *rows])
-        return out.getvalue()
+        return csv_text([header, *rows])
 
     places = tuple(f'line {line}' for line in found.lines)
     return ProgramFile(Program(tuple(joints), positions, approach=approach), places, text_with)

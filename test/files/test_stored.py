@@ -26,8 +26,13 @@ LOG_TIMES = {
 }
 
 
-@pytest.mark.parametrize('log_times', LOG_TIMES)
-@pytest.mark.parametrize(('storage', 'mode'), COMPRESSIONS)
+@pytest.mark.parametrize(
+    ('storage', 'mode', 'log_times'),
+    [
+        *((*each, 'in order') for each in COMPRESSIONS),
+        *(('mcap', mode, times) for mode in ('none', 'storage') for times in [*LOG_TIMES][1:]),
+    ],
+)
 def test_messages_are_those_of_the_library_in_its_order(tmp_path, storage, mode, log_times):
     path = record_in_chunks(tmp_path / 'bag', storage, mode, LOG_TIMES[log_times])
     with Reader(path) as reader:
