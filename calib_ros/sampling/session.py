@@ -315,7 +315,8 @@ class CalibrationSession:
         try:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
-            raise InputError(f'{err} ({self._came})') from err
+            few, _, advice = str(err).rpartition('; ')
+            raise InputError(f'{few} ({self._came}); {advice}') from err
         if result.accepted:
             owners = named(self.samples).owners
             self.adopt(Calibration.of(result, owners=owners, fitted=problem.sets), self.samples)
