@@ -141,7 +141,8 @@ def result_files(
         contents |= page_of(report, screen, pdf=pdf)
     earlier = out / 'calibration.yaml'
     if result.accepted:
-        contents['calibration.yaml'] = Calibration.of(result, owners=loaded.owners).dump()
+        kept = Calibration.of(result, owners=loaded.owners, fitted=loaded.problem.sets)
+        contents['calibration.yaml'] = kept.dump()
     elif earlier.exists():
         contents['calibration.previous.yaml'] = earlier.read_bytes()
     return contents
