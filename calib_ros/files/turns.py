@@ -97,7 +97,8 @@ def _rotations(
     angles = np.column_stack([values[name] for name in names])
     _require_whole(angles, made, ', '.join(names))
     if layout.rotation_vector:
-        return se3.exp_rotation(angles), np.linalg.inv(se3.left_jacobian_inverse(angles))
+        left = np.linalg.inv(se3.left_jacobian_inverse(angles))
+        return se3.exp_rotation(angles), np.asarray(left)
     if not layout.euler:
         raise ConfigError(
             f'{made.path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, '
