@@ -88,16 +88,7 @@ class Hearing:
 
 
 class Inputs:
-    """Subscriptions to streams of messages, emptied by hand.
-
-    Parameters
-    ----------
-    node : Node
-    streams : sequence of Stream
-    guarded : callable
-        Makes a function of one that logs what it raises.
-
-    """
+    """Subscriptions to streams of messages, emptied by hand."""
 
     def __init__(
         self,
