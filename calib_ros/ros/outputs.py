@@ -162,7 +162,8 @@ class Keeper:
         chain, record = found.calibration.chain, found.calibration.record
         nominal, links = self._session.chain, self._given.links
         forms = exports(chain, nominal, found.joints, record)
-        forms += vendor_files(chain, nominal, record, self._urdf, dict(links))
+        ends = {'base_link': links['base_link'], 'tip_link': links['tip_link']}
+        forms += vendor_files(chain, nominal, record, self._urdf, ends)
         files = {each.name: each.content for each in forms}
         if self._urdf:
             text = corrected_urdf(self._urdf, chain, **links)

@@ -95,16 +95,11 @@ class Alike:
     ends: tuple[bytes, bytes]
     rows: NDArray[np.uint8]
 
-    @property
-    def links(self) -> tuple[tuple[str, str], ...]:
-        """Return which frames their transforms link."""
-        return self.layout.links
-
     def of(self, k: int) -> Readings:
         """Return stamps (N,) and numbers (N, 7) of one transform of each."""
         numbers = _numbers(self.rows, self.layout.numbers[k], '<f8', 7).astype(np.float64)
         stamps = _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2))
-        return Readings(stamps, self.links[k], numbers)
+        return Readings(stamps, self.layout.links[k], numbers)
 
     def span(self, k: int) -> tuple[int, int]:
         """Return the first and the last stamp of one transform of each."""
