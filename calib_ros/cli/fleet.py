@@ -10,14 +10,11 @@ from pathlib import Path
 
 from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import INCOMPLETE, NOT_ACCEPTED
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
-
-INCOMPLETE = 4
-"""Exit status when measurements of some robots could not be used, and no robot needs a look."""
 
 
 def _add_fleet(parser: argparse.ArgumentParser) -> None:

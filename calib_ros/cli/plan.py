@@ -36,9 +36,6 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.maps import plan_report
 
-TASK_POSES = 300
-"""Random poses at which a plan is to be accurate when no task is given."""
-
 
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what is wanted')
@@ -138,8 +135,9 @@ def _measurement(
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
         design = design.after(read_joints(options.taken, design.chain))
-    task = design.chain.random_joints(TASK_POSES, rng)
-    if options.task is not None:
+    if options.task is None:
+        task = design.chain.random_joints(300, rng)
+    else:
         task = read_joints(options.task, design.chain)
     if options.candidates is None:
         candidates = draw_candidates(design, options.draw, rng, visibility)

@@ -12,9 +12,9 @@ import numpy as np
 from calib_ros.apply import placement, workspace
 from calib_ros.apply.placement import AIMS, task_of
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions
-from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import (
+    Contents,
     add_chain,
     add_identity,
     add_out,
@@ -70,13 +70,13 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
         if getattr(options, name) < lowest:
             raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
-    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as folder:
-        write_files(folder, _files(options, screen))
+    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
+        contents |= _files(options, screen)
     screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
     return 0
 
 
-def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes]:
+def _files(options: argparse.Namespace, screen: Screen) -> Contents:
     """Map, place, print what comes out, and return the files of it."""
     from calib_ros.report import plots
 
@@ -85,7 +85,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
     task = _task(options, arm, rng)
     with screen.work('mapping errors over the workspace'):
         survey = workspace.survey(arm, options.poses, rng)
-        contents: dict[str, str | bytes] = {
+        contents: Contents = {
             'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
             'workspace.png': plots.workspace_png(survey),
         }

@@ -98,8 +98,7 @@ class Archive:
                 self._journal = Journal(self._path, self._joints)
                 self._due = False
             while self._journal is not None and self._waiting:
-                sample, removed = self._waiting[0]
-                (self._journal.remove if removed else self._journal.add)(sample)
+                self._journal.add(*self._waiting[0])
                 del self._waiting[0]
         except OSError as err:
             self.error = str(err)

@@ -28,8 +28,6 @@ from calib_ros.files.rows import Row
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
-UNCACHED = 8
-"""Rows of a robot that are read one by one before its cache is written anew."""
 
 
 class History:
@@ -97,7 +95,7 @@ class History:
         held = known.column('key').to_pylist()
         new = sorted(keys.difference(held))
         table = pa.concat_tables([known, *(self._read(serial, key) for key in new)])
-        if len(new) >= UNCACHED:
+        if len(new) >= 8:  # fewer are read one by one every time
             self._cache(serial, table)
         rows = [row for row in _rows_of(table) if row.key in keys]
         return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))

@@ -87,21 +87,10 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
 def logged(
     chunk: bytes, channels: Mapping[int, Channel]
 ) -> tuple[list[tuple[int, Channel, bytes]], Exception | None]:
-    """Return the messages on some channels of a chunk, in the order of their log times.
+    """Return the messages on some channels, by number, of a chunk, in the order of log times.
 
-    Parameters
-    ----------
-    chunk : bytes
-        Its record, with kind and size.
-    channels : mapping
-        By their numbers.
-
-    Returns
-    -------
-    found : list
-        Log time, channel and data of each.
-    problem : Exception or None
-        What is wrong with a record, before which these messages stand.
+    The chunk is a record with kind and size. Log time, channel and data of each message are
+    returned, and what is wrong with a record before which these stand, if anything.
 
     Raises
     ------
@@ -126,19 +115,6 @@ def logged(
         problem.__cause__ = err
     found.sort(key=itemgetter(0))
     return found, problem
-
-
-def unindexed(
-    content: Content, channels: Mapping[int, Channel]
-) -> Iterator[tuple[Channel, bytes]]:
-    """Yield the messages on some channels of a file as they stand in it."""
-    for kind, record in records(content, len(MAGIC)):
-        if kind == DATA_END:
-            return
-        if kind == MESSAGE:
-            (key,) = struct.unpack_from('<H', record)
-            if key in channels:
-                yield channels[key], record[MESSAGE_HEAD:]
 
 
 def unpacked_size(chunk: bytes) -> int:

@@ -23,8 +23,6 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import mcap
 from calib_ros.texts import parse_yaml, read_text
 
-LARGEST_METADATA = 1_000_000
-"""Bytes of a metadata.yaml."""
 NOT_CLOSED = 'the recording was not closed'
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
@@ -42,7 +40,7 @@ Stream = TypeVar('Stream')
 def recorded(path: Path) -> int | None:
     """Return how many messages the recorder says it has written; None when it does not."""
     try:
-        text = read_text(path / 'metadata.yaml', LARGEST_METADATA)
+        text = read_text(path / 'metadata.yaml')
     except ConfigError:
         return None
     found = re.search(r'^  message_count: ([0-9]{1,15})\s*$', text, re.MULTILINE)
@@ -68,7 +66,7 @@ def unpacked_files(path: Path) -> Iterator[Path]:
         for file in packed:
             _unpack_file(file, folder / file.stem)
         with suppress(ConfigError):
-            text = read_text(path / 'metadata.yaml', LARGEST_METADATA)
+            text = read_text(path / 'metadata.yaml')
             text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
             (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
         yield folder
@@ -106,7 +104,7 @@ def check(path: Path) -> None:
     """
     metadata = path / 'metadata.yaml'
     if metadata.exists():
-        parse_yaml(read_text(metadata, LARGEST_METADATA), str(metadata))
+        parse_yaml(read_text(metadata), str(metadata))
     for file in _files(path):
         if file.suffix == '.db3':
             with closing(_open(file)) as connection:

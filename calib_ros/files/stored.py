@@ -6,19 +6,11 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
-from mmap import ACCESS_READ, mmap
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
-from calib_ros.files.mcap import (
-    LARGEST_CHUNK,
-    LARGEST_RATIO,
-    logged,
-    unindexed,
-    unpacked,
-    unpacked_size,
-)
+from calib_ros.files.mcap import LARGEST_CHUNK, LARGEST_RATIO, logged, unpacked, unpacked_size
+from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
 
@@ -82,11 +74,13 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
         if wanted:
             yield from ((channels[c.id], data) for c, _, data in storage.messages(wanted))
         return
+    if not storage.chunks:
+        whole = Salvage((storage.path,))
+        yield from whole.on({each.topic: streams[each.topic] for each in wanted})
+        if whole.problem:
+            raise ValueError(whole.problem)
+        return
     with storage.path.open('rb') as file:
-        if not storage.chunks:
-            with closing(mmap(file.fileno(), 0, access=ACCESS_READ)) as content:
-                yield from unindexed(content, channels)
-            return
         left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
         problem: Exception | None = None
         for overlapping in _together(storage.chunks, channels):

@@ -14,16 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.files.columns import check_quaternions
-from calib_ros.files.csv_columns import read_columns
+from calib_ros.files.columns import Columns, check_quaternions
+from calib_ros.files.csv_columns import read_columns, with_rows
 from calib_ros.files.layouts import POSITION, QUATERNION
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import limits
 from calib_ros.kinematics.se3 import FloatArray
 
-BEYOND = 1e-3
-"""How far [rad or m] an arm may stand beyond a limit."""
 POSE = (*POSITION, *QUATERNION)
 
 
@@ -33,25 +31,36 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     Raises
     ------
     InputError
-        For a missing column, one joint too many, no row, a value that is no number, and one that
-        is beyond the limits of its joint.
+        As `joint_values` does, and for a value beyond the limits of its joint by over 1e-3.
 
     """
-    columns = joint_columns(len(chain.joints))
-    found = read_columns(path, columns)
-    values, surplus = found.block(columns), f'q{len(columns) + 1}'
-    if surplus in found.header:
-        raise InputError(
-            f'{path} has a column {surplus}, but "{chain.name}" has {len(columns)} joints only'
-        )
+    found = read_columns(path, joint_columns(len(chain.joints)))
+    values = joint_values(found, len(chain.joints))
     lower, upper = limits(chain)
-    beyond = (values < lower - BEYOND) | (values > upper + BEYOND)
+    beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
     for k, i in np.argwhere(beyond).tolist():
         raise InputError(
-            f'{found.where(k, columns[i])} {values[k, i]:.6g} is beyond the limits of '
+            f'{found.where(k, f"q{i + 1}")} {values[k, i]:.6g} is beyond the limits of '
             f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
         )
     return values
+
+
+def joint_values(found: Columns, joints: int) -> FloatArray:
+    """Return the joint values (N, n) [rad or m] of an arm in columns q1 ... qn.
+
+    Raises
+    ------
+    InputError
+        For a missing column, one joint too many, no row, and a value that is no number.
+
+    """
+    names = joint_columns(joints)
+    if f'q{joints + 1}' in with_rows(found, names).header:
+        raise InputError(
+            f'{found.path} has a column q{joints + 1}, but the arm has {joints} joints only'
+        )
+    return found.block(names)
 
 
 def read_poses(path: Path) -> FloatArray:

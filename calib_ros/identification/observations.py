@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -311,9 +311,10 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
     standing = joints[np.concatenate([[True], _moved(joints)])]  # one row a stop
-    near = _near(standing)
-    links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
-    _, label = connected_components(links, directed=False)
+    near, label = _near(standing), np.arange(len(standing))
+    if len(near):
+        links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
+        _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
     return np.asarray(_repeats(standing[first])[label[stops(joints)]], dtype=np.intp)
 
@@ -339,13 +340,13 @@ def _repeats(joints: FloatArray) -> NDArray[np.intp]:
     apart = np.arange(count)
     if count < FEWEST:
         return apart
-    place = np.concatenate([np.cos(joints), np.sin(joints)], axis=1)
+    place = _on_circles(joints)
+    if not len(_pairs(place, SCATTER)):
+        return apart
     far, near = cKDTree(place).query(
         place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
     )
     first, which = np.nonzero(np.isfinite(far))
-    if not (far < SCATTER).any():
-        return apart
     graph = _graph(far[first, which], first, near[first, which], count)
     tree = minimum_spanning_tree(graph).tocoo()
     lengths = np.append(np.sort(tree.data), GAP * SCATTER)
@@ -370,24 +371,30 @@ def _graph(
 
 
 def _near(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn.
+    """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn."""
+    pairs = _pairs(_on_circles(joints), STILL * joints.shape[1] ** 0.5)
+    change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
+    return np.asarray(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
 
-    Sums of cosines move by n times as much at most, and know no turns: in the order of one, rows
-    are compared with those after them as long as these two may be near.
+
+def _on_circles(joints: FloatArray) -> FloatArray:
+    """Return (N, 2 n) joint values (N, n) where a full turn makes no difference."""
+    return np.concatenate([np.cos(joints), np.sin(joints)], axis=1)
+
+
+def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:
+    """Return (K, 2) the rows of (N, D) that are no further apart than a reach.
+
+    In a projection on three directions they are as near; trees of more dimensions are slow.
     """
-    phases = np.arange(joints.shape[1])
-    along, across = np.cos(joints + phases).sum(axis=1), np.sin(joints + phases).sum(axis=1)
-    order = np.argsort(along)
-    along, across = along[order], across[order]
-    reach = joints.shape[1] * STILL
-    found = []
-    first, step = np.arange(len(joints)), 0
-    while len(first):
-        step += 1
-        first = first[: np.searchsorted(first, len(joints) - step)]
-        first = first[along[first + step] - along[first] <= reach]
-        close = first[np.abs(across[first + step] - across[first]) <= reach]
-        pairs = np.column_stack([order[close], order[close + step]])
-        change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
-        found.append(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
-    return np.concatenate(found)
+    along = place @ _directions(place.shape[1])
+    tree = cKDTree(along, balanced_tree=False, compact_nodes=False)
+    pairs = tree.query_pairs(reach, output_type='ndarray')
+    close = np.linalg.norm(place[pairs[:, 0]] - place[pairs[:, 1]], axis=1) <= reach
+    return np.asarray(pairs[close])
+
+
+@lru_cache
+def _directions(size: int) -> FloatArray:
+    """Return (D, 3 at most) orthonormal directions, seeded."""
+    return np.linalg.qr(np.random.default_rng(0).normal(size=(size, min(size, 3))))[0]

@@ -4,13 +4,12 @@
 
 import csv
 import json
-import os
 import re
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import DATA, needs_data
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -25,8 +24,7 @@ from calib_ros.sampling.pictures import Refusal
 cv2 = pytest.importorskip('cv2')
 from photographs import CHARUCO, rendered
 
-DATA = os.environ.get('CALIB_ROS_DATA')
-REAL = Path(DATA or '.') / 'charuco_wrist_camera_fixed'
+REAL = DATA / 'charuco_wrist_camera_fixed'
 MARKERS = boards.Board('markers', 4, 5, 0.04, 0.03, 'DICT_APRILTAG_36h11')
 LENS = Lens(1300.0, 1300.0, 640.0, 480.0)
 
@@ -165,8 +163,6 @@ REAL_BOARD = BOARD.replace('0.036', '0.036195').replace('0.026', '0.018256')
 @pytest.fixture(scope='module')
 def photographs(tmp_path_factory):
     """Return a folder with board, intrinsics and the corners of the real photographs."""
-    if not DATA:
-        pytest.skip('CALIB_ROS_DATA is not set')
     folder = tmp_path_factory.mktemp('charuco')
     (folder / 'board.yaml').write_text(REAL_BOARD.replace('D\n', 'DICT_6X6_250\n'))
     (folder / 'camera.yaml').write_text(INTRINSICS)
@@ -178,6 +174,7 @@ def corners_to(folder, name):
     return ['--board', str(folder / 'board.yaml'), '--out', str(folder / name)]
 
 
+@needs_data
 @pytest.mark.parametrize(('lens', 'least', 'limit'), [('given', 2.4, 2.66), ('fitted', 0.5, 1.10)])
 def test_the_real_photographs(photographs, capsys, lens, least, limit):
     words = ['identify', '--chain', 'flange_pose', '--json', '--lens', lens]
@@ -196,6 +193,7 @@ def test_the_real_photographs(photographs, capsys, lens, least, limit):
     )
 
 
+@needs_data
 def test_a_bag_of_the_real_photographs(photographs, capsys):
     store = get_typestore(Stores.ROS2_JAZZY)
     types = store.types

@@ -92,7 +92,7 @@ def test_another_robot_and_the_other_convention_are_named():
     assert 'convention: standard' in str(explained(Problem(other, seen)))
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_where_nothing_is_wrong_nothing_is_said(seed):
     rng = np.random.default_rng(seed)
     seen = seen_of(seed=seed, oriented=bool(seed % 2))

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measured robots; the data lie outside the repository, where CALIB_ROS_DATA says."""
+"""Measured robots give the figures that others have found."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import DATA, needs_data
 
 from calib_ros.cli.main import main
 from calib_ros.files.bags import replay
@@ -16,12 +15,7 @@ from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.sampling.session import CalibrationSession
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[3] / 'shared' / 'data'))
-
-pytestmark = pytest.mark.skipif(
-    not DATA.is_dir() and 'CI' not in os.environ,
-    reason=f'no measured robots at {DATA}; set CALIB_ROS_DATA',
-)
+pytestmark = needs_data
 
 # Held-out RMS [mm] of an independent least squares with the same model, nominal and calibrated,
 # and its number of parameters.
