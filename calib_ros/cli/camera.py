@@ -17,7 +17,8 @@ from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.images import SUFFIXES, Image, detect, files_of, image_of, marker_cells
+from calib_ros.files.detector import detect, marker_cells
+from calib_ros.files.images import SUFFIXES, Image, files_of, image_of
 from calib_ros.kinematics.chain_file import dump_yaml
 
 
