@@ -68,7 +68,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     if result.accepted:
         for note in words.notes(result):
             screen.bullet(note)
-    elif not result.noise.consistent:
+    elif result.noise.position > 1.0 and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
     for line in words.cameras_in_words(result):
         screen.bullet(line)
