@@ -63,8 +63,8 @@ def survey(arm: Calibration, count: int, rng: np.random.Generator) -> Survey:
     """Survey the errors at random configurations within the joint limits."""
     joints = arm.chain.random_joints(count, rng)
     removed, turned = arm.removed(joints)
-    positions = in_base(arm.chain, joints)[:, :3, 3]
-    return Survey(joints, positions, removed, turned, arm.sigma(joints), arm.remaining(joints))
+    positions, sigma = in_base(arm.chain, joints)[:, :3, 3], arm.sigma(joints)
+    return Survey(joints, positions, removed, turned, sigma, np.hypot(sigma, arm.residual or 0.0))
 
 
 def in_base(chain: Chain, joints: FloatArray) -> FloatArray:
