@@ -85,13 +85,9 @@ class Spread:
     @classmethod
     def of(cls, errors: FloatArray) -> Spread:
         """Return the figures of errors (N,)."""
-        return cls(
-            float(np.sqrt(np.mean(errors**2))),
-            float(errors.mean()),
-            float(np.median(errors)),
-            float(np.quantile(errors, 0.95)),
-            float(errors.max()),
-        )
+        median, high = np.quantile(errors, [0.5, 0.95])
+        found = (np.sqrt(np.mean(errors**2)), errors.mean(), median, high, errors.max())
+        return cls(*map(float, found))
 
 
 @dataclass(frozen=True)
