@@ -372,32 +372,29 @@ def test_a_program_is_not_compensated_in_place(run, tmp_path):
     assert (tmp_path / 'program.csv').read_text() == TABLE
 
 
+ZEROS = np.zeros((2, 6))
 WRONG = [
     ('.txt', 'x', 'must be a table'),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n', 'has no rows'),
-    ('.csv', 'q1,q2,q3,q4,q5\n1,2,3,4,5\n', 'must have one column q6, not 0'),
-    ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'must have one column q1, not 2'),
-    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', 'line 2: 5 values for 6 columns'),
-    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a finite number, not 'x'"),
-    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,nan\n', 'q6 must be a finite number'),
+    ('.csv', 'q1,q2,q3,q4,q5\n1,2,3,4,5\n', 'has no column q6'),
+    ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'several columns q1'),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a number, not ''"),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a number, not 'x'"),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,nan\n', 'q6 must be a number'),
     ('.yaml', '[', 'is not valid YAML'),
-    ('.yaml', 2 * trajectory(np.zeros((2, 6))), 'must hold one YAML document, not 2'),
+    ('.yaml', 2 * trajectory(ZEROS), 'must hold one YAML document, not 2'),
     ('.yaml', 'a: 1', 'must be a trajectory_msgs/JointTrajectory'),
     ('.yaml', "joint_names: [a]\npoints: ['...']", 'point 1 .*--full-length'),
     ('.yaml', 'joint_names: [a]\npoints: [{positions: []}]', 'has no positions'),
     ('.yaml', trajectory(np.zeros((2, 5))), 'positions must be a list of 6 numbers'),
-    ('.yaml', trajectory(np.zeros((2, 6)), 'abcdef'), 'unknown joint in the program'),
-    ('.yaml', trajectory(np.zeros((2, 6)), velocities=[True] * 6), 'finite number, not True'),
+    ('.yaml', trajectory(ZEROS, 'abcdef'), 'unknown joint in the program'),
+    ('.yaml', trajectory(ZEROS, velocities=[True] * 6), 'finite number, not True'),
     (
         '.yaml',
-        trajectory(np.zeros((2, 6))).replace('velocities: []', 'velocities: [0,0,0,0,0,0]', 1),
+        trajectory(ZEROS).replace('velocities: []', 'velocities: [0,0,0,0,0,0]', 1),
         'point 2: velocities must be a list of 6 numbers',
     ),
-    (
-        '.yaml',
-        trajectory(np.zeros((2, 6)), accelerations=[0.0] * 6),
-        'needs velocities as well',
-    ),
+    ('.yaml', trajectory(ZEROS, accelerations=[0.0] * 6), 'needs velocities as well'),
 ]
 
 
