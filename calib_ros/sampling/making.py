@@ -64,7 +64,8 @@ class Maker:
         rotations = np.tile(np.eye(3), (len(values), 1, 1))
         rotations[oriented] = se3.from_quat(values[oriented, QUAT])
         for k, stamp_ns in enumerate(stamps.tolist()):
-            sample = self._made(
+            yield from self._made(
+                int(numbers[k]),
                 key,
                 stamp_ns,
                 values[k : k + 1],
@@ -76,8 +77,6 @@ class Maker:
                 acceleration=motion.acceleration[k].copy(),
                 delay=1e-9 * delay_ns,
             )
-            if sample is not None:
-                yield int(numbers[k]), sample
 
     def of_stops(self, found: Matched, sigma: float) -> Iterator[Numbered]:
         """Yield a sample of the measurements of each stop, unless these spread too much.
@@ -116,7 +115,8 @@ class Maker:
                 continue
             if left_out:
                 self.dropped[VIBRATING] += left_out
-            sample = self._made(
+            yield from self._made(
+                number,
                 key,
                 int(times[k]),
                 values[begin : begin + count][used],
@@ -127,8 +127,6 @@ class Maker:
                 delay=1e-9 * delay_ns,
                 spread=float(means.spreads[k]),
             )
-            if sample is not None:
-                yield number, sample
 
     def _of_images(
         self, found: Matched, begins: NDArray[np.intp], joints: FloatArray
@@ -138,7 +136,8 @@ class Maker:
         ends = np.append(begins[1:], len(values))
         for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
             middle = (begin + end) // 2
-            sample = self._made(
+            yield from self._made(
+                int(numbers[begin]),
                 key,
                 int(stamps[middle]),
                 values[middle : middle + 1],
@@ -148,8 +147,6 @@ class Maker:
                 delay=1e-9 * delay_ns,
                 images=tuple(values[begin:end, 0].astype(int).tolist()),
             )
-            if sample is not None:
-                yield int(numbers[begin]), sample
 
     def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
         """Make a sample of a ball that sits in a socket, at stamps (N,) while the arm stands."""
@@ -165,21 +162,27 @@ class Maker:
         self.fresh.append(sample)
 
     def _made(
-        self, key: StreamKey, stamp_ns: int, rows: FloatArray, position: FloatArray, **more: Any
-    ) -> Sample | None:
-        """Return a sample of measurements (N, WIDTH), unless there is one or no room."""
+        self,
+        number: int,
+        key: StreamKey,
+        stamp_ns: int,
+        rows: FloatArray,
+        position: FloatArray,
+        **more: Any,
+    ) -> Iterator[Numbered]:
+        """Yield a sample of measurements (N, WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
             self.dropped['poses: a sample with this stamp is there already'] += len(rows)
-            return None
+            return
         if len(known) >= self._capacity:
             self.dropped['poses: the memory for samples is full'] += len(rows)
-            return None
+            return
         known.add(stamp_ns)
         covariance = None
         if not np.isnan(rows[:, COVARIANCE]).any():
             covariance = rows[:, COVARIANCE].mean(axis=0).reshape(6, 6)
-        return Sample(
+        sample = Sample(
             stamp_ns=stamp_ns,
             position=None if key.distance else position,
             distance=float(position[0]) if key.distance else None,
@@ -192,6 +195,7 @@ class Maker:
             count=len(rows),
             **more,
         )
+        yield number, sample
 
     def add(self, found: list[Numbered]) -> None:
         """Keep samples for who takes them, in the order of their rounds or stops."""

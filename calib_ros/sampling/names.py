@@ -18,7 +18,7 @@ Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
 
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
-FEW = 0.1
+MOST_STRAY = 0.1
 """Share of measurements in other frames up to which they are stray ones; more is a mistake."""
 
 
@@ -113,7 +113,7 @@ class FrameNames:
         A few measurements in others do not count.
         """
         for known in self._known.values():
-            if known.total() - max(known.values()) > FEW * known.total():
+            if known.total() - max(known.values()) > MOST_STRAY * known.total():
                 return tuple(sorted(known))
         return ()
 
