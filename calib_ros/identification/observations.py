@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -287,18 +287,28 @@ class Observations(Shown):
         """Return (N,) the number of the standing configuration that each pair belongs to."""
         return configurations(self.joints)
 
+    @cached_property
+    def stops(self) -> NDArray[np.intp]:
+        """Return (N,) the number of the stop, in sequence, at which each pair was taken."""
+        return stops(self.joints)
+
+
+def distinct(numbers: NDArray[np.intp]) -> int:
+    """Return how many different numbers (N,) of configurations there are."""
+    return int(np.count_nonzero(np.bincount(numbers)))
+
 
 def stops(joints: FloatArray) -> NDArray[np.intp]:
     """Return (N,) the number of the stop at which joint values (N, n) in sequence were taken."""
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    return np.concatenate([[0], np.cumsum(_moved(joints))]).astype(np.intp)
+    return np.append(0, np.cumsum(~_still(np.diff(joints, axis=0)))).astype(np.intp)
 
 
-def _moved(joints: FloatArray) -> NDArray[np.bool_]:
-    """Return (N - 1,) whether the arm moved from one row to the next; angles modulo a turn."""
-    change = np.abs(np.diff(joints, axis=0)) % TURN
-    return np.asarray(np.minimum(change, TURN - change).max(axis=1) > STILL)
+def _still(change: FloatArray) -> NDArray[np.bool_]:
+    """Return (N,) which changes (N, n) of joint values are none; angles modulo a turn."""
+    change = np.abs(change) % TURN
+    return np.asarray(np.minimum(change, TURN - change).max(axis=1) <= STILL)
 
 
 def configurations(joints: FloatArray) -> NDArray[np.intp]:
@@ -310,12 +320,15 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     """
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    standing = joints[np.concatenate([[True], _moved(joints)])]  # one row a stop
-    near = _near(standing)
-    links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
-    _, label = connected_components(links, directed=False)
+    number = stops(joints)
+    standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
+    place = np.concatenate([np.cos(standing), np.sin(standing)], axis=1)  # which knows no turns
+    near, label = _near(standing, place), np.arange(len(standing))
+    if len(near):
+        links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
+        _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
-    return np.asarray(_repeats(standing[first])[label[stops(joints)]], dtype=np.intp)
+    return np.asarray(_repeats(place[first])[label[number]], dtype=np.intp)
 
 
 def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
@@ -329,23 +342,20 @@ def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
     return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
 
 
-def _repeats(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (N,) which joint values (N, n) are visits of one configuration that scatter.
+def _repeats(place: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) which places (N, 2 n) are visits of one configuration that scatter.
 
     Where the distances of nearest values leave a gap, from so much to GAP times as much, those
     below it are visits, as long as each configuration is as small as they are.
     """
-    count = len(joints)
+    count = len(place)
     apart = np.arange(count)
-    if count < FEWEST:
+    if count < FEWEST or not len(_pairs(place, SCATTER)):
         return apart
-    place = np.concatenate([np.cos(joints), np.sin(joints)], axis=1)
     far, near = cKDTree(place).query(
         place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
     )
     first, which = np.nonzero(np.isfinite(far))
-    if not (far < SCATTER).any():
-        return apart
     graph = _graph(far[first, which], first, near[first, which], count)
     tree = minimum_spanning_tree(graph).tocoo()
     lengths = np.append(np.sort(tree.data), GAP * SCATTER)
@@ -369,25 +379,25 @@ def _graph(
     return coo_array((lengths, ends), shape=(count, count))
 
 
-def _near(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn.
+def _near(joints: FloatArray, place: FloatArray) -> NDArray[np.intp]:
+    """Return (K, 2) the rows of (N, n), at places (N, 2 n), within STILL of each other."""
+    pairs = _pairs(place, STILL * joints.shape[1] ** 0.5)
+    return np.asarray(pairs[_still(joints[pairs[:, 0]] - joints[pairs[:, 1]])])
 
-    Sums of cosines move by n times as much at most, and know no turns: in the order of one, rows
-    are compared with those after them as long as these two may be near.
+
+def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:
+    """Return (K, 2) the rows of (N, D) that are no further apart than a reach.
+
+    In a projection on three directions they are as near; trees of more dimensions are slow.
     """
-    phases = np.arange(joints.shape[1])
-    along, across = np.cos(joints + phases).sum(axis=1), np.sin(joints + phases).sum(axis=1)
-    order = np.argsort(along)
-    along, across = along[order], across[order]
-    reach = joints.shape[1] * STILL
-    found = []
-    first, step = np.arange(len(joints)), 0
-    while len(first):
-        step += 1
-        first = first[: np.searchsorted(first, len(joints) - step)]
-        first = first[along[first + step] - along[first] <= reach]
-        close = first[np.abs(across[first + step] - across[first]) <= reach]
-        pairs = np.column_stack([order[close], order[close + step]])
-        change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
-        found.append(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
-    return np.concatenate(found)
+    along = place @ _directions(place.shape[1])
+    tree = cKDTree(along, balanced_tree=False, compact_nodes=False)
+    pairs = tree.query_pairs(reach, output_type='ndarray')
+    close = np.linalg.norm(place[pairs[:, 0]] - place[pairs[:, 1]], axis=1) <= reach
+    return np.asarray(pairs[close])
+
+
+@lru_cache
+def _directions(size: int) -> FloatArray:
+    """Return (D, 3 at most) orthonormal directions, seeded."""
+    return np.linalg.qr(np.random.default_rng(0).normal(size=(size, min(size, 3))))[0]

@@ -14,6 +14,7 @@ import numpy as np
 import calib_ros
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import FALSE, reason_in_words
+from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.region import Region
@@ -140,11 +141,16 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
 
 
 def verdict(
-    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures
+    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures, reused: float = 0.0
 ) -> tuple[bool, str]:
-    """Return whether a calibration still holds on new samples, and why in words."""
+    """Return whether a calibration still holds on new samples, and why in words.
+
+    A share of them may be `reused`: fitted before, as of a bag that is played again.
+    """
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} samples taken since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    if warning := reused_in_words(reused):
+        text += f'; {warning}'
     if calibration.residual is None:
         return True, text
     if not calibration.holds(1e-3 * now.rms_mm):

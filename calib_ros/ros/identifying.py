@@ -114,7 +114,8 @@ class Identifying:
             )
         )
         if result.accepted:
-            found = Calibration.of(result, given.origin, named(given.samples).owners)
+            owners, sets = named(given.samples).owners, given.problem.sets
+            found = Calibration.of(result, given.origin, owners, sets)
             page = partial(_page, given, result)
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples

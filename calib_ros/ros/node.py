@@ -301,7 +301,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         figures = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # else there was nothing to judge
-        holds, text = words.verdict(calibration, *figures)
+        holds, text = words.verdict(calibration, *figures, self.session.reused())
         return holds, text + self._filer.validated(self.session, figures, holds)
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:

@@ -289,7 +289,7 @@ class CalibrationSession:
             raise InputError(f'{few} ({self._came}); {advice}') from err
         if result.accepted:
             owners = named(self.samples).owners
-            self.adopt(Calibration.of(result, owners=owners), self.samples)
+            self.adopt(Calibration.of(result, owners=owners, fitted=problem.sets), self.samples)
         return result
 
     def adopt(self, calibration: Calibration, samples: Sequence[Sample] | None = None) -> None:
@@ -309,6 +309,11 @@ class CalibrationSession:
         calibration, sets = self._since()
         nominal, now = compare(calibration.before, calibration.chain, sets).figures
         return now, nominal
+
+    def reused(self) -> float:
+        """Return the share of the samples since that the calibration was fitted to."""
+        calibration, sets = self._since()
+        return calibration.reused(sets)
 
     def recent(self) -> tuple[Calibration, Problem]:
         """Return the calibration in use, and the last stops since then as a problem."""

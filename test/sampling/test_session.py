@@ -25,6 +25,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.words import verdict
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
@@ -364,6 +365,16 @@ def test_later_samples_are_judged_in_the_frames_of_their_targets(first):
     assert now.count > 5
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
     assert made.calibration.chain is result.chain
+
+
+def test_samples_that_were_fitted_are_known_again():
+    """As where a recording is played once more to a node that loaded what came of it."""
+    made = session(samples())
+    made.identify()
+    made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
+    assert made.reused() == 1.0
+    words = verdict(made.calibration, *made.validate(), made.reused())[1]
+    assert 'these are the measurements that the calibration was fitted to' in words
 
 
 def test_a_bumped_robot_is_noticed():
