@@ -19,6 +19,7 @@ from scipy import special
 
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.acceptance import Findings, refusals, remarks
+from calib_ros.identification.confidence import KNOWN
 from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior, considered
 from calib_ros.identification.fitting import (
@@ -33,7 +34,7 @@ from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
-from calib_ros.identification.region import KNOWN, Region, region_of
+from calib_ros.identification.region import Region, region_of
 from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import Step, find_step

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.identification import identifiability
+from calib_ros.identification.confidence import SURE
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.shared_errors import shared_errors
@@ -19,8 +20,6 @@ from calib_ros.kinematics.se3 import FloatArray
 
 SHARED = 1.2
 """Ratio from which the errors of one configuration's pairs are taken to be correlated."""
-SIGMA_TEST = 0.999
-"""Confidence at which the chi-squared test of the sigmas given lets them pass."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def noise_of(
     freedom = counts - taken
     known = freedom > 1e-9
     variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
-    beyond = 0.5 * (1.0 - SIGMA_TEST)
+    beyond = 0.5 * (1.0 - SURE)
     low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
     neighbours = shared_errors(fit, names, system)

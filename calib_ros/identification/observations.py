@@ -36,7 +36,6 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     'points': (3,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
-TURN = 2.0 * np.pi
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
 SCATTER = 0.02
@@ -46,9 +45,8 @@ GAP = 5.0
 WIDEST = 2.0
 """Size of a configuration's visits in units of the longest step between them."""
 FEWEST = 8
-"""Configurations from which on their distances tell what a visit is, or who is near."""
-NEIGHBOURS = 8
-"""Nearest values among which visits are looked for."""
+"""Configurations from which on their distances tell what a visit is, or who is near; so many
+nearest ones are looked at."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -297,8 +295,13 @@ def stops(joints: FloatArray) -> NDArray[np.intp]:
 
 def _moved(joints: FloatArray) -> NDArray[np.bool_]:
     """Return (N - 1,) whether the arm moved from one row to the next; angles modulo a turn."""
-    change = np.abs(np.diff(joints, axis=0)) % TURN
-    return np.asarray(np.minimum(change, TURN - change).max(axis=1) > STILL)
+    return _far(np.diff(joints, axis=0))
+
+
+def _far(change: FloatArray) -> NDArray[np.bool_]:
+    """Return (N,) whether changes (N, n) are more than standing still; angles modulo a turn."""
+    change = np.abs(change) % (2.0 * np.pi)
+    return np.asarray(np.minimum(change, 2.0 * np.pi - change).max(axis=1) > STILL)
 
 
 def configurations(joints: FloatArray) -> NDArray[np.intp]:
@@ -344,7 +347,7 @@ def _repeats(joints: FloatArray) -> NDArray[np.intp]:
     if not len(_pairs(place, SCATTER)):
         return apart
     far, near = cKDTree(place).query(
-        place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
+        place, k=range(2, 2 + min(FEWEST, count - 1)), distance_upper_bound=GAP * SCATTER
     )
     first, which = np.nonzero(np.isfinite(far))
     graph = _graph(far[first, which], first, near[first, which], count)
@@ -373,8 +376,7 @@ def _graph(
 def _near(joints: FloatArray) -> NDArray[np.intp]:
     """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn."""
     pairs = _pairs(_on_circles(joints), STILL * joints.shape[1] ** 0.5)
-    change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
-    return np.asarray(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
+    return np.asarray(pairs[~_far(joints[pairs[:, 0]] - joints[pairs[:, 1]])])
 
 
 def _on_circles(joints: FloatArray) -> FloatArray:

@@ -36,6 +36,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.samples import Samples
+from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
@@ -58,8 +59,6 @@ POSES = 24
 """Poses, spread evenly over those measured, that tell enough: of gravity, of all else."""
 ANOTHER = (2e-3, 5e-3)
 """Least offset [m, rad] of an arm that may be another one than the nominal."""
-EXPLAINED = 0.5
-"""Share of the residual squares that couplings explain, or that gravity must explain more."""
 
 
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:

@@ -33,9 +33,8 @@ BEST = 10
 MOST_STEPS = 30
 RELINEARISATIONS = 5
 SUBSET = 300
-"""Samples that are searched, evenly spread over all; the fit that follows takes all."""
-LEAST = 30
-"""Samples of a set that are searched, however many sets there are."""
+"""Samples that are searched, evenly spread over all, of each set a tenth at least; the fit that
+follows takes all."""
 DRAWN = 0.5
 """Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
 RIDGE = 1e-9
@@ -86,7 +85,7 @@ def trimmed_sum(chain: Chain, system: System) -> float:
 
 def _thinned(system: System) -> System:
     """Return a part of the samples."""
-    most = max(SUBSET // len(system.sets), LEAST)
+    most = max(SUBSET // len(system.sets), SUBSET // 10)
     return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
 
 
