@@ -31,7 +31,8 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.identification.confidence import CONFIDENT, chance_of
-from calib_ros.identification.records import POSES
+from calib_ros.identification.evidence import SPREAD
+from calib_ros.identification.observations import POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -44,8 +45,6 @@ FALSE = 0.005
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
 way costs half a unit of the evidence's logarithm."""
-WIDE = 10.0
-"""Sizes of a change that leave its estimate to the data."""
 MOST = 3
 """Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
@@ -252,7 +251,7 @@ class Columns:
         """Return the covariance (P, P) of changes whose sizes are left to the data."""
         parts = []
         for reason in reasons:
-            sizes = [WIDE * SIZES.get(name.unit, 1.0) for name in reason.names]
+            sizes = [SPREAD * SIZES.get(name.unit, 1.0) for name in reason.names]
             parts.append(self.of(reason.names) * np.array(sizes))
         square = np.hstack(parts)
         return np.asarray(square @ square.T)

@@ -41,8 +41,7 @@ from calib_ros.identification.confidence import CONFIDENT, chance_of
 from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.records import POSES
+from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER

@@ -111,9 +111,8 @@ class Shifts:
                 whole = np.linalg.norm(series, axis=(1, 2))
                 slow = slow_cosines(len(begins))
                 series -= series @ slow.T @ slow
-                series *= (np.linalg.norm(series, axis=(1, 2)) > RANK_TOLERANCE * whole)[
-                    :, None, None
-                ]
+                rounding = np.linalg.norm(series, axis=(1, 2)) <= RANK_TOLERANCE * whole
+                series[rounding] = 0.0
                 products[-1] += self._sampled(_correlated(series, circle))
                 parts.append(series.reshape(len(series), -1))
             rows.append(np.concatenate(parts, axis=1))

@@ -37,7 +37,7 @@ import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from calib_ros.identification.leastsquares import Normal, System, normal_equations
+from calib_ros.identification.leastsquares import ROUNDS, Normal, System, normal_equations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -63,7 +63,6 @@ MOST = 2000
 """Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
-ROUNDS = 60
 LEAST = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 

@@ -14,12 +14,10 @@ from calib_ros.identification import identifiability
 from calib_ros.identification.confidence import SURE
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.leastsquares import Fit, System
+from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.shared_errors import shared_errors
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-
-SHARED = 1.2
-"""Ratio from which the errors of one configuration's pairs are taken to be correlated."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ def noise_of(
         neighbours.found,
     )
     together = joint_sums / np.maximum(sums, 1e-300)
-    sizes = np.where(together > SHARED, together, 1.0) * (1.0 if consistent else variances)
+    sizes = np.where(together > SUSPICIOUS, together, 1.0) * (1.0 if consistent else variances)
     middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
     extra, _ = system.extra_rows(fit.chain, names)
     if system.prior is not None:

@@ -48,6 +48,9 @@ FEWEST = 8
 """Configurations from which on their distances tell what a visit is, or who is near; so many
 nearest ones are looked at."""
 
+POSES = 200
+"""Poses that stand for many: random ones for the joint range, even ones for those measured."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Observations(Shown):
@@ -194,7 +197,7 @@ class Observations(Shown):
             )
         return chosen
 
-    def spread(self, most: int) -> Observations:
+    def spread(self, most: int = POSES) -> Observations:
         """Return every so many pairs, at most so many."""
         return self.select(np.arange(0, len(self), 1 + len(self) // most))
 

@@ -15,7 +15,7 @@ from calib_ros.errors import ConfigError
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
@@ -26,8 +26,6 @@ from calib_ros.values import parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, whether a camera on the flange measured, whether it is a socket; device or target."""
-POSES = 200
-"""Random poses that stand for the joint range."""
 
 
 def packed(square: FloatArray) -> list[str]:

@@ -29,8 +29,8 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.confidence import KNOWN
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.records import POSES, packed, unpacked
+from calib_ros.identification.observations import POSES, Observations
+from calib_ros.identification.records import packed, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
