@@ -39,7 +39,7 @@ from calib_ros.identification.changes import (
     likely,
     reason_in_words,
 )
-from calib_ros.identification.confidence import KNOWN
+from calib_ros.identification.levels import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from calib_ros.identification.confidence import CERTAIN, CONFIDENT
+from calib_ros.identification.levels import CERTAIN, CONFIDENT
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region

@@ -30,8 +30,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
-from calib_ros.identification.confidence import CONFIDENT, chance_of
 from calib_ros.identification.evidence import SPREAD
+from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER

@@ -37,10 +37,10 @@ from calib_ros.identification.changes import (
     reasons_document,
     reasons_of,
 )
-from calib_ros.identification.confidence import CONFIDENT, chance_of
 from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
+from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain

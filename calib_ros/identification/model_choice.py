@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from calib_ros.identification.confidence import CERTAIN, SURE
 from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
+from calib_ros.identification.levels import CERTAIN, SURE
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import log_gain

@@ -11,9 +11,9 @@ import numpy as np
 from scipy import special
 
 from calib_ros.identification import identifiability
-from calib_ros.identification.confidence import SURE
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.leastsquares import Fit, System
+from calib_ros.identification.levels import SURE
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.shared_errors import shared_errors
 from calib_ros.kinematics.chain import Chain

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.identification.confidence import KNOWN
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
+from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.records import packed, unpacked
 from calib_ros.identification.samples import BLOCK

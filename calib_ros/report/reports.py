@@ -10,8 +10,8 @@ import numpy as np
 
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.confidence import CONFIDENT
 from calib_ros.identification.identification import Identification
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import table_hash
