@@ -7,9 +7,9 @@ their rows are
 
     [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
 
-and a triangular factor of [G | L | residual] has the same normal matrix as the rows themselves: 16
-rows an image at most, however many points it shows. Gross errors are told point by point, and
-image by image, by the sum over its points.
+and a factor of the products of [G | L | residual] has the same normal matrix as the rows
+themselves: 16 rows an image at most, however many points it shows. Gross errors are told point by
+point, and image by image, by the sum over its points.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.resection import products_of
 from calib_ros.identification.samples import BLOCK, Block, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import View, at_the_board, require_lens, view
+from calib_ros.kinematics.lens import View, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -81,20 +82,14 @@ class PixelSamples(Samples):
     def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
         """Yield rows (P + 1, R, images) with the normal matrix of all points, by blocks."""
         for block in self._linearised(chain, names):
-            size, _, points = block.columns.shape
-            images = block.twist.shape[2]
-            first = np.flatnonzero(np.diff(block.owner, prepend=-1))
-            number = np.arange(points) - first[block.owner]
-            stacked = np.zeros((images, int(number.max()) + 1, 2, size))
-            stacked[block.owner, number] = block.columns.transpose(2, 1, 0)
-            factor = np.asarray(np.linalg.qr(stacked.reshape(images, -1, size), mode='r'))
-            rows = np.empty((len(block.twist) + 1, factor.shape[1], images))
-            arm = factor[:, :, :6] @ block.twist.transpose(2, 1, 0)
-            rows[:-1] = arm.transpose(2, 1, 0)
+            begins = np.flatnonzero(np.diff(block.owner, prepend=-1))
+            factor = _factor(products_of(block.columns, begins))
+            rows = np.empty((len(names) + 1, factor.shape[1], len(begins)))
+            rows[:-1] = (factor[:, :, :6] @ block.twist.transpose(2, 1, 0)).transpose(2, 1, 0)
             for k, row in enumerate(block.lens):
                 rows[row] = factor[:, :, 6 + k].T
             rows[-1] = factor[:, :, -1].T
-            yield block.part.start + first, rows, np.zeros((0, 0, 0)), block.model
+            yield block.part.start + begins, rows, np.zeros((0, 0, 0)), block.model
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the rows (P + 1, 2, C) of all points, a block at a time."""
@@ -109,7 +104,7 @@ class PixelSamples(Samples):
             for k in range(2):
                 unit = np.zeros((2, len(block.owner)))
                 unit[k] = self.sigmas[0]
-                shifts[block.part, k] = at_the_board(block.seen, unit)
+                shifts[block.part, k] = block.seen.at_the_board(unit)
             yield (rows[[*block.model.order, len(names)]],)
         self._shifts = shifts
 
@@ -161,28 +156,34 @@ class PixelSamples(Samples):
             axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
             owner = self._images[part] - self._images[part.start]
             shape = (3, len(images))
-            seen = view(
-                lens,
-                [np.broadcast_to(axis, shape)[:, owner] for axis in axes],
-                np.broadcast_to(origin, shape)[:, owner],
-                self._points[:, part],
-                seen_by.on_flange,
-            )
-            columns = np.concatenate(
-                [
-                    seen.by_twist,
-                    lens.by_lens(seen.points, kinds),
-                    (self._pixels[:, part] - seen.pixels)[np.newaxis],
-                ]
-            )
-            columns /= self.sigmas[0]
-            if self.weights is not None:
-                columns *= self.weights[part]
+            axes = np.stack([np.broadcast_to(axis, shape) for axis in axes])
+            origin = np.broadcast_to(origin, shape)
+            seen = view(lens, axes, origin, owner, self._points[:, part], seen_by.on_flange)
+            columns = np.empty((7 + len(kinds), *seen.pixels.shape))
+            seen.by_twist(columns[:6])
+            lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
+            columns[-1] = self._pixels[:, part] - seen.pixels
+            columns *= (1.0 if self.weights is None else self.weights[part]) / self.sigmas[0]
             twist = np.zeros((len(names), 6, len(images)))
             twist[:, :3] = shift[:-1]
             twist[: model.rotations, 3:] = turn[:-1]
+            if seen_by.on_flange:  # along the camera's axes, as it moves the other way
+                flat = twist.reshape(len(names), 2, 3, -1)
+                twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
             yield _Images(part, owner, columns, twist, [row[n] for n in own], seen, model)
             first = last
+
+
+def _factor(products: FloatArray) -> FloatArray:
+    """Return F (M, R, S) with F^T F the products (M, S, S) of each image."""
+    try:
+        return np.linalg.cholesky(products).swapaxes(1, 2)
+    except np.linalg.LinAlgError:  # fewer points than unknowns, or points that fit exactly
+        scale = np.sqrt(np.maximum(np.einsum('mss->ms', products), 1e-300))
+        scaled = products / (scale[:, :, np.newaxis] * scale[:, np.newaxis])
+        size, axes = np.linalg.eigh(scaled)
+        root = np.sqrt(np.maximum(size, 0.0))[:, :, np.newaxis]
+        return np.asarray(root * axes.swapaxes(1, 2) * scale[:, np.newaxis])
 
 
 def samples_of(

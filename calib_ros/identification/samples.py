@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.lens import at_the_board, require_lens, view
+from calib_ros.kinematics.lens import require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 
@@ -241,18 +241,11 @@ def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray
     came = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
     axes, origin = chain.trace(chain.effective(q, came), base=then.base, tool=then.tool)
     pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
-    for start in range(0, len(then), BLOCK):
-        part = slice(start, start + BLOCK)
-        owner = then.images[part]
-        seen = view(
-            lens,
-            [axis[:, owner] for axis in axes],
-            origin[:, owner],
-            then.points[part].T,
-            then.on_flange,
-        )
+    for start in range(0, len(then), 4 * BLOCK):
+        part = slice(start, start + 4 * BLOCK)
+        seen = view(lens, axes, origin, then.images[part], then.points[part].T, then.on_flange)
         residual = then.pixels[part].T - seen.pixels
-        pixels[part], shifts[part] = residual.T, at_the_board(seen, residual)
+        pixels[part], shifts[part] = residual.T, seen.at_the_board(residual)
     return pixels, shifts
 
 
