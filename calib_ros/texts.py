@@ -22,12 +22,12 @@ LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""
 LARGEST_TABLE = 100_000_000
 """Bytes of a table."""
-MOST_ROWS = 200_000
-"""Rows of a table of measurements or poses."""
+MOST_ROWS = LARGEST_TABLE // 500
+"""Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""
 DEEPEST = 20
 """Levels of nested YAML."""
-MOST_NODES = 500_000
-"""Values in a YAML document with its aliases written out; a long text counts as several."""
+MOST_NODES = LARGEST_TEXT // 20
+"""Values in a YAML document with its aliases written out; 20 characters count as one."""
 
 
 def read_text(
@@ -38,11 +38,7 @@ def read_text(
 ) -> str:
     """Return the text of a file, which `what` describes, without a byte order mark.
 
-    Raises
-    ------
-    CalibrationError
-        Of the type `error`, when it cannot be read, is too large or is not UTF-8.
-
+    An `error` is raised when it cannot be read, is too large or is not UTF-8.
     """
     return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
 

@@ -128,6 +128,14 @@ def add_storage(parser: Group) -> None:
     parser.add_argument('--storage', choices=STORAGES, default='mcap', help='of the bag')
 
 
+def at_least(options: argparse.Namespace, **lowest: float) -> None:
+    """Refuse options that are less than they may be; one that is not given is none."""
+    for name, least in lowest.items():
+        value = getattr(options, name)
+        if value is not None and not value >= least:
+            raise InputError(f'--{name} must be at least {least}, not {value}')
+
+
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
     """Refuse to write what is there already, before any work is done."""
     for path in paths:

@@ -8,9 +8,8 @@ import argparse
 import json
 from collections.abc import Callable
 
-from calib_ros.cli.options import NOT_ACCEPTED, add_moved, results
+from calib_ros.cli.options import NOT_ACCEPTED, add_moved, at_least, results
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.identification.recalibration import GROWTH, Recalibration, recalibrate, years_since
@@ -52,8 +51,7 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
 
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
-    if not options.growth >= 0.0:
-        raise InputError(f'--growth must not be negative, not {options.growth}')
+    at_least(options, growth=0)
     previous = load_calibration(options.previous, loaded.problem.chain)
     for warning in loaded.warnings:
         screen.warn(warning)

@@ -18,11 +18,11 @@ from calib_ros.cli.options import (
     add_chain,
     add_out,
     add_storage,
+    at_least,
     origin_of,
 )
 from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError
 from calib_ros.files.loading import of_bag
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
@@ -85,11 +85,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
 
 def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
     """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
-    if options.poses < 1 or options.seed < 0:
-        raise InputError(
-            f'--poses must be at least 1 and --seed at least 0, not {options.poses} and '
-            f'{options.seed}'
-        )
+    at_least(options, poses=1, seed=0)
     rng, cell = np.random.default_rng(options.seed), Cell()
     true = faulty(chain, cell, rng)
     configurations = chain.random_joints(options.poses, rng)

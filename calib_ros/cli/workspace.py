@@ -18,6 +18,7 @@ from calib_ros.cli.options import (
     add_chain,
     add_identity,
     add_out,
+    at_least,
     origin_of,
     page_of,
     results,
@@ -38,8 +39,6 @@ from calib_ros.report.markdown import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
-BOX_POSES = 30
-"""Random poses that stand for a task given as a box of joint values."""
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -67,9 +66,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
-        if getattr(options, name) < lowest:
-            raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
+    at_least(options, poses=100, cells=1, turns=1, seed=0)
     with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
     screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
@@ -143,7 +140,7 @@ def _task(
     lower, upper = np.reshape(options.joint_box, (2, size))
     if not (lower <= upper).all():
         raise InputError('--joint-box: give all lower values first, then all upper ones')
-    joints = rng.uniform(lower, upper, (BOX_POSES, size))
+    joints = rng.uniform(lower, upper, (30, size))  # poses that stand for all
     return task_of(in_base(arm.commanded_by(options.model), joints))
 
 

@@ -250,14 +250,7 @@ def _check_links(streams: Mapping[str, Stream]) -> None:
 
 
 def rosbag2() -> Any:
-    """Return the library that reads and writes bags; nothing but bags needs it.
-
-    Raises
-    ------
-    InputError
-        When it is not installed: Ubuntu does not package it.
-
-    """
+    """Return the library that reads and writes bags; nothing but bags needs it."""
     try:
         from rosbags import rosbag2
     except ImportError as err:

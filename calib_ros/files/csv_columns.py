@@ -116,14 +116,7 @@ class TextColumns(Columns):
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
-    """Return the columns of a CSV with rows, some of which it needs to have.
-
-    Raises
-    ------
-    InputError
-        When it has not, or is no table.
-
-    """
+    """Return the columns of a CSV with rows, some of which it needs to have."""
     return with_rows(columns_of(path, read_text(path, LARGEST_TABLE, InputError)), needed)
 
 

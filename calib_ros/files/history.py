@@ -31,14 +31,7 @@ FOLDER, ENDING = 'robot=', '.parquet'
 
 
 class History:
-    """A dataset of rows in a folder, or at any URL that fsspec can write.
-
-    Raises
-    ------
-    ConfigError
-        When pyarrow or fsspec is not installed, or nothing knows such URLs.
-
-    """
+    """A dataset of rows in a folder, or at any URL that fsspec can write."""
 
     def __init__(self, place: str | Path) -> None:
         try:
@@ -80,14 +73,7 @@ class History:
         )
 
     def rows(self, serial: str) -> tuple[Row, ...]:
-        """Return the rows of a robot in the order of their times.
-
-        Raises
-        ------
-        InputError
-            When a file is none of a history.
-
-        """
+        """Return the rows of a robot in the order of their times."""
         import pyarrow as pa
 
         keys = self.keys(serial)

@@ -31,13 +31,6 @@ class Journal:
     joints : int
         Number of joints.
 
-    Raises
-    ------
-    InputError
-        When the file is that of another robot, or another process writes it.
-    OSError
-        When it cannot be written.
-
     """
 
     def __init__(self, path: Path, joints: int) -> None:
@@ -52,14 +45,7 @@ class Journal:
             raise
 
     def add(self, sample: Sample, removed: bool = False) -> None:
-        """Write a sample, or that it was taken back.
-
-        Raises
-        ------
-        OSError
-            When the disk is full, say; what was written before is whole.
-
-        """
+        """Write a sample, or that it was taken back; what is there stays whole."""
         self._write(cells(sample, 'removed' if removed else None))
 
     def close(self) -> None:

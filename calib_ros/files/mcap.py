@@ -91,12 +91,6 @@ def logged(
 
     The chunk is a record with kind and size. Log time, channel and data of each message are
     returned, and what is wrong with a record before which these stand, if anything.
-
-    Raises
-    ------
-    ValueError
-        When the chunk does not have its size and checksum.
-
     """
     chunk = chunk[_HEAD.size :]
     begin, end, size, checksum = _CHUNK.unpack_from(chunk)
@@ -129,16 +123,7 @@ def string(record: bytes, start: int) -> str:
 
 
 def unpacked(data: bytes, compression: str, largest: int) -> bytes:
-    """Return what is packed in some bytes; of one that is cut off what there is.
-
-    Raises
-    ------
-    ValueError
-        When it is larger than `largest` bytes.
-    OSError
-        When the compression is not known.
-
-    """
+    """Return what is packed in some bytes; of one that is cut off what there is."""
     found = _unpack(data, compression, largest + 1) if compression else data
     if len(found) > largest:
         raise ValueError(f'it unpacks to more than the {largest} bytes that it may have')

@@ -107,11 +107,7 @@ class Measurements:
     def kept(self) -> Measurements:
         """Return the rows that were not taken back: of those alike it is the last one.
 
-        Raises
-        ------
-        InputError
-            When of those that are left two are alike.
-
+        Two that are left and alike are refused.
         """
         found = self
         if self.removed.any():
@@ -169,14 +165,7 @@ class Measurements:
 
 
 def measurements(columns: Columns, joints: int) -> Measurements:
-    """Return what the rows of a table say; whatever makes no sense is refused.
-
-    Raises
-    ------
-    InputError
-        For a missing column and for cells that are no number, say. The message names the line.
-
-    """
+    """Return what the rows of a table say; whatever makes no sense is refused."""
     header = columns.header
     _check_header(columns, joints)
     has = [~columns.blank(n) if n in header else np.zeros(len(columns.lines), bool) for n in KINDS]

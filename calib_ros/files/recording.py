@@ -63,14 +63,6 @@ def write_bag(
 
     Topics: /joint_states, and /measured_pose or /measured_point; /validation_pose or
     /validation_point for held-out poses. Files `beside` the bag are there before it is.
-
-    Raises
-    ------
-    InputError
-        When there is something at the path already.
-    OSError
-        When it cannot be written, because the disk is full say.
-
     """
     with whole_folder(path) as folder:
         try:

@@ -49,14 +49,7 @@ def recorded(path: Path) -> int | None:
 
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
-    """Give a bag folder whose files are not compressed: it itself, or one that goes away again.
-
-    Raises
-    ------
-    InputError
-        When a file unpacks to more than any recording does.
-
-    """
+    """Give a bag folder whose files are not compressed: it itself, or one that goes away again."""
     packed = sorted(path.glob('*.zstd')) if path.is_dir() else []
     if not packed:
         yield path
@@ -94,14 +87,7 @@ def named(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 
 def check(path: Path) -> None:
-    """Refuse a bag folder or file that the library must not open, though messages may be in it.
-
-    Raises
-    ------
-    CalibrationError, ValueError, sqlite3.Error
-        When it may stand for more than it holds, or is damaged.
-
-    """
+    """Refuse a bag folder or file that the library must not open, though messages may be in it."""
     metadata = path / 'metadata.yaml'
     if metadata.exists():
         parse_yaml(read_text(metadata), str(metadata))

@@ -13,6 +13,7 @@ from calib_ros.files.mcap import LARGEST_CHUNK, LARGEST_RATIO, logged, unpacked,
 from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
+from calib_ros.texts import LARGEST_TABLE
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -23,7 +24,7 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 """What the library does not promise: without them, it is asked for the messages itself."""
 LARGEST_MESSAGE = 65_536
 """Bytes of a message; a joint state of a thousand joints has fewer."""
-LARGEST_IMAGE = 200_000_000
+LARGEST_IMAGE = 2 * LARGEST_TABLE
 """Bytes of an image, as a message or a file."""
 
 

@@ -43,12 +43,6 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
     CSV: joint values in q1 ... qn, in the order of the arm; s1 ... sn, if present, are the signs
     of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic echo` prints
     it.
-
-    Raises
-    ------
-    InputError
-        For a file that is neither, or that lacks something; the message names the place.
-
     """
     readers = {'.csv': _read_csv, '.yaml': _read_yaml, '.yml': _read_yaml}
     if path.suffix.lower() not in readers:
@@ -126,12 +120,6 @@ def trajectory_program(
     """Return the program of a JointTrajectory: joint names, and points with lists of numbers.
 
     Velocities and accelerations are those of all points or of none.
-
-    Raises
-    ------
-    InputError
-        For lists that do not fit the names, and values that are no numbers; `where` names it.
-
     """
 
     def values(key: str) -> FloatArray | None:

@@ -133,13 +133,6 @@ def vendor_files(
         tells whether a file belongs to the robot. A hash of the numbers by default, which the
         driver reports as a mismatch, and goes on.
 
-    Raises
-    ------
-    ConfigError
-        When the chain is not one of the URDF, or the checksum is none.
-    ExportError
-        When a file, read back, differs from the chain.
-
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(

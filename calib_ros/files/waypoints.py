@@ -28,11 +28,7 @@ POSE = (*POSITION, *QUATERNION)
 def read_joints(path: Path, chain: Chain) -> FloatArray:
     """Read joint values (N, n) [rad or m] of a chain from the columns q1 ... qn of a CSV.
 
-    Raises
-    ------
-    InputError
-        As `joint_values` does, and for a value beyond the limits of its joint by over 1e-3.
-
+    A value over 1e-3 beyond the limits of its joint is refused.
     """
     found = read_columns(path, joint_columns(len(chain.joints)))
     values = joint_values(found, len(chain.joints))
@@ -47,14 +43,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
 
 def joint_values(found: Columns, joints: int) -> FloatArray:
-    """Return the joint values (N, n) [rad or m] of an arm in columns q1 ... qn.
-
-    Raises
-    ------
-    InputError
-        For a missing column, one joint too many, no row, and a value that is no number.
-
-    """
+    """Return the joint values (N, n) [rad or m] of an arm in columns q1 ... qn."""
     names = joint_columns(joints)
     if f'q{joints + 1}' in with_rows(found, names).header:
         raise InputError(
@@ -64,14 +53,7 @@ def joint_values(found: Columns, joints: int) -> FloatArray:
 
 
 def read_poses(path: Path) -> FloatArray:
-    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV.
-
-    Raises
-    ------
-    InputError
-        For a missing column, no row, a value that is no number, or a quaternion that is none.
-
-    """
+    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
     found = read_columns(path, POSE)
     numbers = found.block(POSE)
     check_quaternions(found, numbers[:, 3:])

@@ -69,12 +69,6 @@ def read_plant(path: Path) -> tuple[Robot, ...]:
     """Read a plant file.
 
     Relative names in it are meant from its folder.
-
-    Raises
-    ------
-    ConfigError
-        When it cannot be used; the message names the robot and the key.
-
     """
     return parse_plant(read_text(path, what='plant file '), path.parent, str(path))
 

@@ -69,14 +69,7 @@ class Outcome(NamedTuple):
 
 
 def sources(robot: Robot) -> tuple[Source, ...]:
-    """Return what there is of a robot, by name.
-
-    Raises
-    ------
-    InputError
-        When a pattern matches nothing, or its file system cannot be listed.
-
-    """
+    """Return what there is of a robot, by name."""
     found = []
     for each in robot.measured:
         try:

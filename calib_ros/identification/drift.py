@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from calib_ros.identification.leastsquares import System
-from calib_ros.identification.observations import Observations, stops
+from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -74,7 +74,7 @@ class Shifts:
     """
 
     def __init__(self, system: System, residuals: Sequence[FloatArray]) -> None:
-        numbers = [stops(samples.observations.joints) for samples in system.sets]
+        numbers = [samples.observations.stops for samples in system.sets]
         self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
         count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
         self._share = np.arange(count) / count

@@ -31,10 +31,11 @@ from calib_ros.identification.fitting import (
 from calib_ros.identification.leastsquares import Fit, System, minimise, normal_equations
 from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise
+from calib_ros.identification.observations import distinct
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import KNOWN, Region, region_of
-from calib_ros.identification.robust import OUTLIER, Robust
+from calib_ros.identification.robust import MANY, OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import Step, find_step
 from calib_ros.identification.validation import (
@@ -248,7 +249,10 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     structural, start, fitted = fit(problem, known)
     names = fitted.names
     problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
-    before = minimise(start, [n for n in names if start.owns_frame(n)], robust.system)
+    frames = [name for name in names if start.owns_frame(name)]
+    if robust.system.count > MANY:
+        start = minimise(start, frames, robust.system.spread(MANY)).chain
+    before = minimise(start, frames, robust.system)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
@@ -316,8 +320,8 @@ def _size(fitted: Fitted) -> float:
     if fitted.noise.consistent:
         return fitted.size
     numbers = fitted.problem.configurations
-    seen = sum(len(np.unique(each)) for each in numbers)
-    return fitted.size * float(np.sqrt(seen / len(np.unique(np.concatenate(numbers)))))
+    seen = sum(distinct(each) for each in numbers)
+    return fitted.size * float(np.sqrt(seen / distinct(np.concatenate(numbers))))
 
 
 def _priors(problem: Problem) -> dict[str, float]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -105,6 +106,11 @@ class System(Shown):
         """Return the samples chosen by masks or indices, set by set, with their weights."""
         pairs = zip(self.sets, chosen, strict=True)
         return replace(self, sets=tuple(samples.select(index) for samples, index in pairs))
+
+    def spread(self, most: int) -> System:
+        """Return every so many samples of each set, at most so many of all sets or one of each."""
+        share = -(-self.count // most)
+        return self.select([np.arange(0, samples.count, share) for samples in self.sets])
 
     def weighted(self, weights: Sequence[FloatArray | None]) -> System:
         """Return the samples with weights (N,) set by set; None for all ones."""
@@ -199,12 +205,19 @@ def products_of(
     for number, samples in enumerate(system.sets):
         for which, shift, turn, model in samples.blocks(chain, names):
             last = len(turn) - 1
-            for k, (by_position, by_orientation) in enumerate(found):
-                inside = slice(None) if folds is None else folds[number][which] == k
-                rows = shift[..., inside].reshape(size, -1)
+            ends = [shift.shape[2]]
+            if folds is not None:
+                here = folds[number][which]
+                sorting = np.argsort(here, kind='stable')
+                shift, turn = shift[..., sorting], turn[..., sorting] if last >= 0 else turn
+                ends = np.cumsum(np.bincount(here, minlength=count)).tolist()
+            for (by_position, by_orientation), (first, end) in zip(
+                found, pairwise([0, *ends]), strict=True
+            ):
+                rows = shift[..., first:end].reshape(size, -1)
                 by_position += rows @ rows.T
                 if last >= 0:
-                    rows = turn[..., inside].reshape(last + 1, -1)
+                    rows = turn[..., first:end].reshape(last + 1, -1)
                     products = rows @ rows.T
                     by_orientation[:last, :last] += products[:-1, :-1]
                     by_orientation[:last, -1] += products[:-1, -1]

@@ -287,18 +287,28 @@ class Observations(Shown):
         """Return (N,) the number of the standing configuration that each pair belongs to."""
         return configurations(self.joints)
 
+    @cached_property
+    def stops(self) -> NDArray[np.intp]:
+        """Return (N,) the number of the stop, in sequence, at which each pair was taken."""
+        return stops(self.joints)
+
+
+def distinct(numbers: NDArray[np.intp]) -> int:
+    """Return how many different numbers (N,) of configurations there are."""
+    return int(np.count_nonzero(np.bincount(numbers)))
+
 
 def stops(joints: FloatArray) -> NDArray[np.intp]:
     """Return (N,) the number of the stop at which joint values (N, n) in sequence were taken."""
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    return np.concatenate([[0], np.cumsum(_moved(joints))]).astype(np.intp)
+    return np.append(0, np.cumsum(~_still(np.diff(joints, axis=0)))).astype(np.intp)
 
 
-def _moved(joints: FloatArray) -> NDArray[np.bool_]:
-    """Return (N - 1,) whether the arm moved from one row to the next; angles modulo a turn."""
-    change = np.abs(np.diff(joints, axis=0)) % TURN
-    return np.asarray(np.minimum(change, TURN - change).max(axis=1) > STILL)
+def _still(change: FloatArray) -> NDArray[np.bool_]:
+    """Return (N,) which changes (N, n) of joint values are none; angles modulo a turn."""
+    change = np.abs(change) % TURN
+    return np.asarray(np.minimum(change, TURN - change).max(axis=1) <= STILL)
 
 
 def configurations(joints: FloatArray) -> NDArray[np.intp]:
@@ -310,13 +320,15 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     """
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    standing = joints[np.concatenate([[True], _moved(joints)])]  # one row a stop
-    near, label = _near(standing), np.arange(len(standing))
+    number = stops(joints)
+    standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
+    place = np.concatenate([np.cos(standing), np.sin(standing)], axis=1)  # which knows no turns
+    near, label = _near(standing, place), np.arange(len(standing))
     if len(near):
         links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
         _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
-    return np.asarray(_repeats(standing[first])[label[stops(joints)]], dtype=np.intp)
+    return np.asarray(_repeats(place[first])[label[number]], dtype=np.intp)
 
 
 def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
@@ -330,18 +342,15 @@ def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
     return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))
 
 
-def _repeats(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (N,) which joint values (N, n) are visits of one configuration that scatter.
+def _repeats(place: FloatArray) -> NDArray[np.intp]:
+    """Return (N,) which places (N, 2 n) are visits of one configuration that scatter.
 
     Where the distances of nearest values leave a gap, from so much to GAP times as much, those
     below it are visits, as long as each configuration is as small as they are.
     """
-    count = len(joints)
+    count = len(place)
     apart = np.arange(count)
-    if count < FEWEST:
-        return apart
-    place = _on_circles(joints)
-    if not len(_pairs(place, SCATTER)):
+    if count < FEWEST or not len(_pairs(place, SCATTER)):
         return apart
     far, near = cKDTree(place).query(
         place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
@@ -370,16 +379,10 @@ def _graph(
     return coo_array((lengths, ends), shape=(count, count))
 
 
-def _near(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (K, 2) the rows of (N, n) within STILL of each other; angles modulo a turn."""
-    pairs = _pairs(_on_circles(joints), STILL * joints.shape[1] ** 0.5)
-    change = np.abs(joints[pairs[:, 0]] - joints[pairs[:, 1]]) % TURN
-    return np.asarray(pairs[np.minimum(change, TURN - change).max(axis=1) <= STILL])
-
-
-def _on_circles(joints: FloatArray) -> FloatArray:
-    """Return (N, 2 n) joint values (N, n) where a full turn makes no difference."""
-    return np.concatenate([np.cos(joints), np.sin(joints)], axis=1)
+def _near(joints: FloatArray, place: FloatArray) -> NDArray[np.intp]:
+    """Return (K, 2) the rows of (N, n), at places (N, 2 n), within STILL of each other."""
+    pairs = _pairs(place, STILL * joints.shape[1] ** 0.5)
+    return np.asarray(pairs[_still(joints[pairs[:, 0]] - joints[pairs[:, 1]])])
 
 
 def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:

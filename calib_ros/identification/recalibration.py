@@ -41,7 +41,7 @@ from calib_ros.identification.leastsquares import (
     normal_equations,
     products_of,
 )
-from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.observations import Observations, distinct, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document
@@ -279,7 +279,7 @@ def _judged(
 ) -> tuple[ErrorFigures, ErrorFigures]:
     """Return the errors of the new poses before, and by what the others tell."""
     groups = numbered(sets)
-    count = min(MOST_FOLDS, len(np.unique(np.concatenate(groups))))
+    count = min(MOST_FOLDS, distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
     chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
     chains = []

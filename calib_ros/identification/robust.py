@@ -42,6 +42,8 @@ INNER, OUTER = 5.0, 7.0
 errors in three directions 2 of 100,000 lie beyond the first."""
 OUTLIER = 6.0
 """Distance beyond which a sample is named as an outlier."""
+MANY = 20_000
+"""Samples that tell which of them are gross errors, a sample in ten thousand aside."""
 REWEIGHTINGS = 40
 SUSPICIOUS = 1.2
 """RMS residual [sigma] from which gross errors may hide in it."""
@@ -77,7 +79,14 @@ class Robust:
 
 
 def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
-    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious."""
+    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious.
+
+    Of more than MANY samples an even spread tells which model it is; all are fitted from there.
+    """
+    if system.count > MANY:
+        few = thorough_fit(chain, names, system.spread(MANY), loss)
+        found = reweighted(few.fit.chain, names, system, loss)
+        return replace(found, iterations=few.iterations + found.iterations)
     first = robust_fit(chain, names, system, loss)
     suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
     if loss != 'redescending' or not suspicious:

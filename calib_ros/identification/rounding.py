@@ -71,13 +71,11 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 
 def _step(values: FloatArray) -> float:
     """Return the step that different values (N,) are multiples of; zero where there is none."""
-    different = np.unique(values)
-    if len(different) < 3:
-        return 0.0
-    for step in sorted(STEPS, reverse=True):
-        if _are_multiples(different[:3], step) and _are_multiples(different, step):
-            return 0.0 if _are_multiples(different, WIDER * step) else step
-    return 0.0
+    few = values[:3, np.newaxis] / STEPS
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < EXACT, STEPS).tolist()
+    step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
+    wider = _are_multiples(values, WIDER * step) if step else True
+    return 0.0 if wider or len(np.unique(values)) < 3 else step
 
 
 def _are_multiples(values: FloatArray, step: float) -> bool:

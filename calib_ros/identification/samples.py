@@ -201,8 +201,17 @@ class Samples:
 def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
     """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
 
-    Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
+    Measured distances give (N, 1). Rotation vectors are NaN where none was measured. Observations
+    keep those of the last chain, which several ask for.
     """
+    known = vars(observations).get('_residuals')
+    if known is None or known[0] is not chain:
+        known = vars(observations)['_residuals'] = (chain, _residual_arrays(chain, observations))
+    found: tuple[FloatArray, FloatArray] = known[1]
+    return found
+
+
+def _residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
     delay = chain.frame(observations.base).delay
     then = observations if delay is None else observations.earlier(delay)
     distances = observations.distances
@@ -225,6 +234,8 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
             measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
             orientation[part] = orientation_error(measured, axes).T
     orientation[~oriented] = np.nan
+    for each in (position, orientation):
+        each.setflags(write=False)
     return position, orientation
 
 

@@ -33,7 +33,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from calib_ros.identification.leastsquares import Fit, System
-from calib_ros.identification.observations import FEWEST, stops
+from calib_ros.identification.observations import FEWEST
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -120,7 +120,7 @@ class _Stops:
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     """Return which neighbours share errors, and the noise that follows."""
     kinds = tuple(LENGTHS)
-    total = sum(int(stops(samples.observations.joints)[-1]) + 1 for samples in system.sets)
+    total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // MOST))
     few = _gather(fit.chain, names, system, share, RUN)
     correlations = dict.fromkeys(kinds, 0.0)
@@ -298,7 +298,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
     counts, places, times = [], [], []
     circular = np.array([joint.type == 'revolute' for joint in chain.joints])
     for number, samples in enumerate(system.sets):
-        all_numbers = stops(samples.observations.joints)
+        all_numbers = samples.observations.stops
         chosen = all_numbers // run % share == 0
         if samples.weights is not None:
             chosen &= samples.weights > 0.0
@@ -358,7 +358,7 @@ def _successive(
     found = np.zeros((len(names), len(names)))
     for samples in system.sets:
         before = [np.zeros((len(names), samples.width if part == 0 else 3))] * len(kernels)
-        for _, sums in _sums(chain, names, samples, stops(samples.observations.joints)):
+        for _, sums in _sums(chain, names, samples, samples.observations.stops):
             if part >= len(sums):
                 continue
             rows = sums[part][:-1]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.leastsquares import System, minimise, without_each
-from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.observations import Observations, distinct, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.region import KNOWN
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
@@ -164,12 +164,13 @@ def compare(
     judged: NDArray[np.bool_] | None = None,
 ) -> Comparison:
     """Return the residuals of all sets, one after the other, by both chains."""
-    parts = [(residuals(before, each), residuals(after, each)) for each in sets]
     numbers = np.concatenate(numbered(sets))
     index = np.arange(len(numbers))
+    second = _joined([residuals(after, each) for each in sets], numbers, index)
+    first = _joined([residuals(before, each) for each in sets], numbers, index)
     return Comparison(
-        _joined([first for first, _ in parts], numbers, index),
-        _joined([second for _, second in parts], numbers, index),
+        first,
+        second,
         np.ones(len(numbers), dtype=bool) if judged is None else judged,
     )
 
@@ -220,10 +221,9 @@ def _cross_validate(
 ) -> tuple[Comparison | None, str]:
     """Judge both chains on parts of the configurations that were left out in turn."""
     groups = problem.configurations
-    count = len(np.unique(np.concatenate(groups)))
+    count = distinct(np.concatenate(groups))
     rows = sum(
-        len(np.unique(group)) * kind.rows
-        for group, kind in zip(groups, problem.kinds, strict=True)
+        distinct(group) * kind.rows for group, kind in zip(groups, problem.kinds, strict=True)
     )
     folds = _folds(problem, names, count, rows)
     if folds < 2:

@@ -118,8 +118,11 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     return dump_yaml({'/**': {'ros__parameters': parameters}})
 
 
-def checked(found: Recalibration) -> tuple[bool, str]:
-    """Return whether the last stops agree with the calibration in use, and why in words."""
+def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
+    """Return whether the last stops agree with the calibration in use, and why in words.
+
+    It must hold as for `verdict`, and nothing may have changed.
+    """
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} samples'
     if found.changed:
         reasons = '; '.join(reason_in_words(each) for each in found.changed)
@@ -132,6 +135,8 @@ def checked(found: Recalibration) -> tuple[bool, str]:
             f'{text}, more than the calibration in use and noise explain, and no few parameters '
             'do: measure new poses and call ~/identify'
         )
+    if previous.holds(1e-3 * found.before.rms_mm) is False:
+        return False, _lost(previous, text)
     return True, f'the calibration in use agrees with what was measured: {text}'
 
 
@@ -148,13 +153,17 @@ def verdict(
         text += f'; {warning}'
     if calibration.residual is None:
         return True, text
-    judged = 1e3 * calibration.residual
     if not calibration.holds(1e-3 * now.rms_mm):
-        return False, (
-            f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '
-            'tracker, the target or the robot moved?'
-        )
-    return True, f'the calibration holds: {text}; it had {judged:.3f} mm'
+        return False, _lost(calibration, text)
+    return True, f'the calibration holds: {text}; it had {1e3 * calibration.residual:.3f} mm'
+
+
+def _lost(calibration: Calibration, text: str) -> str:
+    return (
+        f'the calibration does not hold any more: {text}; it had '
+        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, the target or the robot '
+        'moved?'
+    )
 
 
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:

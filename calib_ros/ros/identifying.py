@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros.errors import shortened
@@ -56,20 +55,9 @@ class Snapshot(NamedTuple):
 
 
 class Identifying:
-    """Identifies, tells the result in words, and hands over what is accepted.
+    """Identifies, tells the result in words, and hands over what is `accepted`.
 
-    Parameters
-    ----------
-    node : Node
-    session : CalibrationSession
-    archive : Archive
-    filer : Filer
-    configuration : callable
-        Returns what the node is set to as a parameter file.
-    accepted : callable
-        Takes an accepted calibration, as what it is published, and its samples.
-    latched : QoSProfile
-
+    `configuration` returns what the node is set to as a parameter file.
     """
 
     def __init__(
@@ -80,11 +68,10 @@ class Identifying:
         filer: Filer,
         configuration: Callable[[], str],
         accepted: Callable[[Calibration, Published, Sequence[Sample]], None],
-        latched: QoSProfile,
     ) -> None:
         self._node, self._session, self._archive, self._filer = node, session, archive, filer
         self._configuration, self._accepted = configuration, accepted
-        self._residuals = node.create_publisher(MarkerArray, '~/residuals', latched)
+        self._residuals = node.create_publisher(MarkerArray, '~/residuals', to_ros.LATCHED)
         self.progress = Progress('identifying')
         self.last = 'nothing identified yet'
         """What came of the last identification or ~/load, in words."""

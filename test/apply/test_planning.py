@@ -696,7 +696,7 @@ def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
     [
         ('q1,q2\n0,0\n', 'has no column q3, q4, q5, q6'),
         ('q1,q2,q3,q4,q5,q6\n', 'has no rows'),
-        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but "ur10e" has 6 joints only'),
+        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but the arm has 6 joints only'),
         (
             'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
             'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',

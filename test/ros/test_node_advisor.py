@@ -382,7 +382,7 @@ def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
         for _ in range(3):
             publisher.publish(trajectory(path(5)[0]))
         cell.spin_until(lambda: begun.is_set() and len(cell.node._guide._pending) == 3)
-        monkeypatch.setattr(guide_module, 'MOST_WAITING', 2)
+        monkeypatch.setattr(guide_module, 'MOST_QUEUED', 2)
         publisher.publish(trajectory(path(5)[0]))
         cell.spin_until(lambda: cell.node._guide._last_trajectory)
         assert 'refused: 2 others wait already' in cell.node._guide._last_trajectory
