@@ -12,96 +12,88 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib_ros.apply.compensation import Compensator, compensate
-    from calib_ros.apply.planning import Plan, plan
-    from calib_ros.apply.program import Program
-    from calib_ros.apply.verification import Verification, verify
-    from calib_ros.errors import CalibrationError
-    from calib_ros.files.bags import replay
-    from calib_ros.files.tables import read_table
-    from calib_ros.identification.calibration import Calibration, load_calibration
-    from calib_ros.identification.difference import Difference, difference
-    from calib_ros.identification.identification import Identification, identify
-    from calib_ros.identification.model_choice import identify_model
-    from calib_ros.identification.observations import Observations
-    from calib_ros.identification.problem import Problem
-    from calib_ros.identification.recalibration import Recalibration, recalibrate
-    from calib_ros.kinematics.chain import Chain
-    from calib_ros.kinematics.chain_file import dump_chain, load_chain
-    from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
-    from calib_ros.sampling.session import CalibrationSession
-    from calib_ros.settings import Settings
+    from calib_ros.apply.compensation import Compensator as Compensator
+    from calib_ros.apply.compensation import compensate as compensate
+    from calib_ros.apply.planning import Plan as Plan
+    from calib_ros.apply.planning import plan as plan
+    from calib_ros.apply.program import Program as Program
+    from calib_ros.apply.verification import Verification as Verification
+    from calib_ros.apply.verification import verify as verify
+    from calib_ros.errors import CalibrationError as CalibrationError
+    from calib_ros.files.bags import replay as replay
+    from calib_ros.files.tables import read_table as read_table
+    from calib_ros.identification.calibration import (
+        Calibration as Calibration,
+    )
+    from calib_ros.identification.calibration import (
+        load_calibration as load_calibration,
+    )
+    from calib_ros.identification.difference import (
+        Difference as Difference,
+    )
+    from calib_ros.identification.difference import (
+        difference as difference,
+    )
+    from calib_ros.identification.identification import (
+        Identification as Identification,
+    )
+    from calib_ros.identification.identification import (
+        identify as identify,
+    )
+    from calib_ros.identification.model_choice import identify_model as identify_model
+    from calib_ros.identification.observations import Observations as Observations
+    from calib_ros.identification.problem import Problem as Problem
+    from calib_ros.identification.recalibration import (
+        Recalibration as Recalibration,
+    )
+    from calib_ros.identification.recalibration import (
+        recalibrate as recalibrate,
+    )
+    from calib_ros.kinematics.chain import Chain as Chain
+    from calib_ros.kinematics.chain_file import dump_chain as dump_chain
+    from calib_ros.kinematics.chain_file import load_chain as load_chain
+    from calib_ros.kinematics.urdf import (
+        chain_from_urdf as chain_from_urdf,
+    )
+    from calib_ros.kinematics.urdf import (
+        corrected_urdf as corrected_urdf,
+    )
+    from calib_ros.sampling.session import CalibrationSession as CalibrationSession
+    from calib_ros.settings import Settings as Settings
 
 __version__ = '0.1.0'
 
-__all__ = [
-    'Calibration',
-    'CalibrationError',
-    'CalibrationSession',
-    'Chain',
-    'Compensator',
-    'Difference',
-    'Identification',
-    'Observations',
-    'Plan',
-    'Problem',
-    'Program',
-    'Recalibration',
-    'Settings',
-    'Verification',
-    'chain_from_urdf',
-    'compensate',
-    'corrected_urdf',
-    'difference',
-    'dump_chain',
-    'identify',
-    'identify_model',
-    'load_calibration',
-    'load_chain',
-    'plan',
-    'read_table',
-    'recalibrate',
-    'replay',
-    'verify',
-]
-
 _HOMES = {
-    'Calibration': 'identification.calibration',
-    'CalibrationError': 'errors',
-    'CalibrationSession': 'sampling.session',
-    'Chain': 'kinematics.chain',
-    'Compensator': 'apply.compensation',
-    'Difference': 'identification.difference',
-    'Identification': 'identification.identification',
-    'Observations': 'identification.observations',
-    'Plan': 'apply.planning',
-    'Problem': 'identification.problem',
-    'Program': 'apply.program',
-    'Recalibration': 'identification.recalibration',
-    'Settings': 'settings',
-    'Verification': 'apply.verification',
-    'chain_from_urdf': 'kinematics.urdf',
-    'compensate': 'apply.compensation',
-    'corrected_urdf': 'kinematics.urdf',
-    'difference': 'identification.difference',
-    'dump_chain': 'kinematics.chain_file',
-    'identify': 'identification.identification',
-    'identify_model': 'identification.model_choice',
-    'load_calibration': 'identification.calibration',
-    'load_chain': 'kinematics.chain_file',
-    'plan': 'apply.planning',
-    'read_table': 'files.tables',
-    'recalibrate': 'identification.recalibration',
-    'replay': 'files.bags',
-    'verify': 'apply.verification',
+    'apply.compensation': ('Compensator', 'compensate'),
+    'apply.planning': ('Plan', 'plan'),
+    'apply.program': ('Program',),
+    'apply.verification': ('Verification', 'verify'),
+    'errors': ('CalibrationError',),
+    'files.bags': ('replay',),
+    'files.tables': ('read_table',),
+    'identification.calibration': ('Calibration', 'load_calibration'),
+    'identification.difference': ('Difference', 'difference'),
+    'identification.identification': ('Identification', 'identify'),
+    'identification.model_choice': ('identify_model',),
+    'identification.observations': ('Observations',),
+    'identification.problem': ('Problem',),
+    'identification.recalibration': ('Recalibration', 'recalibrate'),
+    'kinematics.chain': ('Chain',),
+    'kinematics.chain_file': ('dump_chain', 'load_chain'),
+    'kinematics.urdf': ('chain_from_urdf', 'corrected_urdf'),
+    'sampling.session': ('CalibrationSession',),
+    'settings': ('Settings',),
 }
+"""Modules, and what they have that is public."""
+_OF = {name: home for home, names in _HOMES.items() for name in names}
+__all__ = sorted(_OF)
 
 
 def __getattr__(name: str) -> Any:
     """Import a public name at its first use."""
-    if name not in _HOMES:
+    if name not in _OF:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
-    value = getattr(importlib.import_module(f'{__name__}.{_HOMES[name]}'), name)
+    value = getattr(importlib.import_module(f'{__name__}.{_OF[name]}'), name)
     globals()[name] = value
     return value
 

@@ -25,11 +25,7 @@ from calib_ros.errors import InputError
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
     """Write a file under a temporary name beside it, then put it in place.
 
-    Raises
-    ------
-    InputError
-        When there is a file already and `overwrite` is False.
-
+    One that is there already is refused unless `overwrite` is True.
     """
     partial = path.with_name(f'.{path.name}.{secrets.token_hex(8)}.partial')
     data = content.encode() if isinstance(content, str) else content
@@ -111,14 +107,8 @@ def whole_folder(
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
     """Return the real path of a file that somebody else names, if it is in one of some folders.
 
-    Relative names are in the first folder. `allowed_by` says what to set otherwise.
-
-    Raises
-    ------
-    InputError
-        When it is elsewhere, by `..` or by a symbolic link say. Whether there is such a file is
-        not told.
-
+    Relative names are in the first folder. `allowed_by` says what to set otherwise. Whether there
+    is a file elsewhere, by `..` or by a symbolic link say, is not told.
     """
     places = [Path(os.path.realpath(folder)) for folder in folders]
     try:

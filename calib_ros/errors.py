@@ -10,8 +10,8 @@ from collections.abc import Iterable
 
 LONGEST = 400
 """Characters of a message; what is quoted from a file may be of any length."""
-LIKELY = 1000
-"""Alternatives, and characters of a name, among which a misspelt name is looked for."""
+MOST_ENTRIES = 1000
+"""Of a list, of columns, and characters of an entry, that somebody may have written."""
 
 
 def shortened(text: str, longest: int = LONGEST) -> str:
@@ -58,7 +58,7 @@ class UnknownNameError(ConfigError):
         self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)
-        likely = self.alternatives[:LIKELY] if len(str(name)) <= LIKELY else ()
+        likely = self.alternatives[:MOST_ENTRIES] if len(str(name)) <= MOST_ENTRIES else ()
         near = difflib.get_close_matches(str(name), likely, n=1, cutoff=0.5)
         hint = f'did you mean "{near[0]}"? ' if near else ''
         super().__init__(

@@ -34,14 +34,7 @@ class Progress:
         self._cancelled = False
 
     def __call__(self, stage: str) -> None:
-        """Note which stage begins.
-
-        Raises
-        ------
-        CancelledError
-            When the work shall end.
-
-        """
+        """Note which stage begins."""
         with self._lock:
             self._refuse_cancelled()
             self._stage = stage
@@ -60,14 +53,7 @@ class Progress:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Run the work in a `with` block; what is cancelled within it never leaves it well.
-
-        Raises
-        ------
-        CancelledError
-            At the end, when it was cancelled in the last stage.
-
-        """
+        """Run the work in a `with` block; what is cancelled within it never leaves it well."""
         try:
             yield
             with self._lock:

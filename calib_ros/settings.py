@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.values import parse_number
 
 MODES = ('dwell', 'continuous', 'triggered')
@@ -19,9 +19,6 @@ STARTUP = (
     *('joint_topics', 'joint_names'),
 )
 """Settings that a running node cannot change."""
-
-MOST_ENTRIES, LONGEST_ENTRY = 1000, 1000
-"""Entries of a list, and characters of each, that are taken."""
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
@@ -154,7 +151,7 @@ def _check_list(name: str, entries: Sequence[str]) -> None:
     if len(entries) > MOST_ENTRIES:
         raise ConfigError(f'{name} has {len(entries)} entries, at most {MOST_ENTRIES} are taken')
     longest = max(map(len, entries), default=0)
-    if longest > LONGEST_ENTRY:
+    if longest > MOST_ENTRIES:
         raise ConfigError(
-            f'{name} has an entry of {longest} characters, at most {LONGEST_ENTRY} are taken'
+            f'{name} has an entry of {longest} characters, at most {MOST_ENTRIES} are taken'
         )

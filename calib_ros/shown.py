@@ -66,13 +66,9 @@ def _brief(value: object, longest: int = 60) -> str:
         return f'<{type(value).__name__}{" " + name if isinstance(name, str) and name else ""}>'
     if isinstance(value, float):
         return f'{value:.6g}'
-    if isinstance(value, tuple | list | Mapping) and any(
-        isinstance(each, np.ndarray | Shown) for each in value
-    ):
-        return f'<{len(value)} in a {type(value).__name__}>'
-    text = repr(value)
-    if len(text) <= longest:
-        return text
     if isinstance(value, tuple | list | Mapping):
-        return f'<{len(value)} in a {type(value).__name__}>'
-    return text[: longest - 3] + '...'
+        plain = not any(isinstance(each, np.ndarray | Shown) for each in value)
+        text = repr(value) if plain else ''
+        return text if 0 < len(text) <= longest else f'<{len(value)} in a {type(value).__name__}>'
+    text = repr(value)
+    return text if len(text) <= longest else text[: longest - 3] + '...'

@@ -8,30 +8,26 @@ with any number of digits. The stream of its events is looked at before anything
 
 from __future__ import annotations
 
+import csv
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.errors import MOST_ENTRIES, CalibrationError, ConfigError, InputError
+from calib_ros.values import LONGEST_NAME
 
 LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""
 LARGEST_TABLE = 100_000_000
 """Bytes of a table."""
-MOST_COLUMNS = 1000
-"""Columns of a table."""
-MOST_ROWS = 200_000
-"""Rows of a table of measurements or poses."""
-LONGEST_LINE = 1_000_000
-"""Characters in a line of a table."""
+MOST_ROWS = LARGEST_TABLE // 500
+"""Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""
 DEEPEST = 20
 """Levels of nested YAML."""
-MOST_NODES = 500_000
-"""Values in a YAML document with its aliases written out; a long text counts as several."""
-LONGEST_NUMBER = 64
-"""Characters of an unquoted number; a longer one is text."""
+MOST_NODES = LARGEST_TEXT // 20
+"""Values in a YAML document with its aliases written out; 20 characters count as one."""
 
 
 def read_text(
@@ -42,11 +38,7 @@ def read_text(
 ) -> str:
     """Return the text of a file, which `what` describes, without a byte order mark.
 
-    Raises
-    ------
-    CalibrationError
-        Of the type `error`, when it cannot be read, is too large or is not UTF-8.
-
+    An `error` is raised when it cannot be read, is too large or is not UTF-8.
     """
     return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
 
@@ -79,12 +71,19 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
 
 def csv_lines(text: str, where: str) -> io.StringIO:
     """Return the lines of a table for the reader of csv, which cuts lines of any length."""
-    longest = max(map(len, io.StringIO(text)), default=0)
-    if longest > LONGEST_LINE:
+    longest, most = max(map(len, io.StringIO(text)), default=0), MOST_ENTRIES**2
+    if longest > most:
         raise InputError(
-            f'{where} has a line of {longest} characters, more than {LONGEST_LINE}: is it a table?'
+            f'{where} has a line of {longest} characters, more than {most}: is it a table?'
         )
     return io.StringIO(text, newline='')
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Return rows as the text of a table."""
+    text = io.StringIO(newline='')
+    csv.writer(text, lineterminator='\n').writerows(rows)
+    return text.getvalue()
 
 
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:
@@ -125,7 +124,7 @@ def _loader() -> Any:
         convert = getattr(Loader, f'construct_yaml_{kind}')
 
         def number(loader: Any, node: Any, convert: Any = convert) -> Any:
-            return convert(loader, node) if len(node.value) <= LONGEST_NUMBER else node.value
+            return convert(loader, node) if len(node.value) <= LONGEST_NAME else node.value
 
         Loader.add_constructor(f'tag:yaml.org,2002:{kind}', number)
     return Loader

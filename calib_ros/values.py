@@ -18,13 +18,10 @@ QUATERNION_TOLERANCE = 1e-3
 LARGEST = 1e6
 """Largest number [m or rad] that is measured or set; some devices send the largest float for
 none."""
-LARGEST_RATE = 1e12
+LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
 LONGEST_NAME = 200
-SMALLEST_SIGMA, LARGEST_SIGMA = 1e-9, 1e6
-"""Standard deviations [m or rad] between which a covariance is believed."""
-DEPENDENT = 1e-12
-"""Least eigenvalue of a correlation matrix from which on it counts as positive definite."""
+"""Characters of a name, a number or an expression."""
 
 
 def parse_number(
@@ -113,12 +110,11 @@ def covariance_faults(covariances: NDArray[np.float64]) -> NDArray[np.str_]:
     refuse((variances <= 0.0).any(axis=1), 'not positive definite')
     full[found != ''] = np.eye(6)
     sigmas = np.sqrt(np.diagonal(full, axis1=1, axis2=2))
-    believed = (sigmas >= SMALLEST_SIGMA) & (sigmas <= LARGEST_SIGMA)
-    limits = f'{SMALLEST_SIGMA:g} and {LARGEST_SIGMA:g}'
-    refuse(~believed.all(axis=1), f'with a sigma not within {limits}')
+    believed = (sigmas >= 1e-9) & (sigmas <= LARGEST)
+    refuse(~believed.all(axis=1), f'with a sigma not within 1e-09 and {LARGEST:g}')
     normed = full / sigmas[:, :, np.newaxis] / sigmas[:, np.newaxis, :]
     mixed = np.flatnonzero((normed * (1.0 - np.eye(6))).any(axis=(1, 2)))
     definite = np.ones(len(found), dtype=bool)
-    definite[mixed] = np.linalg.eigvalsh(normed[mixed])[:, 0] > DEPENDENT
+    definite[mixed] = np.linalg.eigvalsh(normed[mixed])[:, 0] > 1e-12  # rounding
     refuse(~definite, 'not positive definite')
     return found

@@ -3,6 +3,7 @@
 """A simulated arm with a ball on its flange that sits in sockets, two at each place."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -22,16 +23,21 @@ IIWA = replace(load_chain('kuka_iiwa14'), base=None, tool=None)
 def led_to(chain, q, points):
     """Return joint values near q (N, n) that bring the target to points (N, 3)."""
     model = ErrorModel(chain, [f'{name}.theta' for name in chain.joint_names])
+    signs, q = np.array([joint.sign for joint in chain.joints]), q.copy()
     for _ in range(200):
-        columns = model.jacobian(q)[:, :3] * np.array([joint.sign for joint in chain.joints])
-        square = columns @ columns.transpose(0, 2, 1) + 1e-5 * np.eye(3)
         left = points - chain.forward(q)[:, :3, 3]
-        steps = np.linalg.solve(square, left[:, :, None])
-        q = q + (columns.transpose(0, 2, 1) @ steps)[:, :, 0]
+        far = np.abs(left).max(axis=1) > 1e-13
+        if not far.any():
+            break
+        columns = model.jacobian(q[far])[:, :3] * signs
+        square = columns @ columns.transpose(0, 2, 1) + 1e-5 * np.eye(3)
+        steps = np.linalg.solve(square, left[far, :, None])
+        q[far] += (columns.transpose(0, 2, 1) @ steps)[:, :, 0]
     assert np.abs(chain.forward(q)[:, :3, 3] - points).max() < 1e-12
     return q
 
 
+@cache
 def cell(seed, offset=0.03, noise=0.0, count=30):
     """Return a true arm with the ball some offset [m] from its last axis, and the problem."""
     rng = np.random.default_rng(seed)

@@ -7,7 +7,8 @@ from functools import cache
 import cv2
 import numpy as np
 
-from calib_ros.files import boards, images
+from calib_ros.files import boards
+from calib_ros.files.detector import marker_cells
 
 CHARUCO = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_6X6_250')
 SCALE = 5000.0
@@ -29,7 +30,7 @@ def drawn(board):
         for row, column in np.ndindex(board.rows, board.columns):
             if (row + column) % 2 == 0:
                 black(column * side, row * side, side)
-    for cells, (left, top) in zip(images.marker_cells(board), board.markers * SCALE, strict=True):
+    for cells, (left, top) in zip(marker_cells(board), board.markers * SCALE, strict=True):
         size = board.marker * SCALE / len(cells)
         for row, column in np.argwhere(cells):
             black(left + column * size, top + row * size, size)

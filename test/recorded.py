@@ -4,13 +4,14 @@
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros.apply import simulation
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import STORAGES, Recording
 from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -23,6 +24,10 @@ ARM = Chain(
     'standard',
     (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4), Joint('c', 'prismatic', a=0.1)),
 )
+STREAMS = {
+    '/joint_states': Stream('/joint_states', JOINT_STATE),
+    '/pose': Stream('/pose', 'geometry_msgs/msg/PoseStamped'),
+}
 storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 
 
@@ -144,3 +149,37 @@ def assert_equal(found, expected):
     np.testing.assert_allclose(found.rotations, expected.rotations, atol=1e-14)
     assert found.covariance is None
     assert expected.covariance is None
+
+
+def record_in_chunks(path, storage, mode='none', log_time=lambda k, rng: k):
+    """Write 300 messages in some chunks of 1 MB, filled with long texts that nobody wants."""
+    rng = np.random.default_rng(7)
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if mode != 'none':
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    types = {each.topic: each.type for each in STREAMS.values()} | {'/x': 'std_msgs/msg/String'}
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
+            for topic, kind in types.items()
+        }
+        for k in range(300):
+            topic, message = '/joint_states', joint_state((k + 1) * 10 * MS, rng.normal(size=3))
+            if k % 3 == 1:
+                topic, message = '/pose', pose_stamped((k + 1) * 10 * MS, rng.normal(size=3))
+            elif k % 10 == 0:
+                topic, message = '/x', text_message(rng.bytes(200_000).hex())
+            data = TYPESTORE.serialize_cdr(message, types[topic])
+            writer.write(connections[topic], 10 + int(log_time(k, rng)), data)
+    return path
+
+
+def damage(path, share=None, metadata=True):
+    """Cut the bag's file off, as by a full disk; without metadata as by kill -9."""
+    (file,) = (item for item in path.iterdir() if item.suffix in ('.mcap', '.db3'))
+    if share is not None:
+        content = file.read_bytes()
+        file.write_bytes(content[: int(share * len(content))])
+    if not metadata:
+        (path / 'metadata.yaml').unlink()
+    return file

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import rclpy
@@ -48,6 +49,7 @@ from calib_ros.apply.simulation import drive, faulty, measure
 from calib_ros.files.recording import Recording
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.ros import advisor as advisor_module
 from calib_ros.ros import node as node_module
 from calib_ros.ros.node import CalibrationNode
 from calib_ros.sampling.intake import Stream, feed
@@ -62,7 +64,8 @@ LATCHED = QoSProfile(
 node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
 node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
 node_module.JOIN_TIMEOUT = 60.0  # what was begun ends, however busy the machine is
-BURST_NS = 370_000_000
+advisor_module.CLOUD = 500  # a cloud costs more than the identification before it
+BURST_NS = 600_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
 START = 1_700_000_000_000_000_000
 STOPS = 24
@@ -199,15 +202,27 @@ class Cell:
                 (item[0] + int(more), *item[1:]) for item, more in zip(queue, late, strict=True)
             ]
         queue.sort(key=lambda item: item[0])
-        for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
-            wanted = node.session.received.copy() if node else {}
-            for _, stream, publisher, message in burst:
-                publisher.publish(message)
-                if node:
-                    wanted[stream] += 1
-            self.spin_until(
-                lambda end=wanted: all(node.session.received[k] >= n for k, n in end.items())
-            )
+        with self.without_reports():
+            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
+                wanted = node.session.received.copy() if node else {}
+                for _, stream, publisher, message in burst:
+                    publisher.publish(message)
+                    if node:
+                        wanted[stream] += 1
+                self.spin_until(
+                    lambda end=wanted: all(node.session.received[k] >= n for k, n in end.items())
+                )
+
+    @contextmanager
+    def without_reports(self):
+        """Let the nodes report nothing meanwhile: it costs more than the messages."""
+        period = round(1e9 * node_module.DIAGNOSTICS_PERIOD)
+        reports = [t for node in self.nodes for t in node.timers if t.timer_period_ns == period]
+        for timer in reports:
+            timer.cancel()
+        yield
+        for timer in reports:
+            timer.reset()
 
 
 class Child:

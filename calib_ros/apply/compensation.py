@@ -21,12 +21,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.following import Follower
+from calib_ros.kinematics.following import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
@@ -125,8 +124,8 @@ class Refusal:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compensation(Shown):
-    """Corrected joint commands, with what they leave and what was refused.
+class Compensation(Solution):
+    """Corrected joint commands, with what they leave (`Solution`) and what was refused.
 
     Attributes
     ----------
@@ -134,17 +133,6 @@ class Compensation(Shown):
         Joint values [rad or m] as the controller believes them.
     joints : (N, n)
         The corrected ones; NaN in samples that are refused.
-    position, orientation : (N,)
-        Errors that remain [m], [rad], of refused samples as well: what could be reached.
-    position_before, orientation_before : (N,)
-        Errors without correction.
-    iterations : int
-        Of the slowest sample.
-    converged : (N,) bool
-    limited : (N, n) bool
-        Joints that are held at a limit.
-    damped : (N,) bool
-        Samples whose full correction would exceed the largest one: corrected in part.
     refusals : tuple of Refusal
         In the order of the samples.
 
@@ -152,15 +140,7 @@ class Compensation(Shown):
 
     command: FloatArray
     joints: FloatArray
-    position: FloatArray
-    orientation: FloatArray
-    position_before: FloatArray
-    orientation_before: FloatArray
-    iterations: int
-    converged: NDArray[np.bool_]
-    limited: NDArray[np.bool_]
-    damped: NDArray[np.bool_]
-    refusals: tuple[Refusal, ...]
+    refusals: tuple[Refusal, ...] = ()
 
     @property
     def correction(self) -> FloatArray:
@@ -192,19 +172,8 @@ def compensate(
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
     solution = follower.solve(command, approach)
-    result = Compensation(
-        command=command,
-        joints=np.clip(command + solution.change, follower.lower, follower.upper),  # rounding
-        position=solution.errors[:, 0],
-        orientation=solution.errors[:, 1],
-        position_before=solution.errors_before[:, 0],
-        orientation_before=solution.errors_before[:, 1],
-        iterations=solution.iterations,
-        converged=solution.converged,
-        limited=solution.held,
-        damped=solution.damped,
-        refusals=(),
-    )
+    joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
+    result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))
     result = refused(result, _unreached(compensator, result))
     return refused(result, _jumps(compensator, result))

@@ -34,6 +34,7 @@ from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.observations import Observations, configurations
@@ -111,6 +112,8 @@ class Verification(Shown):
         Frames that were fitted to the new measurements.
     holds : bool or None
         Whether the error agrees with the one of the calibration (`Calibration.holds`), if known.
+    reused : float
+        Share of the measurements that the calibration was fitted to (`Calibration.reused`).
 
     """
 
@@ -128,6 +131,7 @@ class Verification(Shown):
     by_program: bool
     fitted: tuple[str, ...] = ()
     holds: bool | None = None
+    reused: float = 0.0
 
     @property
     def configurations(self) -> int:
@@ -194,7 +198,7 @@ def verify(
     verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, arm.holds(rms))
+    known = (commanded is not None, fitted, arm.holds(rms), arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 
@@ -361,7 +365,7 @@ def each_in_words(found: Verification) -> list[str]:
 
 def remarks(found: Verification) -> list[str]:
     """Return what to know besides the figures, and what to do."""
-    lines = []
+    lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if found.fitted:
         lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     if not found.by_program:

@@ -12,12 +12,13 @@ import numpy as np
 
 from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import add_out, refuse_existing
+from calib_ros.cli.options import add_out, at_least, refuse_existing
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.images import SUFFIXES, Image, detect, files_of, image_of, marker_cells
+from calib_ros.files.detector import detect, marker_cells
+from calib_ros.files.images import SUFFIXES, Image, files_of, image_of
 from calib_ros.kinematics.chain_file import dump_yaml
 
 
@@ -76,8 +77,7 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
 
 def _images(options: argparse.Namespace, screen: Screen) -> int:
     refuse_existing(options, options.out)
-    if options.fewest < 1:
-        raise InputError(f'--fewest must be at least 1, not {options.fewest}')
+    at_least(options, fewest=1)
     board = read_board(options.board)
     with screen.work('looking for corners') as work:
         found = detect(_pictures(options, work), board, options.fewest, screen.say)

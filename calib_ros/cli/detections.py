@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from calib_ros.cli.inputs import Loaded, table
+from calib_ros.cli.inputs import table
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.boards import (
@@ -18,6 +18,7 @@ from calib_ros.files.boards import (
     read_lens,
     read_places,
 )
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain import Chain

@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import add_chain, add_out, results
 from calib_ros.cli.screen import Screen
@@ -62,8 +61,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     elif Path(options.chain).suffix in URDF_SUFFIXES:
         urdf = read_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
-    with results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as folder:
-        write_files(folder, {each.name: each.content for each in found})
+    with results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
+        contents |= {each.name: each.content for each in found}
     for each in found:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
         screen.say(f'{options.out / each.name}: {exact}')

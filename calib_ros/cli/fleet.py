@@ -10,14 +10,11 @@ from pathlib import Path
 
 from calib_ros.atomic import write_file
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import INCOMPLETE, NOT_ACCEPTED, at_least
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
-
-INCOMPLETE = 4
-"""Exit status when measurements of some robots could not be used, and no robot needs a look."""
 
 
 def _add_fleet(parser: argparse.ArgumentParser) -> None:
@@ -51,8 +48,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
 
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')
-    if options.workers < 0:
-        raise InputError(f'--workers must be at least 1, not {options.workers}')
+    at_least(options, workers=0)
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)

@@ -9,10 +9,9 @@ import json
 import math
 from pathlib import Path
 
-from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.detections import detected
-from calib_ros.cli.inputs import Loaded, of_bag, of_table
+from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
@@ -40,7 +39,8 @@ from calib_ros.cli.results import (
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.boards import POSED, posed_arm
-from calib_ros.files.history import History
+from calib_ros.files.loading import LARGEST_LOSS, Loaded, of_bag, of_table
+from calib_ros.files.rows import identified as row_of
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
 from calib_ros.settings import Settings
@@ -54,9 +54,6 @@ DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
 OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
-LARGEST_LOSS = 0.1
-"""Share of the messages of a bag that may be lost. As many fewer samples at random make standard
-deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -133,15 +130,15 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.previous is not None:
         return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
     history = history_of(options)
-    if options.out is None:
+    with results(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
-    else:
-        with results(options, (*RESULT_FILES, 'report.pdf')) as folder:
-            found = _identified(options, screen)
-            made = result_files(found, screen, options.out, options.tolerance, options.pdf)
-            write_files(folder, made)
+        if options.out is not None:
+            contents |= result_files(found, screen, options.out, options.tolerance, options.pdf)
     if history is not None:
-        _file(history, found, options)
+        problem, measured = found.loaded.problem, options.csv or options.measured
+        judged, used = (*problem.sets, *problem.judging), options.detections or measured
+        about = filing_of(options, problem.chain, judged, used, options.largest_loss)
+        history.file(row_of(found.result, about, found.warnings))
     for warning in (*found.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
@@ -149,16 +146,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     else:
         show(found, screen, options.out)
     return 0 if found.result.accepted else NOT_ACCEPTED
-
-
-def _file(history: History, found: Identified, options: argparse.Namespace) -> None:
-    from calib_ros.files.rows import identified, settings_hash
-
-    problem = found.loaded.problem
-    hashed = settings_hash(problem.chain, settings_of(options), options.largest_loss)
-    measured = options.csv or options.detections or options.measured
-    about = filing_of(options, (*problem.sets, *problem.judging), measured, hashed)
-    history.file(identified(found.result, about, found.warnings))
 
 
 def _source(options: argparse.Namespace) -> str:
@@ -184,9 +171,13 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     if options.detections is not None:
         loaded = detected(options, chain, settings, screen)
     elif source == 'table':
-        loaded = of_table(options, chain, settings, screen)
+        given = {'sockets': options.socket_distance, 'sigma_touch': options.sigma_touch}
+        given = {name: value for name, value in given.items() if value is not None}
+        found = table(options, options.csv, chain, settings, screen, options.eye_in_hand)
+        loaded = of_table(found, chain, settings, **given)
     else:
-        loaded = of_bag(options.measured, chain, settings, screen, options.largest_loss)
+        bag = replayed(options.measured, chain, settings, screen)
+        loaded = of_bag(*bag, options.largest_loss)
     return loaded, settings
 
 

@@ -74,14 +74,7 @@ def proposal(path: Path) -> str | None:
 
 
 def refuse_others(path: Path, command: str, *wanted: str) -> str:
-    """Return which of the wanted kinds a file is, the last one where nothing tells.
-
-    Raises
-    ------
-    InputError
-        When it is of another kind.
-
-    """
+    """Return which of the wanted kinds a file is, the last one where nothing tells."""
     kind = kind_of(path) or wanted[-1]
     if kind not in wanted:
         what, where = WORDS[kind]

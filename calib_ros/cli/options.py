@@ -5,20 +5,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from calib_ros.atomic import whole_folder
+from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.rows import Filing, content_hash, measured_at
+from calib_ros.files.recording import STORAGES
+from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_robots
@@ -34,11 +35,13 @@ from calib_ros.report.page import (
 )
 from calib_ros.settings import Settings
 
-NOT_ACCEPTED = 3
-"""Exit status when the input was used, but what came out does not do."""
-
+NOT_ACCEPTED, INCOMPLETE = 3, 4
+"""Exit status when the input was used but what came out does not do; of a fleet, when measurements
+of some robots could not be used and no robot needs a look."""
 
 Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
+Contents: TypeAlias = dict[str, str | bytes]
+"""Of files by name."""
 SETTINGS = {
     'the fit': ('model', 'fixed', 'priors', 'loss', 'folds'),
     'how the device measures': ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'frame_id'),
@@ -122,9 +125,15 @@ def add_out(
 
 def add_storage(parser: Group) -> None:
     """Add the option that says how a bag is stored."""
-    parser.add_argument(
-        '--storage', choices=('mcap', 'sqlite3'), default='mcap', help='of the bag'
-    )
+    parser.add_argument('--storage', choices=STORAGES, default='mcap', help='of the bag')
+
+
+def at_least(options: argparse.Namespace, **lowest: float) -> None:
+    """Refuse options that are less than they may be; one that is not given is none."""
+    for name, least in lowest.items():
+        value = getattr(options, name)
+        if value is not None and not value >= least:
+            raise InputError(f'--{name} must be at least {least}, not {value}')
 
 
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
@@ -167,7 +176,6 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     given = {name: getattr(options, name) for name in names}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
-
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
     if options.joints_preset and options.joints is None:
         raise InputError('--joints-preset is of use with --joints FILE only')
@@ -193,13 +201,20 @@ def sessions_of(options: argparse.Namespace) -> tuple[str, ...]:
     return tuple(options.session.split(',')) if options.session else ()
 
 
-def results(options: argparse.Namespace, names: Sequence[str]) -> AbstractContextManager[Path]:
-    """Return the folder --out to be made in a `with` block; see `whole_folder`.
+@contextmanager
+def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Contents]:
+    """Yield the files of --out, to be filled in; they are written at the end, all or none.
 
     Files of these names (glob patterns) are refused before any work is done, or replaced by
-    --force. Other files stay in the folder.
+    --force. Other files stay in the folder. Without --out nothing is written.
     """
-    return whole_folder(options.out, names, overwrite=options.force)
+    contents: Contents = {}
+    if options.out is None:
+        yield contents
+        return
+    with whole_folder(options.out, names, overwrite=options.force) as folder:
+        yield contents
+        write_files(folder, contents)
 
 
 def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
@@ -215,6 +230,13 @@ def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
         add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
 
 
+def add_moved(parser: Group) -> None:
+    """Add the options that say what of the cell is another one now."""
+    add = parser.add_argument
+    add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
+    add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+
+
 def add_history(parser: Group) -> None:
     """Add the option that says where a result is filed besides."""
     parser.add_argument(
@@ -228,16 +250,20 @@ def history_of(options: argparse.Namespace) -> History | None:
     """Return where a result is filed, if it is to be; refuse one without a serial number."""
     if options.history is None:
         return None
-
     if not options.serial:
         raise InputError('--history files by serial number: give --serial as well')
     return History(options.history)
 
 
 def filing_of(
-    options: argparse.Namespace, sets: Sequence[Observations], measured: Path, settings: str
+    options: argparse.Namespace,
+    nominal: Chain,
+    sets: Sequence[Observations],
+    measured: Path,
+    *judged_by: object,
 ) -> Filing:
-    """Return what is filed of a result besides the result; `settings` is a hash."""
+    """Return what is filed of a result besides the result."""
+    settings = settings_hash(nominal, settings_of(options), *judged_by)
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
@@ -256,7 +282,7 @@ def origin_of(
 
 def page_of(
     report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
-) -> dict[str, str | bytes]:
+) -> Contents:
     """Return a report as the content of files by name; nothing where an extra is missing.
 
     That is said once. `pdf` asks for report.pdf as well.

@@ -23,6 +23,7 @@ from calib_ros.cli.options import (
     add_identity,
     add_out,
     add_settings,
+    at_least,
     origin_of,
     page_of,
     refuse_existing,
@@ -35,9 +36,6 @@ from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.maps import plan_report
-
-TASK_POSES = 300
-"""Random poses at which a plan is to be accurate when no task is given."""
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -138,8 +136,9 @@ def _measurement(
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
         design = design.after(read_joints(options.taken, design.chain))
-    task = design.chain.random_joints(TASK_POSES, rng)
-    if options.task is not None:
+    if options.task is None:
+        task = design.chain.random_joints(300, rng)
+    else:
         task = read_joints(options.task, design.chain)
     if options.candidates is None:
         candidates = draw_candidates(design, options.draw, rng, visibility)
@@ -177,14 +176,11 @@ def _check(options: argparse.Namespace) -> None:
     for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
         if options.iso9283 and getattr(options, name) is not None:
             raise InputError(f'--{name} is of no use with --iso9283')
-    for name, lowest in (('poses', 1), ('draw', 1), ('seed', 0)):
-        value = getattr(options, name)
-        if value is not None and value < lowest:
-            raise InputError(f'--{name} must be at least {lowest}, not {value}')
+    at_least(options, poses=1, draw=1, seed=0, apart=0)
     if options.accuracy is not None and not options.accuracy > 0.0:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')
-    if options.apart < 0.0 or not all(value > 0.0 for value in options.velocity):
-        raise InputError('--apart must not be negative, and each --velocity must be positive')
+    if not all(value > 0.0 for value in options.velocity):
+        raise InputError('each --velocity must be positive')
     if options.out is not None:
         refuse_existing(options, options.out, _page_beside(options.out))
 

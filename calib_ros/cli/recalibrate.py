@@ -8,11 +8,9 @@ import argparse
 import json
 from collections.abc import Callable
 
-from calib_ros.atomic import write_files
-from calib_ros.cli.inputs import Loaded
-from calib_ros.cli.options import NOT_ACCEPTED, results
+from calib_ros.cli.options import NOT_ACCEPTED, add_moved, at_least, results
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.identification.recalibration import GROWTH, Recalibration, recalibrate, years_since
 
@@ -21,7 +19,8 @@ FILES = ('calibration.yaml', 'result.json')
 
 def add_previous(parser: argparse.ArgumentParser) -> None:
     """Add the options of an earlier calibration."""
-    add = parser.add_argument_group('an earlier calibration (docs/history.md)').add_argument
+    group = parser.add_argument_group('an earlier calibration (docs/history.md)')
+    add = group.add_argument
     add(
         '--previous',
         metavar='CALIBRATION',
@@ -34,21 +33,16 @@ def add_previous(parser: argparse.ArgumentParser) -> None:
         metavar='MM',
         help='by which lengths wander in a year; angles by twice as many mrad',
     )
-    add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
-    add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+    add_moved(group)
 
 
 def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], screen: Screen) -> int:
     """Bring the earlier calibration up to date; return the exit status."""
-    if options.out is None:
+    with results(options, FILES) as contents:
         found = _found(options, loaded(), screen)
-    else:
-        with results(options, FILES) as folder:
-            found = _found(options, loaded(), screen)
-            contents: dict[str, str | bytes] = {'result.json': _document(found)}
-            if found.accepted:
-                contents['calibration.yaml'] = found.calibration.dump()
-            write_files(folder, contents)
+        contents['result.json'] = _document(found)
+        if found.accepted:
+            contents['calibration.yaml'] = found.calibration.dump()
     if options.json:
         screen.data(_document(found))
     else:
@@ -57,8 +51,7 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
 
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
-    if not options.growth >= 0.0:
-        raise InputError(f'--growth must not be negative, not {options.growth}')
+    at_least(options, growth=0)
     previous = load_calibration(options.previous, loaded.problem.chain)
     for warning in loaded.warnings:
         screen.warn(warning)

@@ -5,17 +5,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib_ros.cli.inputs import Loaded
 from calib_ros.cli.options import page_of
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
-from calib_ros.identification.model_choice import identify_model
 from calib_ros.report import words
 from calib_ros.report.advice import advice
 from calib_ros.report.markdown import markdown
@@ -50,17 +48,9 @@ class Identified:
 
 
 def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origin) -> Identified:
-    """Identify, and refuse the result where too much of the input is lost."""
+    """Identify with a sign of life."""
     with screen.work('identifying') as work:
-        try:
-            result = identify_model(loaded.problem, settings.model, work)
-        except TooFewObservationsError as err:
-            if loaded.read:
-                raise InputError(f'{err} ({loaded.read})') from err
-            raise
-    own = () if loaded.instead else result.refusals
-    result = replace(result, refusals=(*own, *loaded.refusals))
-    return Identified(loaded, result, origin)
+        return Identified(loaded, loaded.identified(settings.model, work), origin)
 
 
 def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
@@ -151,7 +141,8 @@ def result_files(
         contents |= page_of(report, screen, pdf=pdf)
     earlier = out / 'calibration.yaml'
     if result.accepted:
-        contents['calibration.yaml'] = Calibration.of(result, owners=loaded.owners).dump()
+        kept = Calibration.of(result, owners=loaded.owners, fitted=loaded.problem.sets)
+        contents['calibration.yaml'] = kept.dump()
     elif earlier.exists():
         contents['calibration.previous.yaml'] = earlier.read_bytes()
     return contents

@@ -19,11 +19,10 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 WIDTH = 80
-FIRST_S = 0.5
-"""Time after which work shows on a terminal that it goes on."""
 EVERY_S = 2.0
 """Time between two signs of life; where they stay, as in a log, each time doubles it."""
-LONGEST_S = 16.0 * EVERY_S
+FIRST_S = EVERY_S / 4.0
+"""Time after which a bar shows on a terminal."""
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 
@@ -141,28 +140,14 @@ class Work:
 
     def watch(self) -> None:
         """Show that the work goes on until it is done."""
-        if not sys.stderr.isatty():
+        console = _console(sys.stderr)
+        if console is None:
             pause = EVERY_S
             while not self.done.wait(pause):
                 print(f'calib_ros: {self}', file=sys.stderr, flush=True)
-                pause = min(2.0 * pause, LONGEST_S)
+                pause = min(2.0 * pause, 16.0 * EVERY_S)
         elif not self.done.wait(FIRST_S):
-            console = _console(sys.stderr)
-            if console is None:
-                self._in_one_line()
-            else:
-                self._as_bar(console)
-
-    def _in_one_line(self) -> None:
-        """Write one line of a plain terminal over and over."""
-        width = _width(sys.stderr) - 1
-        while True:
-            sys.stderr.write(f'\r{str(self)[:width]:{width}}')
-            sys.stderr.flush()
-            if self.done.wait(FIRST_S):
-                break
-        sys.stderr.write('\r' + ' ' * width + '\r')
-        sys.stderr.flush()
+            self._as_bar(console)
 
     def _as_bar(self, console: Any) -> None:
         from rich import progress

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
-from calib_ros.atomic import write_files
+from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli.command import Command
-from calib_ros.cli.inputs import of_bag
+from calib_ros.cli.inputs import replayed
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
     add_out,
     add_storage,
+    at_least,
     origin_of,
-    results,
 )
 from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
-from calib_ros.errors import InputError
+from calib_ros.files.loading import of_bag
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
@@ -62,14 +62,14 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 def _demo(options: argparse.Namespace, screen: Screen) -> int:
     chain, settings = load_chain(options.chain), Settings()
     own = (*RESULT_FILES, 'bag_truth.yaml', 'bag/bag.*', 'bag/metadata.yaml')
-    with results(options, own) as folder:
+    with whole_folder(options.out, own, overwrite=options.force) as folder:
         folder.mkdir()
         bag = folder / 'bag'
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         with screen.work('simulating'):
             truth = _write_simulation(chain, options, bag)
         screen.say('2. reading that recording as one of a real cell')
-        loaded = of_bag(bag, chain, settings, screen)
+        loaded = of_bag(*replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors from it')
         configuration = words.configuration_yaml(options.chain, settings)
         origin = origin_of(options, [bag], configuration)
@@ -85,11 +85,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
 
 def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
     """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
-    if options.poses < 1 or options.seed < 0:
-        raise InputError(
-            f'--poses must be at least 1 and --seed at least 0, not {options.poses} and '
-            f'{options.seed}'
-        )
+    at_least(options, poses=1, seed=0)
     rng, cell = np.random.default_rng(options.seed), Cell()
     true = faulty(chain, cell, rng)
     configurations = chain.random_joints(options.poses, rng)

@@ -9,18 +9,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
-from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     OF_BAGS,
+    Contents,
     add_calibration,
     add_chain,
     add_history,
     add_identity,
     add_layout,
+    add_moved,
     add_out,
     add_settings,
     filing_of,
@@ -32,10 +33,9 @@ from calib_ros.cli.options import (
 )
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.history import History
-from calib_ros.files.rows import settings_hash, verified
+from calib_ros.files.rows import verified
 from calib_ros.files.waypoints import read_joints
-from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
+from calib_ros.identification.calibration import calibration_file, load_calibration
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
@@ -70,8 +70,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         help='the program before its correction, q1..qn: judge against the poses that it means',
     )
     add('--session', metavar='NAME', help='session of the table')
-    add('--new-base', action='store_true', help='the measuring device stands elsewhere now')
-    add('--new-tool', action='store_true', help='the target is another one, or mounted anew')
+    add_moved(group)
     group = parser.add_argument_group('how to judge')
     group.add_argument(
         '--tolerance',
@@ -90,17 +89,15 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    if options.out is None:
-        return _verified(options, screen)[0]
-    with results(options, VERIFICATION_FILES) as folder:
-        status, contents = _verified(options, screen)
-        write_files(folder, contents)
-    screen.say(f'wrote {options.out}')
+    with results(options, VERIFICATION_FILES) as contents:
+        status = _verified(options, screen, contents)
+    if options.out is not None:
+        screen.say(f'wrote {options.out}')
     return status
 
 
-def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[str, str | bytes]]:
-    """Judge, and print what comes out; return the exit status and the files of --out."""
+def _verified(options: argparse.Namespace, screen: Screen, contents: Contents) -> int:
+    """Judge, print what comes out, and fill in the files of --out; return the exit status."""
     history = history_of(options)
     nominal = load_chain(options.chain)
     arm = load_calibration(options.calibration, nominal)
@@ -119,23 +116,24 @@ def _verified(options: argparse.Namespace, screen: Screen) -> tuple[int, dict[st
             options.new_tool,
         )
     if history is not None:
-        _file(history, found, options, arm, nominal, sets)
+        judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
+        hashed = table_hash(arm.chain)
+        about = filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
+        history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)
-    words = in_words(found)
     show(found, screen)
     status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
     if options.out is None:
-        return status, {}
+        return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report'):
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
         report = verification_report(arm.chain, found, poses, origin_of(options, read), warnings)
-        contents: dict[str, str | bytes] = {
-            'residuals.csv': poses.table(),
-            'verification.txt': f'{words}\n',
-        }
-        return status, contents | page_of(report, screen, pdf=options.pdf)
+        contents['residuals.csv'] = poses.table()
+        contents['verification.txt'] = f'{in_words(found)}\n'
+        contents |= page_of(report, screen, pdf=options.pdf)
+    return status
 
 
 def show(found: Verification, screen: Screen) -> None:
@@ -166,19 +164,6 @@ def show(found: Verification, screen: Screen) -> None:
         screen.say('\n'.join(['position error [mm] by configuration', *each_in_words(found)]))
     for remark in remarks(found):
         screen.bullet(remark)
-
-
-def _file(
-    history: History,
-    found: Verification,
-    options: argparse.Namespace,
-    arm: Calibration,
-    nominal: Chain,
-    sets: Sequence[Observations],
-) -> None:
-    judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
-    hashed = settings_hash(nominal, settings_of(options), table_hash(arm.chain), *judged_by)
-    history.file(verified(arm.chain, found, filing_of(options, sets, options.measured, hashed)))
 
 
 def _sets(

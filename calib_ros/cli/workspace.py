@@ -12,12 +12,13 @@ import numpy as np
 from calib_ros.apply import placement, workspace
 from calib_ros.apply.placement import AIMS, task_of
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions
-from calib_ros.atomic import write_files
 from calib_ros.cli.command import Command
 from calib_ros.cli.options import (
+    Contents,
     add_chain,
     add_identity,
     add_out,
+    at_least,
     origin_of,
     page_of,
     results,
@@ -38,8 +39,6 @@ from calib_ros.report.markdown import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
-BOX_POSES = 30
-"""Random poses that stand for a task given as a box of joint values."""
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -67,16 +66,14 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    for name, lowest in (('poses', 100), ('cells', 1), ('turns', 1), ('seed', 0)):
-        if getattr(options, name) < lowest:
-            raise InputError(f'--{name} must be at least {lowest}, not {getattr(options, name)}')
-    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as folder:
-        write_files(folder, _files(options, screen))
+    at_least(options, poses=100, cells=1, turns=1, seed=0)
+    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
+        contents |= _files(options, screen)
     screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
     return 0
 
 
-def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes]:
+def _files(options: argparse.Namespace, screen: Screen) -> Contents:
     """Map, place, print what comes out, and return the files of it."""
     from calib_ros.report import plots
 
@@ -85,7 +82,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> dict[str, str | bytes
     task = _task(options, arm, rng)
     with screen.work('mapping errors over the workspace'):
         survey = workspace.survey(arm, options.poses, rng)
-        contents: dict[str, str | bytes] = {
+        contents: Contents = {
             'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
             'workspace.png': plots.workspace_png(survey),
         }
@@ -143,7 +140,7 @@ def _task(
     lower, upper = np.reshape(options.joint_box, (2, size))
     if not (lower <= upper).all():
         raise InputError('--joint-box: give all lower values first, then all upper ones')
-    joints = rng.uniform(lower, upper, (BOX_POSES, size))
+    joints = rng.uniform(lower, upper, (30, size))  # poses that stand for all
     return task_of(in_base(arm.commanded_by(options.model), joints))
 
 

@@ -36,11 +36,6 @@ class Archive:
     configuration : callable
         Returns the configuration to write beside a journal.
 
-    Raises
-    ------
-    InputError
-        When no file can be written in the folder.
-
     """
 
     def __init__(
@@ -98,8 +93,7 @@ class Archive:
                 self._journal = Journal(self._path, self._joints)
                 self._due = False
             while self._journal is not None and self._waiting:
-                sample, removed = self._waiting[0]
-                (self._journal.remove if removed else self._journal.add)(sample)
+                self._journal.add(*self._waiting[0])
                 del self._waiting[0]
         except OSError as err:
             self.error = str(err)
@@ -107,15 +101,9 @@ class Archive:
             self.error = ''
 
     def begin_anew(self) -> Path | None:
-        """Begin another journal; return the path of the old one, which stays.
+        """Begin another journal, unless samples would be lost; return the path of the old one.
 
         The new one is written at once: after a crash it must be the newest.
-
-        Raises
-        ------
-        InputError
-            When samples cannot be written, which would be lost.
-
         """
         self.write()
         if self._waiting:
@@ -131,14 +119,7 @@ class Archive:
         return old
 
     def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-        """Go on with the newest journal, if there is one; return its samples, and warnings.
-
-        Raises
-        ------
-        InputError
-            When it cannot be read.
-
-        """
+        """Go on with the newest journal, if there is one; return its samples, and warnings."""
         found = self._files(JOURNAL)
         if not found:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
@@ -155,14 +136,6 @@ class Archive:
         """Write a calibration, into a new file unless a path is given; return its path.
 
         The configuration by which it was made, where that is known, is written beside it.
-
-        Raises
-        ------
-        InputError
-            When one of the files is there already.
-        OSError
-            When it cannot be written.
-
         """
         path = path or self._new_path(CALIBRATION)
         beside = path.with_suffix(SETTINGS)

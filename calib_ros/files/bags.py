@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files.cameras import cameras_of
+from calib_ros.files.mcap import LARGEST_CHUNK
 from calib_ros.files.salvage import (
     NOT_CLOSED,
     Salvage,
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 BATCH = 2000
 """Messages that are decoded at once."""
-MOST_AT_ONCE = 50_000_000
-"""Bytes from which fewer are: images."""
 ALLOW = 'take the rest all the same with --largest-loss'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|is there already')
@@ -119,15 +118,13 @@ def _replay(
     path: Path, folder: Path, session: CalibrationSession, told: Callable[[float], None]
 ) -> Replayed:
     """Feed the files in a folder, which are those of a bag or were unpacked from it."""
-    library = rosbag2()
+    rosbag2()  # damaged or not, nothing is read without
     try:
-        check(folder)
-        reader = library.Reader(folder)
-        reader.open()
-    except Exception as err:  # a damaged file fails in many ways, in the library and below it
+        reader = _opened(path, folder)
+    except InputError:
         found = salvage(folder)
         if found is None:
-            raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
+            raise
         return _salvaged(path, folder, found, session)
     with closing(reader):
         available = named((c.topic, c.msgtype) for c in reader.connections)
@@ -152,6 +149,18 @@ def _replay(
     lost = max(0, expected - count)
     damaged = f'{path} is damaged ({shortened(problem)}): {lost} of {expected} messages are lost'
     return Replayed(expected, count, (*session.warnings, damaged))
+
+
+def _opened(path: Path, folder: Path) -> Any:
+    """Return the library's reader of the files in a folder, those of the bag at a path."""
+    library = rosbag2()
+    try:
+        check(folder)
+        reader = library.Reader(folder)
+        reader.open()
+    except Exception as err:  # a damaged file fails in many ways, in the library and below it
+        raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
+    return reader
 
 
 def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSession) -> Replayed:
@@ -182,30 +191,23 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
     """
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
-    library, deserialise = rosbag2(), _deserialiser({})
-    with unpacked_files(path) as folder:
-        try:
-            check(folder)
-            reader = library.Reader(folder)
-            reader.open()
-        except Exception as err:  # as in `_replay`
-            raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
-        with closing(reader):
-            found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}
-            if topic and topic not in found:
-                raise UnknownNameError(f'topic of images in {path}', topic, found)
-            if len(found) != 1 and not topic:
-                names = ', '.join(found) or f'{" or ".join(PICTURES)}'
-                problem = 'several topics of images, choose one with --topic' if found else 'no'
-                raise InputError(f'{path} has {problem}: {names}')
-            wanted = [found[topic]] if topic else list(found.values())
-            for connection, _, data in reader.messages(wanted):
-                try:
-                    message = deserialise(data, connection.msgtype)
-                except Exception as err:  # a damaged message fails in many ways
-                    raise InputError(f'{path}: a damaged image on {connection.topic}') from err
-                stamp = message.header.stamp
-                yield stamp.sec * 1_000_000_000 + stamp.nanosec, message
+    deserialise = _deserialiser({})
+    with unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
+        found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}
+        if topic and topic not in found:
+            raise UnknownNameError(f'topic of images in {path}', topic, found)
+        if len(found) != 1 and not topic:
+            names = ', '.join(found) or f'{" or ".join(PICTURES)}'
+            problem = 'several topics of images, choose one with --topic' if found else 'no'
+            raise InputError(f'{path} has {problem}: {names}')
+        wanted = [found[topic]] if topic else list(found.values())
+        for connection, _, data in reader.messages(wanted):
+            try:
+                message = deserialise(data, connection.msgtype)
+            except Exception as err:  # a damaged message fails in many ways
+                raise InputError(f'{path}: a damaged image on {connection.topic}') from err
+            stamp = message.header.stamp
+            yield stamp.sec * 1_000_000_000 + stamp.nanosec, message
 
 
 def _chosen(
@@ -248,14 +250,7 @@ def _check_links(streams: Mapping[str, Stream]) -> None:
 
 
 def rosbag2() -> Any:
-    """Return the library that reads and writes bags; nothing but bags needs it.
-
-    Raises
-    ------
-    InputError
-        When it is not installed: Ubuntu does not package it.
-
-    """
+    """Return the library that reads and writes bags; nothing but bags needs it."""
     try:
         from rosbags import rosbag2
     except ImportError as err:
@@ -311,7 +306,7 @@ def _extend(batch: list[tuple[Stream, bytes]], messages: Iterator[tuple[Stream, 
     for each in itertools.islice(messages, BATCH):
         batch.append(each)
         size += len(each[1]) if isinstance(each[1], bytes) else 0
-        if size > MOST_AT_ONCE:
+        if size > LARGEST_CHUNK:  # images
             return False
     return len(batch) < BATCH
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.boards import lens_of, read_board
-from calib_ros.files.images import Detector, image_of
+from calib_ros.files.detector import Detector
+from calib_ros.files.images import image_of
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View

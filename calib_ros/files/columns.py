@@ -37,12 +37,6 @@ class Columns:
         """Return the numbers (N, len(names)), NaN for empty cells.
 
         Many columns at once take hardly longer than one. Errors name them as they are `called`.
-
-        Raises
-        ------
-        InputError
-            When a cell is no number.
-
         """
         found = self._numbers(names)
         if found is not None:
@@ -74,12 +68,6 @@ class Columns:
         """Return numbers (N, len(names)) of which each row has all or, if not `needed`, none.
 
         `values` are the numbers of the columns where they are known.
-
-        Raises
-        ------
-        InputError
-            When a row has some of them only, or one beyond the largest.
-
         """
         found = self.numbers(names) if values is None else values
         nothing = np.isnan(found)
@@ -95,14 +83,7 @@ class Columns:
         return found
 
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Return the integers (N,) of a column, for empty cells those given if any are.
-
-        Raises
-        ------
-        InputError
-            When a cell holds no integer of 64 bits.
-
-        """
+        """Return the integers (N,) of a column, for empty cells those given if any are."""
         texts = self.texts(name)
         try:
             found = np.array([int(text) for text in texts], dtype=np.int64)

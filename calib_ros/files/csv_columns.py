@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import InputError
+from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, MOST_ROWS, csv_lines, read_text
+from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, read_text
 
 IRREGULAR = ('"', '\r', '\0')
 """What cells are not cut at separators alone with."""
@@ -116,23 +116,20 @@ class TextColumns(Columns):
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
-    """Return the columns of a CSV with rows, some of which it needs to have.
+    """Return the columns of a CSV with rows, some of which it needs to have."""
+    return with_rows(columns_of(path, read_text(path, LARGEST_TABLE, InputError)), needed)
 
-    Raises
-    ------
-    InputError
-        When it has not, or is no table.
 
-    """
-    found = columns_of(path, read_text(path, LARGEST_TABLE, InputError))
+def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
+    """Return columns; refuse those without rows, and without any of those that are needed."""
     missing = [name for name in needed if name not in found.header]
     if missing:
         raise InputError(
-            f'{path} has no column {", ".join(missing)}; expected {", ".join(needed)}; found '
-            f'{", ".join(found.header) or "nothing"}'
+            f'{found.path} has no column {", ".join(missing)}; expected {", ".join(needed)}; '
+            f'found {", ".join(found.header) or "nothing"}'
         )
     if not len(found.lines):
-        raise InputError(f'{path} has no rows')
+        raise InputError(f'{found.path} has no rows')
     return found
 
 
@@ -171,7 +168,7 @@ def regular(
         first, _, text = text.partition('\n')
         header, lines = first.split(separator), lines[1:]
     width = len(header)
-    if not len(lines) or len(set(header)) < width or width > MOST_COLUMNS:
+    if not len(lines) or len(set(header)) < width or width > MOST_ENTRIES:
         return None
     flat = np.frombuffer(text.encode(), dtype=np.uint8)
     ends = np.flatnonzero((flat == ord(separator)) | (flat == ord('\n'))).astype(np.int32)
@@ -192,8 +189,8 @@ def _irregular(path: Path, text: str) -> MadeColumns:
         for row in reader:
             if not (row and header):
                 header = header or row
-                if len(header) > MOST_COLUMNS:
-                    raise InputError(f'{path} has {len(header)} columns, more than {MOST_COLUMNS}')
+                if len(header) > MOST_ENTRIES:
+                    raise InputError(f'{path} has {len(header)} columns, more than {MOST_ENTRIES}')
                 continue
             if any(row[len(header) :]):
                 raise InputError(

@@ -38,12 +38,10 @@ from calib_ros.kinematics.chain import Chain, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import csv_text
 
 EXACT = 1e-9
 """Largest difference [m, and in rotation matrices] of an export that is called exact."""
-POSES = 1000
-FITTED = 200
-"""Poses to which a table that cannot be exact is fitted; it is judged on all."""
 FILES = (
     *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
     *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
@@ -90,8 +88,7 @@ def exports(
         When a file, read back, differs from the chain.
 
     """
-    rng = np.random.default_rng(0)
-    q = chain.random_joints(POSES, rng)
+    q = anywhere(chain)
     arm = replace(chain, effects=())
     wanted = arm.forward(q)
     lost = _distance(chain.forward(q), wanted) if chain.effects else 0.0
@@ -118,6 +115,11 @@ def exports(
         text = _csv(best, f'{nominal.convention} {what}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
+
+
+def anywhere(chain: Chain) -> FloatArray:
+    """Return the joint values (N, n) at which files are held against a chain."""
+    return chain.random_joints(1000, np.random.default_rng(0))
 
 
 def converted(chain: Chain, convention: str) -> Chain:
@@ -244,14 +246,11 @@ def urdf_foot(chain: Chain) -> str:
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
     """Return the table of a chain with a line that says what it is."""
-    text = io.StringIO()
-    text.write(head(chain, what, error, digest))
-    writer = csv.writer(text, lineterminator='\n')
-    writer.writerow(ROW)
-    for joint in chain.joints:
-        numbers = [repr(float(getattr(joint, kind))) for kind in DH_KINDS]
-        writer.writerow([to_cell(joint.name), joint.type, joint.sign, *numbers])
-    return text.getvalue()
+    rows = [
+        (to_cell(each.name), each.type, each.sign, *(getattr(each, kind) for kind in DH_KINDS))
+        for each in chain.joints
+    ]
+    return head(chain, what, error, digest) + csv_text([ROW, *rows])
 
 
 def _read_csv(text: str, form: Chain) -> Chain:
@@ -301,7 +300,7 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         or Parameter(name).kind in kinds
         or ('zero' in kinds and name in driven)
     ]
-    joints = joints[:: max(1, len(joints) // FITTED)]
+    joints = joints[:: max(1, len(joints) // 200)]  # to be fitted; it is judged on all
     poses = chain.forward(joints)
     observations = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     system = System((Samples(observations, 1e-4, 1e-3),))

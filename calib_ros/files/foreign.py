@@ -4,8 +4,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -19,6 +17,7 @@ from calib_ros.files.layouts import (
     ANGLES,
     COVARIANCE,
     IN_TURN,
+    JOINT,
     LENGTHS,
     NUMBERS,
     POSITION,
@@ -34,6 +33,7 @@ from calib_ros.files.turns import finished
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import MOST_JOINTS
+from calib_ros.texts import csv_text
 
 MEASURED = (*POSITION, 'distance')
 UNITS = {
@@ -96,18 +96,13 @@ class Foreign:
 
 def as_csv(columns: MadeColumns) -> str:
     """Return the text of a table; numbers are exact."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator='\n')
     names = sorted(columns.header, key=_place)
-    writer.writerow(names)
-    writer.writerows(zip(*(columns.texts(name) for name in names), strict=True))
-    return out.getvalue()
+    return csv_text([names, *zip(*map(columns.texts, names), strict=True)])
 
 
 def _place(name: str) -> tuple[int, int]:
-    letter, digits = name[0], name[1:]
-    if letter in 'qsva' and digits.isdigit():
-        return 1 + 'qsva'.index(letter), int(digits)
+    if JOINT.fullmatch(name):
+        return 1 + 'qsva'.index(name[0]), int(name[1:])
     order = ('session', 'split', 'stamp_ns', *POSITION, *QUATERNION, 'distance', *COVARIANCE)
     rank = order.index(name) if name in order else len(order)
     return (0 if rank < 3 else 5), rank
@@ -124,9 +119,7 @@ class _Table:
         self._ours = {
             ours: theirs
             for ours, theirs in layout.columns.items()
-            if not (ours[1:].isdigit() and ours[0] in 'qsva' and int(ours[1:]) > most)
-            and (joints or not re.fullmatch('[qsva][0-9]+', ours))
-            and (not alone or re.fullmatch('[qsva][0-9]+', ours))
+            if (joints and int(ours[1:]) <= most if JOINT.fullmatch(ours) else not alone)
         }
         expressions = {
             ours: Expression.parse(theirs)
@@ -136,7 +129,7 @@ class _Table:
         self._optional = {
             name
             for ours, each in expressions.items()
-            if chain is None and re.fullmatch('[qsva][0-9]+', ours)
+            if chain is None and JOINT.fullmatch(ours)
             for name in each.names
         }
         needed = [n for each in expressions.values() for n in each.names]
@@ -253,7 +246,7 @@ class _Table:
             return length
         if ours in (*TURNS, *IN_TURN, *SIGMAS[3:]):
             return 1.0 if self._layout.rotation_vector and not self._layout.angle else angle
-        if ours[0] in 'qva' and ours[1:].isdigit():
+        if JOINT.fullmatch(ours) and ours[0] != 's':
             chain = self._chain
             prismatic = chain is not None and chain.joints[int(ours[1:]) - 1].type == 'prismatic'
             return length if prismatic else joint
@@ -273,8 +266,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
         if chain is not None:
             found |= {name: f'q{k + 1}' for k, name in enumerate(chain.joint_names)}
     if not alone:
-        found |= {name: name for name in (*NUMBERS, *WORDS) if name not in TURNS + IN_TURN}
-        found |= {name: name for name in TURNS + IN_TURN}
+        found |= {name: name for name in (*NUMBERS, *WORDS)}
     return found
 
 
@@ -285,11 +277,7 @@ def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')
     here = made.select(slice(max(0, -shift), count - max(0, shift)))
     there = slice(max(0, shift), count - max(0, -shift))
-    moved = {
-        name: made.values[name][there]
-        for name in made.values
-        if name[0] in 'qsva' and name[1:].isdigit()
-    }
+    moved = {name: made.values[name][there] for name in made.values if JOINT.fullmatch(name)}
     return replace(here, values={**here.values, **moved})
 
 

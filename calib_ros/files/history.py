@@ -28,19 +28,10 @@ from calib_ros.files.rows import Row
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
-UNCACHED = 8
-"""Rows of a robot that are read one by one before its cache is written anew."""
 
 
 class History:
-    """A dataset of rows in a folder, or at any URL that fsspec can write.
-
-    Raises
-    ------
-    ConfigError
-        When pyarrow or fsspec is not installed, or nothing knows such URLs.
-
-    """
+    """A dataset of rows in a folder, or at any URL that fsspec can write."""
 
     def __init__(self, place: str | Path) -> None:
         try:
@@ -82,14 +73,7 @@ class History:
         )
 
     def rows(self, serial: str) -> tuple[Row, ...]:
-        """Return the rows of a robot in the order of their times.
-
-        Raises
-        ------
-        InputError
-            When a file is none of a history.
-
-        """
+        """Return the rows of a robot in the order of their times."""
         import pyarrow as pa
 
         keys = self.keys(serial)
@@ -97,7 +81,7 @@ class History:
         held = known.column('key').to_pylist()
         new = sorted(keys.difference(held))
         table = pa.concat_tables([known, *(self._read(serial, key) for key in new)])
-        if len(new) >= UNCACHED:
+        if len(new) >= 8:  # fewer are read one by one every time
             self._cache(serial, table)
         rows = [row for row in _rows_of(table) if row.key in keys]
         return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.errors import InputError
-from calib_ros.files.tables import LATER, cells, columns
+from calib_ros.files.tables import cells, columns
 from calib_ros.sampling.sample import Sample
 
 
@@ -31,19 +31,11 @@ class Journal:
     joints : int
         Number of joints.
 
-    Raises
-    ------
-    InputError
-        When the file is that of another robot, or another process writes it.
-    OSError
-        When it cannot be written.
-
     """
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
-        self._width: int | None = None  # of a journal without the later columns
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
         try:
             self._lock()
@@ -52,30 +44,9 @@ class Journal:
             self.close()
             raise
 
-    def add(self, sample: Sample) -> None:
-        """Write a sample.
-
-        Raises
-        ------
-        OSError
-            When the disk is full, say; what was written before is whole.
-
-        """
-        row = cells(sample)
-        if self._width and any(row[self._width :]):
-            raise OSError(
-                f'{self.path} is of an earlier version, without columns for sockets or images: '
-                'call ~/clear to begin another'
-            )
-        self._write(row)
-
-    def remove(self, sample: Sample) -> None:
-        """Write that a sample was taken back."""
-        self._write(cells(sample, 'removed'))
-
-    def sync(self) -> None:
-        """Wait until everything is on the disk, to survive a power failure too."""
-        os.fsync(self._file)
+    def add(self, sample: Sample, removed: bool = False) -> None:
+        """Write a sample, or that it was taken back; what is there stays whole."""
+        self._write(cells(sample, 'removed' if removed else None))
 
     def close(self) -> None:
         """Close the file."""
@@ -96,12 +67,6 @@ class Journal:
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""
         expected = ','.join(header).encode() + b'\n'
-        width = len(header)
-        for names in reversed(LATER):
-            width -= len(names)
-            before = ','.join(header[:width]).encode() + b'\n'
-            if os.pread(self._file, len(before), 0) == before:
-                expected, self._width = before, width
         found = os.pread(self._file, len(expected), 0)
         if not expected.startswith(found):
             raise InputError(
@@ -118,7 +83,6 @@ class Journal:
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
-        row = row[: self._width]
         csv.writer(text).writerow(row)  # by its own end of lines it quotes names with any
         data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
         begin = os.fstat(self._file).st_size

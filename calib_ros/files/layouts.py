@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.kinematics.chain_file import shared_files
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import MOST_JOINTS
@@ -41,7 +41,6 @@ SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')
 """Texts that are taken over."""
 NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
-MOST_COLUMNS_GIVEN = 8 * MOST_JOINTS
 UNREADABLE = (
     '"{}" is no expression of columns: give names, {{names with blanks}} or numbers of columns '
     '(#7) with + - * / and brackets'
@@ -51,73 +50,73 @@ TOKEN = re.compile(
     r'|([^\W\d]\w*(?:\.\w+)*)|([-+*/()]))\s*'
 )
 """{any name}, #7 (a column by its number), a number, a plain name, or a sign."""
+SIGNS: Mapping[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.true_divide,
+    ast.UAdd: np.positive,
+    ast.USub: np.negative,
+}
+JOINT = re.compile('[qsva][0-9]+')
+"""Columns of ours with a number of each joint: values, signs of last moves, and rates."""
 
 
 @dataclass(frozen=True)
 class Expression:
-    """A sum, difference, product or quotient of columns and numbers."""
+    """A sum, difference, product or quotient of columns and numbers.
+
+    `terms` are columns by their names (`#7` is the seventh) and numbers, in the order in which the
+    `tree` has them as `_0`, `_1` and so on.
+    """
 
     text: str
-    names: tuple[str, ...]
-    """Columns by their names; `#7` is the seventh."""
+    terms: tuple[str | float, ...]
     tree: ast.expr
 
     @classmethod
     def parse(cls, text: str) -> Expression:
         """Read an expression."""
-        names: list[str] = []
+        terms: list[str | float] = []
         code, at = '', 0
         while at < len(text):
             match = TOKEN.match(text, at)
             if match is None or len(text) > LONGEST_NAME:
                 raise ConfigError(UNREADABLE.format(text))
             braced, column, number, plain, sign = match.groups()
-            name = braced or plain or (f'#{column}' if column else '')
-            if name and name not in names:
-                names.append(name)
-            code += f' _{names.index(name)} ' if name else number or sign
+            if not sign:
+                name = braced or plain or f'#{column}'
+                terms.append(float(number) if number else name)
+            code += sign or f' _{len(terms) - 1} '
             at = match.end()
         try:
-            tree = ast.parse(code.strip(), mode='eval').body
-            _check(tree)
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as err:
+            found = cls(text, tuple(terms), ast.parse(code.strip(), mode='eval').body)
+            found.of(dict.fromkeys(found.names, np.ones(1)))
+        except (SyntaxError, ValueError, KeyError, RecursionError, MemoryError) as err:
             raise ConfigError(UNREADABLE.format(text)) from err
-        return cls(text, tuple(names), tree)
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the columns by their names."""
+        return tuple(dict.fromkeys(each for each in self.terms if isinstance(each, str)))
 
     def of(self, columns: Mapping[str, FloatArray]) -> FloatArray:
         """Return the value (N,) for columns (N,) by name."""
+        values = [columns[each] if isinstance(each, str) else each for each in self.terms]
         with np.errstate(all='ignore'):
-            return np.asarray(_value(self.tree, [columns[name] for name in self.names]))
+            return np.asarray(_value(self.tree, values))
 
 
-def _check(tree: ast.expr) -> None:
-    if isinstance(tree, ast.BinOp) and isinstance(tree.op, ast.Add | ast.Sub | ast.Mult | ast.Div):
-        _check(tree.left)
-        _check(tree.right)
-    elif isinstance(tree, ast.UnaryOp) and isinstance(tree.op, ast.UAdd | ast.USub):
-        _check(tree.operand)
-    elif isinstance(tree, ast.Constant):
-        if not isinstance(tree.value, int | float) or isinstance(tree.value, bool):
-            raise ValueError(tree.value)
-    elif not (isinstance(tree, ast.Name) and re.fullmatch('_[0-9]+', tree.id)):
-        raise ValueError(type(tree).__name__)
-
-
-def _value(tree: ast.expr, columns: Sequence[FloatArray]) -> Any:
+def _value(tree: ast.expr, terms: Sequence[FloatArray | float]) -> Any:
+    """Return the value of a tree that holds nothing but terms and signs."""
     if isinstance(tree, ast.BinOp):
-        left, right = _value(tree.left, columns), _value(tree.right, columns)
-        if isinstance(tree.op, ast.Add):
-            return left + right
-        if isinstance(tree.op, ast.Sub):
-            return left - right
-        return left * right if isinstance(tree.op, ast.Mult) else np.true_divide(left, right)
+        return SIGNS[type(tree.op)](_value(tree.left, terms), _value(tree.right, terms))
     if isinstance(tree, ast.UnaryOp):
-        value = _value(tree.operand, columns)
-        return -value if isinstance(tree.op, ast.USub) else value
-    if isinstance(tree, ast.Constant):
-        return np.float64(float(str(tree.value)))
-    assert isinstance(tree, ast.Name)
-    return columns[int(tree.id[1:])]
+        return SIGNS[type(tree.op)](_value(tree.operand, terms))
+    if not isinstance(tree, ast.Name):
+        raise ValueError(type(tree).__name__)
+    return terms[int(tree.id[1:])]
 
 
 @dataclass(frozen=True)
@@ -206,12 +205,12 @@ class Layout:
             raise ConfigError(f'rotations are written one way: give {" or ".join(ways)}')
         if self.decimal == ',' and self.cut == ',':
             raise ConfigError('cells cannot be separated by commas that are decimal ones as well')
-        if not isinstance(self.columns, Mapping) or len(self.columns) > MOST_COLUMNS_GIVEN:
+        if not isinstance(self.columns, Mapping) or len(self.columns) > MOST_ENTRIES:
             raise ConfigError(
                 '"columns" of a layout must map our columns to expressions of theirs'
             )
         for name in self.columns:
-            if name not in (*NUMBERS, *WORDS) and not re.fullmatch('[qsva][0-9]+', name):
+            if name not in (*NUMBERS, *WORDS) and not JOINT.fullmatch(name):
                 raise UnknownNameError('column', name, ('q1', *NUMBERS, *WORDS))
 
     @property

@@ -87,27 +87,10 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
 def logged(
     chunk: bytes, channels: Mapping[int, Channel]
 ) -> tuple[list[tuple[int, Channel, bytes]], Exception | None]:
-    """Return the messages on some channels of a chunk, in the order of their log times.
+    """Return the messages on some channels, by number, of a chunk, in the order of log times.
 
-    Parameters
-    ----------
-    chunk : bytes
-        Its record, with kind and size.
-    channels : mapping
-        By their numbers.
-
-    Returns
-    -------
-    found : list
-        Log time, channel and data of each.
-    problem : Exception or None
-        What is wrong with a record, before which these messages stand.
-
-    Raises
-    ------
-    ValueError
-        When the chunk does not have its size and checksum.
-
+    The chunk is a record with kind and size. Log time, channel and data of each message are
+    returned, and what is wrong with a record before which these stand, if anything.
     """
     chunk = chunk[_HEAD.size :]
     begin, end, size, checksum = _CHUNK.unpack_from(chunk)
@@ -128,19 +111,6 @@ def logged(
     return found, problem
 
 
-def unindexed(
-    content: Content, channels: Mapping[int, Channel]
-) -> Iterator[tuple[Channel, bytes]]:
-    """Yield the messages on some channels of a file as they stand in it."""
-    for kind, record in records(content, len(MAGIC)):
-        if kind == DATA_END:
-            return
-        if kind == MESSAGE:
-            (key,) = struct.unpack_from('<H', record)
-            if key in channels:
-                yield channels[key], record[MESSAGE_HEAD:]
-
-
 def unpacked_size(chunk: bytes) -> int:
     """Return how large the content of a chunk is said to be; the record is with kind and size."""
     return int(_CHUNK.unpack_from(chunk, _HEAD.size)[2])
@@ -153,16 +123,7 @@ def string(record: bytes, start: int) -> str:
 
 
 def unpacked(data: bytes, compression: str, largest: int) -> bytes:
-    """Return what is packed in some bytes; of one that is cut off what there is.
-
-    Raises
-    ------
-    ValueError
-        When it is larger than `largest` bytes.
-    OSError
-        When the compression is not known.
-
-    """
+    """Return what is packed in some bytes; of one that is cut off what there is."""
     found = _unpack(data, compression, largest + 1) if compression else data
     if len(found) > largest:
         raise ValueError(f'it unpacks to more than the {largest} bytes that it may have')

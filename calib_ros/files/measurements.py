@@ -26,20 +26,13 @@ from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.sample import socket_place
-from calib_ros.values import (
-    LARGEST,
-    LARGEST_RATE,
-    LARGEST_SIGMA,
-    covariance_faults,
-)
+from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults
 
 SPLITS = {name: name for name in ('', 'train', 'test', 'removed')}
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 KINDS = ('x', 'distance', 'socket', 'plane')
 """Cells that say what was measured in a row: a pose or position, a distance, ..."""
 POSE, DISTANCE, SOCKET, PLANE = range(4)
-MOST_FRAMES = 100
-"""Sessions, devices and targets of a table."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +107,7 @@ class Measurements:
     def kept(self) -> Measurements:
         """Return the rows that were not taken back: of those alike it is the last one.
 
-        Raises
-        ------
-        InputError
-            When of those that are left two are alike.
-
+        Two that are left and alike are refused.
         """
         found = self
         if self.removed.any():
@@ -150,11 +139,11 @@ class Measurements:
         A row that names no frame may be of any.
         """
         kinds, number = distinct(self.codes[:, :3])
-        if len(kinds) > MOST_FRAMES:
-            line = self.lines[int(np.argmax(number == MOST_FRAMES))]
+        if len(kinds) > (most := 100):
+            line = self.lines[int(np.argmax(number == most))]
             raise InputError(
-                f'{self.path}, line {line}: more than {MOST_FRAMES} sessions, devices and '
-                'targets; each has a frame to be fitted'
+                f'{self.path}, line {line}: more than {most} sessions, devices and targets; each '
+                'has a frame to be fitted'
             )
         if self.frame_id[1] == ['']:
             return
@@ -176,14 +165,7 @@ class Measurements:
 
 
 def measurements(columns: Columns, joints: int) -> Measurements:
-    """Return what the rows of a table say; whatever makes no sense is refused.
-
-    Raises
-    ------
-    InputError
-        For a missing column and for cells that are no number, say. The message names the line.
-
-    """
+    """Return what the rows of a table say; whatever makes no sense is refused."""
     header = columns.header
     _check_header(columns, joints)
     has = [~columns.blank(n) if n in header else np.zeros(len(columns.lines), bool) for n in KINDS]
@@ -218,7 +200,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         rotation,
         oriented,
         np.where(kind == PLANE, 0.0, read.one('distance', needed=kind == DISTANCE)),
-        _covariance(columns, read.of(COVARIANCE, False, LARGEST_SIGMA**2), placed, oriented),
+        _covariance(columns, read.of(COVARIANCE, False, LARGEST**2), placed, oriented),
         columns.labels('session'),
         _devices(columns, kind),
         columns.labels('target'),

@@ -28,9 +28,6 @@ from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.values import LONGEST_NAME, parse_name
 
-EPOCH_NS = 10**17
-"""Stamps from which on they are times of this century."""
-
 
 @dataclass(frozen=True)
 class Filing:
@@ -136,10 +133,15 @@ def samples_hash(sets: Sequence[Observations]) -> str:
     return found.hexdigest()
 
 
+def is_time(stamp_ns: int) -> bool:
+    """Tell whether a stamp is a time: of 1973 or later, not since a start or from lines."""
+    return stamp_ns >= 10**17
+
+
 def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
     """Return when the last pose was measured; another time where stamps are no times."""
     last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
-    if last < EPOCH_NS:
+    if not is_time(last):
         return otherwise or datetime.now(timezone.utc)
     return datetime.fromtimestamp(last / 1e9, timezone.utc)
 

@@ -23,8 +23,6 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import mcap
 from calib_ros.texts import parse_yaml, read_text
 
-LARGEST_METADATA = 1_000_000
-"""Bytes of a metadata.yaml."""
 NOT_CLOSED = 'the recording was not closed'
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
@@ -42,7 +40,7 @@ Stream = TypeVar('Stream')
 def recorded(path: Path) -> int | None:
     """Return how many messages the recorder says it has written; None when it does not."""
     try:
-        text = read_text(path / 'metadata.yaml', LARGEST_METADATA)
+        text = read_text(path / 'metadata.yaml')
     except ConfigError:
         return None
     found = re.search(r'^  message_count: ([0-9]{1,15})\s*$', text, re.MULTILINE)
@@ -51,14 +49,7 @@ def recorded(path: Path) -> int | None:
 
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
-    """Give a bag folder whose files are not compressed: it itself, or one that goes away again.
-
-    Raises
-    ------
-    InputError
-        When a file unpacks to more than any recording does.
-
-    """
+    """Give a bag folder whose files are not compressed: it itself, or one that goes away again."""
     packed = sorted(path.glob('*.zstd')) if path.is_dir() else []
     if not packed:
         yield path
@@ -68,7 +59,7 @@ def unpacked_files(path: Path) -> Iterator[Path]:
         for file in packed:
             _unpack_file(file, folder / file.stem)
         with suppress(ConfigError):
-            text = read_text(path / 'metadata.yaml', LARGEST_METADATA)
+            text = read_text(path / 'metadata.yaml')
             text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
             (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
         yield folder
@@ -96,17 +87,10 @@ def named(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
 
 
 def check(path: Path) -> None:
-    """Refuse a bag folder or file that the library must not open, though messages may be in it.
-
-    Raises
-    ------
-    CalibrationError, ValueError, sqlite3.Error
-        When it may stand for more than it holds, or is damaged.
-
-    """
+    """Refuse a bag folder or file that the library must not open, though messages may be in it."""
     metadata = path / 'metadata.yaml'
     if metadata.exists():
-        parse_yaml(read_text(metadata, LARGEST_METADATA), str(metadata))
+        parse_yaml(read_text(metadata), str(metadata))
     for file in _files(path):
         if file.suffix == '.db3':
             with closing(_open(file)) as connection:

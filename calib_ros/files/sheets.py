@@ -12,24 +12,20 @@ import io
 import re
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from calib_ros.errors import InputError
-from calib_ros.files.csv_columns import TextColumns, regular
+from calib_ros.errors import MOST_ENTRIES, InputError
+from calib_ros.files.columns import Columns, MadeColumns
+from calib_ros.files.csv_columns import regular
 from calib_ros.files.layouts import SEPARATORS, Layout
-from calib_ros.texts import LARGEST_TABLE, MOST_COLUMNS, read_bytes
+from calib_ros.texts import LARGEST_TABLE, read_bytes
 
-ABOVE = 100
-"""Lines above the header at most."""
-UNDER = 3
-"""Lines between the header and the first row at most: units."""
-SAMPLE = 30
-"""Lines by which separators are guessed."""
-SEPARATOR = '\x1f'
-"""Between cells that are no regular text."""
+HEAD = 100
+"""Lines that the header and the first row of numbers are looked for in."""
 LARGEST_SHEET = 3 * LARGEST_TABLE
 """Bytes of a workbook unpacked."""
 SHEETS = ('.xlsx', '.xlsm')
@@ -45,7 +41,7 @@ class Sheet:
 
     header: tuple[str, ...]
     above: tuple[tuple[str, ...], ...]
-    columns: TextColumns
+    columns: Columns
     notes: tuple[str, ...]
 
     def number(self, name: str) -> str | None:
@@ -80,7 +76,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     notes: list[str] = []
     if path.suffix.lower() in SHEETS:
         rows = _workbook(path, layout.sheet)
-        text, separator = '', SEPARATOR
+        text, separator = '', ''
     else:
         text, coding = _text(path)
         if coding:
@@ -93,7 +89,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         if separator == ' ':
             text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
             text = re.sub(r'[ \t]+', ' ', text)
-        rows = _cells(path, '\n'.join(text.split('\n', ABOVE + SAMPLE)[:-1] or [text]), separator)
+        rows = _cells(path, '\n'.join(text.split('\n', HEAD)[:-1] or [text]), separator)
     decimal = layout.decimal or _decimal(rows, separator, notes)
     at, header = _header(path, rows, names, known)
     used = [header.index(n) for n in names if not n.startswith('#') and n in header]
@@ -103,7 +99,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     if not header:
         header = ('',) * width
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
-    columns = None
+    columns: Columns | None = None
     start = rows[first][0]
     if text:
         body = text.split('\n', start - 1)[-1]
@@ -115,7 +111,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
             rows = _cells(path, text, separator)
             first = next(k for k, (line, _) in enumerate(rows) if line >= start)
     if columns is None:
-        columns = _ragged(path, rows[first:], max(width, len(header)), decimal)
+        columns = _ragged(path, rows[first:], decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
 
@@ -157,8 +153,8 @@ def _workbook(path: Path, name: str) -> list[tuple[int, list[str]]]:
         sheet = book[name] if name else book.worksheets[0]
         rows = []
         for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-            if len(row) > MOST_COLUMNS:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_COLUMNS}')
+            if len(row) > MOST_ENTRIES:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
             cells = [_cell(value) for value in row]
             if any(cells):
                 rows.append((number, cells))
@@ -179,13 +175,13 @@ def _cell(value: object) -> str:
     if isinstance(value, bool):
         return str(int(value))
     text = repr(value) if isinstance(value, float) else str(value)
-    return ' '.join(text.replace(SEPARATOR, ' ').split())
+    return ' '.join(text.split())
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
     """Return the separator by which most lines have the same number of cells, more than one."""
-    lines = [line for line in text.split('\n', ABOVE + SAMPLE)[: ABOVE + SAMPLE] if line.strip()]
-    lines = lines[-SAMPLE:]
+    lines = [line for line in text.split('\n', HEAD)[:HEAD] if line.strip()]
+    lines = lines[-30:]  # under most of what stands above the header
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most = ',', 0
@@ -220,11 +216,10 @@ def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]
     try:
         found = []
         for row in reader:
-            if len(row) > MOST_COLUMNS:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_COLUMNS}')
+            if len(row) > MOST_ENTRIES:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
             if any(cell.strip() for cell in row):
-                cells = [' '.join(cell.replace(SEPARATOR, ' ').split()) for cell in row]
-                found.append((reader.line_num, cells))
+                found.append((reader.line_num, [' '.join(cell.split()) for cell in row]))
     except csv.Error as err:
         raise InputError(f'cannot read {path}: {err}') from err
     if not found:
@@ -242,7 +237,7 @@ def _header(
     wanted = {name for name in names if not name.startswith('#')}
     low = {name.lower() for name in known}
     best: tuple[int, set[str]] = (0, wanted)
-    for k, (_, cells) in enumerate(rows[:ABOVE]):
+    for k, (_, cells) in enumerate(rows[:HEAD]):
         missing = wanted - set(cells)
         if wanted and not missing:
             return k, tuple(cells)
@@ -269,7 +264,7 @@ def _first(
     notes: list[str],
 ) -> int:
     """Return which row is the first of numbers, after the header and lines of units."""
-    limit = ABOVE if at < 0 else at + 1 + UNDER
+    limit = HEAD if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]
         if not used or any(_is_number(cell, decimal) for cell in cells):
@@ -288,17 +283,11 @@ def _is_number(cell: str, decimal: str) -> bool:
     return True
 
 
-def _ragged(
-    path: Path, rows: Sequence[tuple[int, Sequence[str]]], width: int, decimal: str
-) -> TextColumns:
+def _ragged(path: Path, rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> MadeColumns:
     """Return the columns of rows that may end early or have cells in quotes."""
-    width = max(width, max(len(cells) for _, cells in rows))
-    filled = [[*cells, *[''] * (width - len(cells))] for _, cells in rows]
-    if decimal == ',':
-        filled = [[cell.replace(',', '.') for cell in row] for row in filled]
-    names = [f'#{k + 1}' for k in range(width)]
-    text = '\n'.join(SEPARATOR.join(row) for row in filled)
-    found = regular(path, text, SEPARATOR, names)
-    if found is None:
-        raise InputError(f'cannot read {path}: it holds quotes or zeros within cells')
-    return replace(found, lines=np.array([line for line, _ in rows], dtype=np.intp))
+    cells = zip_longest(*(row for _, row in rows), fillvalue='')
+    words = {
+        f'#{k}': [cell.replace(',', '.') if decimal == ',' else cell for cell in column]
+        for k, column in enumerate(cells, start=1)
+    }
+    return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)

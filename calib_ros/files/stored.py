@@ -6,21 +6,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
-from mmap import ACCESS_READ, mmap
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
-from calib_ros.files.mcap import (
-    LARGEST_CHUNK,
-    LARGEST_RATIO,
-    logged,
-    unindexed,
-    unpacked,
-    unpacked_size,
-)
+from calib_ros.files.mcap import LARGEST_CHUNK, LARGEST_RATIO, logged, unpacked, unpacked_size
+from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
+from calib_ros.texts import LARGEST_TABLE
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -31,7 +24,7 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 """What the library does not promise: without them, it is asked for the messages itself."""
 LARGEST_MESSAGE = 65_536
 """Bytes of a message; a joint state of a thousand joints has fewer."""
-LARGEST_IMAGE = 200_000_000
+LARGEST_IMAGE = 2 * LARGEST_TABLE
 """Bytes of an image, as a message or a file."""
 
 
@@ -82,11 +75,13 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
         if wanted:
             yield from ((channels[c.id], data) for c, _, data in storage.messages(wanted))
         return
+    if not storage.chunks:
+        whole = Salvage((storage.path,))
+        yield from whole.on({each.topic: streams[each.topic] for each in wanted})
+        if whole.problem:
+            raise ValueError(whole.problem)
+        return
     with storage.path.open('rb') as file:
-        if not storage.chunks:
-            with closing(mmap(file.fileno(), 0, access=ACCESS_READ)) as content:
-                yield from unindexed(content, channels)
-            return
         left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
         problem: Exception | None = None
         for overlapping in _together(storage.chunks, channels):

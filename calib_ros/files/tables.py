@@ -47,8 +47,6 @@ from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses, 
 from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, decoded, read_bytes
 
-LATER = (('location', 'socket'), ('view',))
-"""Columns that journals of earlier versions do not have."""
 Sets = tuple[Observations, ...]
 
 
@@ -252,7 +250,8 @@ def columns(joints: int) -> list[str]:
     """Return the columns of a table that can hold every kind of sample."""
     names = ['stamp_ns', *(name for letter in 'qsva' for name in named(letter, joints))]
     names += [*POSITION, *QUATERNION, 'distance', *COVARIANCE, 'device', 'target', 'frame_id']
-    return [*names, 'eye_in_hand', 'delay', 'count', 'spread', 'session', 'split', *sum(LATER, ())]
+    names += ['eye_in_hand', 'delay', 'count', 'spread', 'session', 'split']
+    return [*names, 'location', 'socket', 'view']
 
 
 def cells(sample: Sample, split: str | None = None) -> list[str]:

@@ -18,16 +18,11 @@ import numpy as np
 
 from calib_ros.apply.program import Program
 from calib_ros.errors import InputError
+from calib_ros.files.csv_columns import columns_of
+from calib_ros.files.waypoints import joint_columns, joint_values
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import (
-    LARGEST_TABLE,
-    LARGEST_TEXT,
-    MOST_ROWS,
-    csv_lines,
-    parse_yaml,
-    read_text,
-)
-from calib_ros.values import parse_number, parse_numbers
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, parse_yaml, read_text
+from calib_ros.values import parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
 """What a point of a JointTrajectory holds that a correction changes."""
@@ -48,12 +43,6 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
     CSV: joint values in q1 ... qn, in the order of the arm; s1 ... sn, if present, are the signs
     of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic echo` prints
     it.
-
-    Raises
-    ------
-    InputError
-        For a file that is neither, or that lacks something; the message names the place.
-
     """
     readers = {'.csv': _read_csv, '.yaml': _read_yaml, '.yml': _read_yaml}
     if path.suffix.lower() not in readers:
@@ -62,69 +51,32 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
         )
     reader = readers[path.suffix.lower()]
     largest = LARGEST_TABLE if reader is _read_csv else LARGEST_TEXT
-    return reader(read_text(path, largest, InputError), str(path), joints)
+    return reader(read_text(path, largest, InputError), path, joints)
 
 
-def _read_csv(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
-    reader = csv.reader(csv_lines(text, where))
-    try:
-        lines = [(reader.line_num, row) for row in reader if row]
-    except csv.Error as err:
-        raise InputError(f'cannot read {where}: {err}') from err
-    if len(lines) < 2:
-        raise InputError(f'{where} has no rows')
-    if len(lines) > MOST_ROWS + 1:
-        raise InputError(f'{where} has more than {MOST_ROWS} rows: cut the program into parts')
-    (_, header), *rows = lines
-    names = [f'q{k + 1}' for k in range(len(joints))]
-    for name in names:
-        if header.count(name) != 1:
-            raise InputError(
-                f'{where} must have one column {name}, not {header.count(name)}; expected '
-                f'{", ".join(names)}, found {", ".join(header)}'
-            )
-    if f'q{len(joints) + 1}' in header:
-        raise InputError(
-            f'{where} has a column q{len(joints) + 1}, but the arm has {len(joints)} joints only'
-        )
-    for line, row in rows:
-        if len(row) != len(header):
-            raise InputError(f'{where}, line {line}: {len(row)} values for {len(header)} columns')
-
-    def values(columns: Sequence[str]) -> FloatArray:
-        index = [header.index(name) for name in columns]
-        return np.array(
-            [
-                [
-                    parse_number(row[i], f'{where}, line {line}: {header[i]}', InputError)
-                    for i in index
-                ]
-                for line, row in rows
-            ]
-        )
-
+def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
+    found = columns_of(path, text)
+    positions = joint_values(found, len(joints))
     signs = [f's{k + 1}' for k in range(len(joints))]
-    program = Program(
-        tuple(joints),
-        values(names),
-        approach=np.sign(values(signs)) if set(signs) <= set(header) else None,
-    )
+    signed = set(signs) <= set(found.header)
+    approach = np.sign(found.block(signs)) if signed else None
 
     def text_with(corrected: Program) -> str:
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator='\n')
-        writer.writerow(header)
-        for (_, row), joint_values in zip(rows, corrected.positions.tolist(), strict=True):
-            new = dict(zip(names, map(repr, joint_values), strict=True))
-            writer.writerow([new.get(name, cell) for name, cell in zip(header, row, strict=True)])
-        return out.getvalue()
+        header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
+        at = [header.index(name) for name in joint_columns(len(joints))]
+        for row, values in zip(rows, corrected.positions.tolist(), strict=True):
+            for k, value in zip(at, values, strict=True):
+                row[k] = repr(value)
+        return csv_text([header, *rows])
 
-    return ProgramFile(program, tuple(f'line {line}' for line, _ in rows), text_with)
+    places = tuple(f'line {line}' for line in found.lines)
+    return ProgramFile(Program(tuple(joints), positions, approach=approach), places, text_with)
 
 
-def _read_yaml(text: str, where: str, joints: Sequence[str]) -> ProgramFile:
+def _read_yaml(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
     import yaml
 
+    where = str(path)
     message = parse_yaml(text, where, InputError)
     names = message.get('joint_names') if isinstance(message, dict) else None
     points = message.get('points') if isinstance(message, dict) else None
@@ -168,12 +120,6 @@ def trajectory_program(
     """Return the program of a JointTrajectory: joint names, and points with lists of numbers.
 
     Velocities and accelerations are those of all points or of none.
-
-    Raises
-    ------
-    InputError
-        For lists that do not fit the names, and values that are no numbers; `where` names it.
-
     """
 
     def values(key: str) -> FloatArray | None:

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import MadeColumns, check_quaternions
@@ -98,8 +97,8 @@ def _rotations(
     angles = np.column_stack([values[name] for name in names])
     _require_whole(angles, made, ', '.join(names))
     if layout.rotation_vector:
-        rotation = se3.exp_rotation(angles)
-        return rotation, _left_jacobians(angles)
+        left = np.linalg.inv(se3.left_jacobian_inverse(angles))
+        return se3.exp_rotation(angles), np.asarray(left)
     if not layout.euler:
         raise ConfigError(
             f'{made.path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, '
@@ -118,8 +117,7 @@ def _rotations(
     for k in order:
         unit = 'XYZ'.index(letters[k].upper())
         axes[:, :, k] = turned[:, :, unit]
-        step = Rotation.from_rotvec(np.eye(3)[unit] * angles[:, k, np.newaxis]).as_matrix()
-        turned = turned @ step
+        turned = turned @ se3.exp_rotation(np.eye(3)[unit] * angles[:, k, np.newaxis])
     if names == TURNS:  # columns in the order of rx, ry, rz
         axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
     return turned, axes
@@ -147,17 +145,6 @@ def _require_whole(values: FloatArray, made: MadeColumns, names: str) -> None:
     if nothing.any():
         row = int(np.argmax(nothing))
         raise InputError(f'{made.where(row, names)} must be numbers, not blank')
-
-
-def _left_jacobians(vectors: FloatArray) -> FloatArray:
-    """Return J_l(v) (N, 3, 3) of rotation vectors (N, 3) (Chirikjian 2012)."""
-    angle = np.linalg.norm(vectors, axis=1)[:, np.newaxis, np.newaxis]
-    cross = se3.skew(vectors)
-    small = angle < 1e-6
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    return np.asarray(np.eye(3) + first * cross + second * cross @ cross)
 
 
 def _covariance(

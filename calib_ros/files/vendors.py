@@ -26,8 +26,8 @@ import numpy as np
 from calib_ros.errors import ConfigError
 from calib_ros.files.export import (
     EXACT,
-    POSES,
     Export,
+    anywhere,
     checked,
     converted,
     head,
@@ -42,11 +42,6 @@ from calib_ros.kinematics.chain_file import dump_yaml, table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.kinematics.urdf_tree import parse_urdf
-
-SAME_LAYOUT = 0.1
-"""Largest difference [rad] of nominal rotations between joints from those of the vendor."""
-SAME_LENGTH = 0.01
-"""Likewise [m] of the flange behind the last axis: elsewhere a tool is part of the table."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +73,18 @@ class Vendor:
         )
 
     def has_layout(self, places: FloatArray) -> bool:
-        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths."""
+        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths.
+
+        To 0.1 rad, since layouts differ by quarters of a turn, and to 0.01 m of the flange behind
+        the last axis: elsewhere a tool is part of the table.
+        """
         rolls = np.zeros((len(self.rolls), 3))
         rolls[:, 0] = 0.5 * np.pi * np.array(self.rolls)
         off = np.swapaxes(se3.exp_rotation(rolls), 1, 2) @ places[:, :3, :3]
         turned = np.linalg.norm(se3.log_rotation(off), axis=1).max()
         end = [0.0, 0.0, self.height] if self.end else places[-1, :3, 3]
         shifted = np.linalg.norm(places[-1, :3, 3] - end)
-        return bool(turned < SAME_LAYOUT and shifted < SAME_LENGTH)
+        return bool(turned < 0.1 and shifted < 0.01)
 
 
 UR = Vendor(
@@ -134,13 +133,6 @@ def vendor_files(
         tells whether a file belongs to the robot. A hash of the numbers by default, which the
         driver reports as a mismatch, and goes on.
 
-    Raises
-    ------
-    ConfigError
-        When the chain is not one of the URDF, or the checksum is none.
-    ExportError
-        When a file, read back, differs from the chain.
-
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(
@@ -165,7 +157,7 @@ def vendor_files(
 
 def _checked(vendor: Vendor, chain: Chain, arm: Chain, reference: Chain, document: str) -> Export:
     """Return the file of an arm, read back and compared with the chain that it stands for."""
-    q = chain.random_joints(POSES, np.random.default_rng(0))
+    q = anywhere(chain)
     shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
     lost = float(np.linalg.norm(shift, axis=1).max())
     content = head(chain, 'kinematics', lost, table_hash(chain)) + document

@@ -14,55 +14,46 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.files.columns import check_quaternions
-from calib_ros.files.csv_columns import read_columns
+from calib_ros.files.columns import Columns, check_quaternions
+from calib_ros.files.csv_columns import read_columns, with_rows
 from calib_ros.files.layouts import POSITION, QUATERNION
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import limits
 from calib_ros.kinematics.se3 import FloatArray
 
-BEYOND = 1e-3
-"""How far [rad or m] an arm may stand beyond a limit."""
 POSE = (*POSITION, *QUATERNION)
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
     """Read joint values (N, n) [rad or m] of a chain from the columns q1 ... qn of a CSV.
 
-    Raises
-    ------
-    InputError
-        For a missing column, one joint too many, no row, a value that is no number, and one that
-        is beyond the limits of its joint.
-
+    A value over 1e-3 beyond the limits of its joint is refused.
     """
-    columns = joint_columns(len(chain.joints))
-    found = read_columns(path, columns)
-    values, surplus = found.block(columns), f'q{len(columns) + 1}'
-    if surplus in found.header:
-        raise InputError(
-            f'{path} has a column {surplus}, but "{chain.name}" has {len(columns)} joints only'
-        )
+    found = read_columns(path, joint_columns(len(chain.joints)))
+    values = joint_values(found, len(chain.joints))
     lower, upper = limits(chain)
-    beyond = (values < lower - BEYOND) | (values > upper + BEYOND)
+    beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
     for k, i in np.argwhere(beyond).tolist():
         raise InputError(
-            f'{found.where(k, columns[i])} {values[k, i]:.6g} is beyond the limits of '
+            f'{found.where(k, f"q{i + 1}")} {values[k, i]:.6g} is beyond the limits of '
             f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
         )
     return values
 
 
+def joint_values(found: Columns, joints: int) -> FloatArray:
+    """Return the joint values (N, n) [rad or m] of an arm in columns q1 ... qn."""
+    names = joint_columns(joints)
+    if f'q{joints + 1}' in with_rows(found, names).header:
+        raise InputError(
+            f'{found.path} has a column q{joints + 1}, but the arm has {joints} joints only'
+        )
+    return found.block(names)
+
+
 def read_poses(path: Path) -> FloatArray:
-    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV.
-
-    Raises
-    ------
-    InputError
-        For a missing column, no row, a value that is no number, or a quaternion that is none.
-
-    """
+    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
     found = read_columns(path, POSE)
     numbers = found.block(POSE)
     check_quaternions(found, numbers[:, 3:])

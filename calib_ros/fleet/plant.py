@@ -11,11 +11,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
+from calib_ros.files.loading import LARGEST_LOSS
 from calib_ros.files.rows import parse_serial, settings_hash
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.settings import LONGEST_ENTRY, Settings
+from calib_ros.settings import Settings
 from calib_ros.texts import parse_yaml, read_text
 from calib_ros.values import parse_number
 
@@ -51,7 +52,7 @@ class Robot:
     measured: tuple[Measured, ...]
     settings: Settings = field(default_factory=Settings)
     tolerance: float | None = None
-    largest_loss: float = 0.1
+    largest_loss: float = LARGEST_LOSS
     since: datetime | None = None
 
     def compares(self, time: datetime) -> bool:
@@ -68,12 +69,6 @@ def read_plant(path: Path) -> tuple[Robot, ...]:
     """Read a plant file.
 
     Relative names in it are meant from its folder.
-
-    Raises
-    ------
-    ConfigError
-        When it cannot be used; the message names the robot and the key.
-
     """
     return parse_plant(read_text(path, what='plant file '), path.parent, str(path))
 
@@ -162,7 +157,7 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
             entry = {'files': entry}
         entry = _mapping(entry, 'measured', f'{where}: measured')
         files, session = entry.get('files'), entry.get('session', '')
-        if not isinstance(files, str) or not files or len(files) > LONGEST_ENTRY:
+        if not isinstance(files, str) or not files or len(files) > MOST_ENTRIES:
             raise ConfigError(
                 f'{where}: measured must be a pattern of bags or tables, a file or URL with *, '
                 f'or a list of them, not {files!r:.100}'

@@ -36,6 +36,7 @@ DASK = {
     'distributed.worker.profile.enabled': False,
     'distributed.admin.tick.interval': '1s',
     'distributed.admin.system-monitor.interval': '2s',
+    'distributed.worker.memory.monitor-interval': '500ms',
     'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**28,
     'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2**25,
 }

@@ -7,26 +7,21 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
-from calib_ros.files.bags import replay
 from calib_ros.files.history import is_local
+from calib_ros.files.loading import Loaded, of_bag, of_table, replayed, table
 from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
-from calib_ros.files.tables import read_table
 from calib_ros.fleet.plant import Robot
-from calib_ros.identification.identification import Identification
-from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.problem import Problem
 from calib_ros.report.page import Origin, input_of, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.report.words import configuration_yaml
-from calib_ros.sampling.session import CalibrationSession
 
 TABLES = ('.csv', '.txt', '.xlsx')
 """Endings of tables; anything else is a bag, or a folder that is one."""
@@ -74,14 +69,7 @@ class Outcome(NamedTuple):
 
 
 def sources(robot: Robot) -> tuple[Source, ...]:
-    """Return what there is of a robot, by name.
-
-    Raises
-    ------
-    InputError
-        When a pattern matches nothing, or its file system cannot be listed.
-
-    """
+    """Return what there is of a robot, by name."""
     found = []
     for each in robot.measured:
         try:
@@ -120,7 +108,8 @@ def _outcome(task: Task) -> Outcome:
         content = content_hash([each.sha256 for each in inputs], source.session)
         if content in task.known and not task.page:
             return Outcome()
-        problem, result, warnings, lines = _identify(path, task)
+        loaded = _loaded(path, task)
+        problem, result = loaded.problem, loaded.identified(robot.settings.model)
         about = Filing(
             robot.serial,
             measured_at((*problem.sets, *problem.judging), source.modified),
@@ -129,14 +118,14 @@ def _outcome(task: Task) -> Outcome:
             source.name,
             source.fingerprint,
         )
-        row = identified(result, about, warnings)
+        row = identified(result, about, loaded.warnings)
         if not task.page:
             return Outcome(row)
         configuration = configuration_yaml(robot.chain.name, robot.settings)
         origin = Origin(inputs, serial=robot.serial, settings=configuration)
         wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
-        poses = poses_of(problem, result, lines)
-        report = identification_report(problem, result, poses, origin, warnings, wanted)
+        poses = poses_of(problem, result, loaded.lines)
+        report = identification_report(problem, result, poses, origin, loaded.warnings, wanted)
         return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
 
 
@@ -153,23 +142,12 @@ def fetched(url: str) -> Iterator[Path]:
         yield target
 
 
-def _identify(path: Path, task: Task) -> tuple[Problem, Identification, tuple[str, ...], bool]:
-    """Return problem, result, warnings, and whether the stamps are the lines of a table."""
-    robot, settings = task.robot, task.robot.settings
+def _loaded(path: Path, task: Task) -> Loaded:
+    chain, settings = task.robot.chain, task.robot.settings
     if path.suffix in TABLES:
         sessions = (task.source.session,) if task.source.session else ()
-        sigmas = (settings.sigma_position, settings.sigma_orientation)
-        table = read_table(path, len(robot.chain.joints), sessions, sigmas)
-        problem = table.problem(robot.chain, **settings.for_problem())
-        result = identify_model(problem, settings.model)
-        return problem, result, table.warnings, table.by_line
-    session = CalibrationSession(robot.chain, settings)
-    replayed = replay(path, session)
-    problem = session.problem()
-    result = identify_model(problem, settings.model)
-    lost = replayed.refusals(session.account(), robot.largest_loss)
-    result = replace(result, refusals=(*result.refusals, *lost))
-    return problem, result, replayed.warnings, False
+        return of_table(table(path, chain, settings, sessions), chain, settings)
+    return of_bag(*replayed(path, chain, settings), task.robot.largest_loss)
 
 
 def _file_system(url: str) -> tuple[Any, str]:

@@ -15,7 +15,7 @@ expected to miss by the root of removed^2 + remaining^2, by its calibrated model
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,8 +26,10 @@ import numpy as np
 import calib_ros
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification import records
+from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.noise import Noise
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.region import Region, region_of_record
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics import se3
@@ -74,7 +76,9 @@ class Calibration(Shown):
     owners : mapping
         Which session, device or target each frame is of (`sampling.sample.Frames`), if known.
     record : mapping
-        Where the numbers come from, as the file says it, but for the covariance.
+        Where the numbers come from, as the file says it, but for the covariance and the rows.
+    rows : Fingerprint or None
+        Of the measurements that were fitted, if they are known.
 
     """
 
@@ -89,6 +93,7 @@ class Calibration(Shown):
     world_frame: str = ''
     owners: Mapping[str, records.Owner] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
+    rows: Fingerprint | None = None
 
     @classmethod
     def of(
@@ -96,8 +101,9 @@ class Calibration(Shown):
         result: Identification,
         origin: Mapping[str, Any] | None = None,
         owners: Mapping[str, records.Owner] | None = None,
+        fitted: Sequence[Observations] = (),
     ) -> Calibration:
-        """Return the calibration of an identification; `origin` tells of its samples."""
+        """Return that of an identification; `origin` tells of its samples, those `fitted`."""
         before, after = (result.validation or result.fitted).figures
         region, noise = result.region, result.noise
         record = {
@@ -130,6 +136,7 @@ class Calibration(Shown):
             result.world_frame,
             owners or {},
             record,
+            Fingerprint.of(fitted) if fitted else None,
         )
 
     def dump(self) -> str:
@@ -141,6 +148,8 @@ class Calibration(Shown):
                 'freedom': None if np.isinf(self.freedom) else self.freedom,
                 'root': records.packed(self.covariance),
             }
+        if self.rows is not None:
+            record['rows'] = self.rows.document()
         return HEAD + dump_chain(self.chain, record)
 
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -195,6 +204,10 @@ class Calibration(Shown):
     def holds(self, rms: float) -> bool | None:
         """Tell whether the RMS error [m] of new poses agrees with the one before, if known."""
         return None if self.residual is None else rms <= HOLDS * self.residual
+
+    def reused(self, sets: Sequence[Observations]) -> float:
+        """Return the share of measurements that it was fitted to, as far as that is known."""
+        return 0.0 if self.rows is None else self.rows.share(sets)
 
     def commanded_by(self, model: Model) -> Chain:
         """Return the chain by which a model turns poses into joint values."""
@@ -277,5 +290,6 @@ def parse_calibration(
         region_of_record(about, chain, where),
         about.get('world_frame', ''),
         records.owners_of(about, where),
-        {key: value for key, value in about.items() if key != 'covariance'},
+        {key: value for key, value in about.items() if key not in ('covariance', 'rows')},
+        Fingerprint.of_record(about, where),
     )

@@ -34,6 +34,7 @@ from calib_ros.identification.changes import (
     reasons_document,
     reasons_of,
 )
+from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.leastsquares import (
     System,
     minimise,
@@ -350,4 +351,5 @@ def _updated(
         covariance=found.covariance[np.ix_(own, own)],
         region=region,
         record=record,
+        rows=Fingerprint.of(problem.sets, previous.rows),
     )

@@ -25,8 +25,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.lens import at_the_board, require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import BLOCK as BLOCK
 
-BLOCK = 1024
 Block: TypeAlias = tuple[slice | NDArray[np.intp], FloatArray, FloatArray, ErrorModel]
 
 

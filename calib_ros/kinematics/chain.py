@@ -114,17 +114,14 @@ class Chain(Shown):
         Row i leads from axis i to axis i + 1 in the standard convention and from axis i - 1 to
         axis i in the modified one.
         """
-        first, second = (0, 1) if self.convention == 'standard' else (-1, 0)
-        found = []
-        for i, joint in enumerate(self.joints):
-            before, after = i + first, i + second
-            if before < 0 or after >= len(self.joints):
-                continue
-            revolute = 'revolute' in (self.joints[before].type, self.joints[after].type)
-            tilt = np.hypot(np.sin(joint.alpha), np.sin(joint.beta))
-            if revolute and tilt < np.sin(PARALLEL_TOLERANCE):
-                found.append(joint.name)
-        return tuple(found)
+        first, last = (0, 1) if self.convention == 'standard' else (1, 0)
+        rows = self.joints[first : len(self.joints) - last]
+        return tuple(
+            row.name
+            for row, *axes in zip(rows, self.joints, self.joints[1:], strict=False)
+            if any(joint.type == 'revolute' for joint in axes)
+            and np.hypot(np.sin(row.alpha), np.sin(row.beta)) < np.sin(PARALLEL_TOLERANCE)
+        )
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -137,10 +134,12 @@ class Chain(Shown):
 
         The model holds beta instead of d at the joints named in `parallel`.
         """
-        names = [name for frame in self.frame_names for name in parameters_of(frame)]
-        late = [key for key in self.frame_names if self.frame(key).delay is not None]
-        names += [Parameter(frame, DELAY) for frame in late]
-        cameras = [key for key in self.frame_names if self.frame(key).lens is not None]
+        frames = {name: self.frame(name) for name in self.frame_names}
+        names = [name for frame in frames for name in parameters_of(frame)]
+        names += [
+            Parameter(name, DELAY) for name, each in frames.items() if each.delay is not None
+        ]
+        cameras = [name for name, each in frames.items() if each.lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
@@ -298,18 +297,9 @@ class Chain(Shown):
         return self.walk.along(q, self.frame('base').matrix)[1]
 
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Draw joint values (count, n) within the limits, +-180 degrees or +-0.5 m by default."""
-        limits = []
-        for joint in self.joints:
-            reach = np.pi if joint.type == 'revolute' else 0.5
-            lower, upper = joint.lower, joint.upper
-            if lower is None:
-                lower = -reach if upper is None else min(-reach, upper - 2.0 * reach)
-            if upper is None:
-                upper = max(reach, lower + 2.0 * reach)
-            limits.append((lower, upper))
-        bounds = np.array(limits)
-        return rng.uniform(bounds[:, 0], bounds[:, 1], (count, len(self.joints)))
+        """Draw joint values (count, n) within the range of each joint."""
+        lower, upper = np.array([joint.range for joint in self.joints]).T
+        return rng.uniform(lower, upper, (count, len(self.joints)))
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
         """Return the joint or frame that a parameter belongs to, and the kind of parameter."""

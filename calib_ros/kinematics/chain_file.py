@@ -101,10 +101,7 @@ def shared_files(folder: str) -> dict[str, Path]:
 def parse_chain(text: str, where: str = 'chain file') -> Chain:
     """Turn the text of a chain file into a chain; `where` names it in errors."""
     document = parse_yaml(text, where)
-    content = _mapping(document, CHAIN_KEYS, where)
-    for key in ('convention', 'joints'):
-        if key not in content:
-            raise ConfigError(f'{where}: key "{key}" is missing')
+    content = _mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
@@ -129,14 +126,12 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
                 for name, value in dictionary(content.get('effects'), f'{where}: effects').items()
             }
         )
+    except UnknownNameError as err:
+        what = err.what if where in err.what else f'{where}: {err.what}'
+        raise UnknownNameError(what, err.name, err.alternatives) from err
     except ConfigError as err:
-        if str(err).startswith(where):
-            raise
-        if isinstance(err, UnknownNameError):
-            if where in err.what:
-                raise
-            raise UnknownNameError(f'{where}: {err.what}', err.name, err.alternatives) from err
-        raise ConfigError(f'{where}: {err}') from err
+        text = str(err)
+        raise ConfigError(text if text.startswith(where) else f'{where}: {text}') from err
 
 
 def parse_frames(content: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -164,11 +159,7 @@ def table_hash(chain: Chain) -> str:
         [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
         for joint in chain.joints
     ]
-    content = [
-        str(chain.convention),
-        rows,
-        [[name, float(value)] for name, value in chain.effects],
-    ]
+    content = [str(chain.convention), rows, [[name, float(x)] for name, x in chain.effects]]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
@@ -242,13 +233,26 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     return str(text)
 
 
-def _mapping(value: object, keys: tuple[str, ...], where: str) -> dict[str, Any]:
+def _mapping(
+    value: object, keys: tuple[str, ...], where: str, needed: tuple[str, ...] = ()
+) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f'{where} must be a mapping with the keys {", ".join(keys)}')
     for key in value:
         if key not in keys:
             raise UnknownNameError(f'key in {where}', str(key), keys)
+    for key in needed:
+        if value.get(key) is None:
+            raise ConfigError(f'{where}: key "{key}" is missing')
     return value
+
+
+def _flag(content: dict[str, Any], where: str, default: bool) -> bool:
+    """Return whether a frame or lens is fixed."""
+    fixed = content.get('fixed', default)
+    if not isinstance(fixed, bool):
+        raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
+    return fixed
 
 
 def dictionary(value: object, where: str) -> dict[str, Any]:
@@ -268,10 +272,7 @@ def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _joint(row: object, where: str) -> Joint:
-    content = _mapping(row, JOINT_KEYS, where)
-    for key in ('name', 'a', 'alpha', 'd', 'theta'):
-        if content.get(key) is None:
-            raise ConfigError(f'{where}: key "{key}" is missing')
+    content = _mapping(row, JOINT_KEYS, where, ('name', 'a', 'alpha', 'd', 'theta'))
     numbers = {
         key: parse_number(content[key], f'{where}: {key}')
         for key in (*DH_KINDS, 'sign', 'mass', 'gear_ratio')
@@ -283,14 +284,14 @@ def _joint(row: object, where: str) -> Joint:
             if abs(limit) <= LARGEST:  # what some write where there is none
                 numbers[key] = limit
     sign = numbers.pop('sign', 1.0)
-    centre = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
+    x, y, z = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()
     if sign not in (1.0, -1.0):
         raise ConfigError(f'{where}: sign must be 1 or -1, not {sign:g}')
     return Joint(
         name=parse_name(content['name'], f'{where}: name'),
         type=content.get('type', 'revolute'),
         sign=int(sign),
-        com=(centre[0], centre[1], centre[2]),
+        com=(x, y, z),
         **numbers,
     )
 
@@ -304,29 +305,17 @@ def _frame(value: object, where: str) -> Frame | None:
     length = float(np.linalg.norm(quat))
     if abs(length - 1.0) > QUATERNION_TOLERANCE:
         raise ConfigError(f'{where}.quat_xyzw must have length 1 (x, y, z, w), not {length:.6g}')
-    fixed = content.get('fixed', False)
-    if not isinstance(fixed, bool):
-        raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
     delay = content.get('delay')
     return Frame(
         se3.transform(se3.from_quat(quat), xyz),
-        fixed,
+        _flag(content, where, False),
         None if delay is None else parse_number(delay, f'{where}.delay'),
         None if content.get('lens') is None else _lens(content['lens'], f'{where}.lens'),
     )
 
 
 def _lens(value: object, where: str) -> Lens:
-    content = _mapping(value, (*LENS_KINDS, 'fixed'), where)
-    fixed = content.get('fixed', True)
-    if not isinstance(fixed, bool):
-        raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
-    for kind in IN_PIXELS:
-        if kind not in content:
-            raise ConfigError(f'{where}: key "{kind}" is missing')
-    numbers = {
-        kind: parse_number(content[kind], f'{where}.{kind}')
-        for kind in LENS_KINDS
-        if kind in content
-    }
-    return Lens(**numbers, fixed=fixed)
+    content = _mapping(value, (*LENS_KINDS, 'fixed'), where, IN_PIXELS)
+    given = [kind for kind in LENS_KINDS if kind in content]
+    numbers = {kind: parse_number(content[kind], f'{where}.{kind}') for kind in given}
+    return Lens(**numbers, fixed=_flag(content, where, True))

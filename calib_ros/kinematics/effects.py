@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cross
 
 if TYPE_CHECKING:
     from calib_ros.kinematics.chain import Chain
@@ -47,9 +47,8 @@ class Verdict:
 
 GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 'backlash')
 """Groups of effects that can be switched on together. `gear` has the harmonics at the gear ratio
-and twice that of joints that give one; others are found from data (`selection.py`)."""
-WRIST = 3
-"""Couplings are looked for among so many last joints."""
+and twice that of joints that give one; others are found from data (`model_choice.py`). `coupling`
+is that of the wrist, the last three joints."""
 
 
 def group_of(name: str) -> str:
@@ -62,38 +61,25 @@ def group_of(name: str) -> str:
 
 def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
     """Return the names of all effects of a group for a chain."""
-    joints = chain.joints
-    names = chain.joint_names
-    revolute = [joint.name for joint in joints if joint.type == 'revolute']
-    if group == 'ratio':
-        return tuple(Parameter(name, group) for name in names)
-    if group == 'coupling':
-        wrist = names[-WRIST:]
-        return tuple(
-            Parameter(wrist[i], f'coupling_{wrist[j]}')
-            for i in range(len(wrist))
-            for j in range(i)
-        )
-    if group == 'eccentricity':
-        return tuple(name for joint in revolute for k in (1, 2) for name in waves(joint, k))
-    if group == 'gear':
-        return tuple(
-            name
-            for joint in joints
-            if joint.gear_ratio
-            for k in (1, 2)
-            for name in waves(joint.name, k * joint.gear_ratio)
-        )
-    if group == 'gravity':
-        return tuple(
-            Parameter(joint.name, f'gravity_{other}')
-            for i, joint in enumerate(joints)
-            if joint.type == 'revolute'
-            for other in names[i:]
-        )
-    if group in ('compliance', 'backlash'):
-        return tuple(Parameter(name, group) for name in revolute)
-    raise UnknownNameError('group of effects', group, GROUPS)
+    names, wrist = chain.joint_names, chain.joint_names[-3:]
+    revolute = [joint.name for joint in chain.joints if joint.type == 'revolute']
+    geared = [(joint.name, joint.gear_ratio) for joint in chain.joints if joint.gear_ratio]
+    behind = {name: names[i:] for i, name in enumerate(names)}
+    pairs = [(name, other) for i, name in enumerate(wrist) for other in wrist[:i]]
+    found: dict[str, list[Parameter]] = {
+        'ratio': [Parameter(name, group) for name in names],
+        'coupling': [Parameter(name, f'coupling_{other}') for name, other in pairs],
+        'eccentricity': [wave for name in revolute for k in (1, 2) for wave in waves(name, k)],
+        'gear': [wave for name, gear in geared for k in (1, 2) for wave in waves(name, k * gear)],
+        'gravity': [
+            Parameter(name, f'gravity_{other}') for name in revolute for other in behind[name]
+        ],
+        'compliance': [Parameter(name, group) for name in revolute],
+        'backlash': [Parameter(name, group) for name in revolute],
+    }
+    if group not in found:
+        raise UnknownNameError('group of effects', group, GROUPS)
+    return tuple(found[group])
 
 
 WAVES = ('sin', 'cos')
@@ -211,15 +197,7 @@ def _torques(
     down = start[:3, :3] @ np.asarray(chain.gravity)
     # a weight along g at r turns the axis u through c by u . ((r - c) x g) = (r - c) . (g x u)
     axes, points = frames[:-1, 2], frames[:-1, 3]
-    x, y, z = down
-    turned = np.stack(
-        [
-            y * axes[:, 2] - z * axes[:, 1],
-            z * axes[:, 0] - x * axes[:, 2],
-            x * axes[:, 1] - y * axes[:, 0],
-        ],
-        axis=1,
-    )
+    turned = cross(down[:, np.newaxis], axes)
     turned[np.abs(turned) < ROUNDING * np.linalg.norm(down)] = 0.0  # of a vertical axis
     turned *= chain.walk.signs[..., np.newaxis]
     if ends is not None:

@@ -14,31 +14,30 @@ e_k = u_k^T e of the error would need x_k = e_k / s_k > 1 gets x_k = s_k / e_k, 
 D = sum_k (e_k^2 - s_k^2) v_k v_k^T does: continuous where damping begins, zero at the singularity
 (variable damping after Nakamura and Hanafusa 1986), and exact in all other directions.
 
-Arrays inside are laid out (component, sample), as in `differential.py`.
+Arrays inside are laid out (component, sample), as in `jacobian.py`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
+from calib_ros.kinematics.inverse import ITERATIONS, LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import FloatArray, transform
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, transform
+from calib_ros.kinematics.walk import BLOCK
+from calib_ros.shown import Shown
 
 Flags = NDArray[np.bool_]
 
-BLOCK = 2048
-ITERATIONS = 50
 EXACT = 1e-8
 """Errors [m, rad] below which a pose is reached; steps below which it has converged, in units of
 the largest change."""
-EVEN = 1e-12
-"""Share by which the cost may change and count as the same."""
 CAUTION = 1e-3
 """Damping, as a share of the diagonal, after a step that raised the cost."""
 RIDGE = 1e-8
@@ -49,42 +48,44 @@ POSITION_FIRST = 1e-3
 """Metres that a radian counts where not every orientation can be reached: position first."""
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution(Shown):
     """Changes of the joints, and the errors with and without them.
 
     Attributes
     ----------
     change : (N, n)
         To be added to the commands [rad or m].
-    held : (N, n) bool
-        Joints that are held at a limit.
-    converged, damped : (N,) bool
-        Damped samples would need more than the largest change: they get a part of it.
+    position, orientation : (N,)
+        Errors that remain [m], [rad].
+    position_before, orientation_before : (N,)
+        Errors without a change.
     iterations : int
         Of the slowest sample.
-    errors, errors_before : (N, 2)
-        Lengths of position [m] and orientation error [rad].
+    converged : (N,) bool
+    limited : (N, n) bool
+        Joints that are held at a limit.
+    damped : (N,) bool
+        Samples whose full change would exceed the largest one: changed in part.
 
     """
 
     change: FloatArray
-    held: Flags
-    converged: Flags
-    damped: Flags
+    position: FloatArray
+    orientation: FloatArray
+    position_before: FloatArray
+    orientation_before: FloatArray
     iterations: int
-    errors: FloatArray
-    errors_before: FloatArray
+    converged: Flags
+    limited: Flags
+    damped: Flags
 
 
 def mobility(chain: Chain) -> int:
     """Return how many freedoms of its flange an arm controls, 6 at most."""
-    q = chain.random_joints(10, np.random.default_rng(0))
-    return int(
-        np.linalg.matrix_rank(
-            ErrorModel(chain, [joint.driven for joint in chain.joints]).jacobian(q), 1e-6
-        ).max()
-    )
+    model = ErrorModel(chain, [joint.driven for joint in chain.joints])
+    jacobian = model.jacobian(chain.random_joints(10, np.random.default_rng(0)))
+    return int(np.linalg.matrix_rank(jacobian, 1e-6).max())
 
 
 class Follower:
@@ -138,11 +139,11 @@ class Follower:
             rows = slice(start, start + BLOCK)
             came = None if approach is None else np.ascontiguousarray(approach[rows].T)
             parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ('change', 'held', 'converged', 'damped', 'errors', 'errors_before')
-        }
-        return Solution(iterations=max(part.iterations for part in parts), **joined)
+        names = [each.name for each in fields(Solution)]
+        found = {name: [getattr(part, name) for part in parts] for name in names}
+        iterations = max(found.pop('iterations'))
+        joined = {name: np.concatenate(arrays) for name, arrays in found.items()}
+        return Solution(iterations=iterations, **joined)
 
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
         """Solve for commands (n, B).
@@ -150,14 +151,8 @@ class Follower:
         A joint that would go beyond a limit is held there, and the others do without it.
         """
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
-        task = _Task(
-            q,
-            approach,
-            axes,
-            origin,
-            np.zeros(q.shape, dtype=bool),
-            np.zeros_like(q),
-        )
+        nothing = np.zeros_like(q)
+        task = _Task(q, approach, axes, origin, nothing.astype(bool), nothing)
         before = self._errors(task, task.start)
         x, errors, converged, damped, iterations = self._attempt(task)
         lower, upper = (((end - q.T).T / self._unit) for end in (self.lower, self.upper))
@@ -167,19 +162,15 @@ class Follower:
             if not rest.size:
                 break
             held = task.held | beyond
-            task = replace(task, held=held, start=np.where(held, np.clip(x, lower, upper), 0.0))
+            task = task._replace(held=held, start=np.where(held, np.clip(x, lower, upper), 0.0))
             x[:, rest], errors[rest], converged[rest], damped[rest], more = self._attempt(
                 task.select(rest)
             )
             iterations += more
         return Solution(
             (self._unit * x).T,
-            task.held.T,
-            converged,
-            damped,
-            iterations,
-            errors,
-            before,
+            *(errors[:, 0], errors[:, 1], before[:, 0], before[:, 1]),
+            *(iterations, converged, task.held.T, damped),
         )
 
     def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags, int]:
@@ -243,8 +234,8 @@ class Follower:
             )
             new_error, new_columns = self._linearise(task, new, weight)
             cost, new_cost = _cost(error, x, stiffness), _cost(new_error, new, stiffness)
-            taken = new_cost <= cost * (1.0 + EVEN)
-            still = settle & taken & (new_cost >= cost * (1.0 - EVEN))
+            taken = new_cost <= cost * (1.0 + ROUNDING)
+            still = settle & taken & (new_cost >= cost * (1.0 - ROUNDING))
             x = np.where(taken, new, x)
             error = np.where(taken, new_error, error)
             columns = np.where(taken, new_columns, columns)
@@ -279,8 +270,7 @@ class Follower:
         return np.asarray(np.sqrt(np.einsum('kib,kib->bk', errors, errors)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
+class _Task(NamedTuple):
     """Samples to solve: commands (n, B), wanted axes (3, 3, B) and origins (3, B).
 
     Joints that are `held` (n, B) keep the x that they have at the `start` (n, B).
@@ -295,14 +285,7 @@ class _Task:
 
     def select(self, index: NDArray[np.intp]) -> _Task:
         """Return some of the samples."""
-        return _Task(
-            self.q[:, index],
-            None if self.approach is None else self.approach[:, index],
-            self.axes[..., index],
-            self.origin[:, index],
-            self.held[:, index],
-            self.start[:, index],
-        )
+        return _Task._make(None if each is None else each[..., index] for each in self)
 
 
 def _cost(error: FloatArray, x: FloatArray, stiffness: FloatArray) -> FloatArray:

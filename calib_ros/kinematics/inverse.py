@@ -3,14 +3,14 @@
 """Joint values that bring the target to wanted poses, for any chain.
 
 Newton's method on the error e = (p_wanted - p, rotation vector from R to R_wanted), with
-J = -de/dq by the error model's columns (`differential.py`) for theta or d of every joint. The step
+J = -de/dq by the error model's columns (`jacobian.py`) for theta or d of every joint. The step
 
     dq = (J^T J + lambda I)^-1 J^T e
 
 is the shortest one that removes e (redundant arms). It is damped (Levenberg 1944, Marquardt 1963)
 until it lowers |e|, as near singular configurations.
 
-Arrays are laid out (component, sample), as in `differential.py`.
+Arrays are laid out (component, sample), as in `jacobian.py`.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ class ErrorModel:
         flat = frames.reshape(4 * len(frames), 3, samples)
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
-        cross(axes, target[3] - flat[layout.points], levers[:-1])
+        se3.cross(axes, target[3] - flat[layout.points], levers[:-1])
         shift = np.empty((len(layout.row) + 1, 3, samples))
         turn = np.empty((self.rotations + 1, 3, samples))
         np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
@@ -279,8 +279,7 @@ def _twist(
     """Return what a delay of one second would change: turn and shift (3, B) of a target there."""
     rates, turning = -walk.signs * velocity, walk.turning
     driven, points = frames[: len(rates), 2], frames[: len(rates), 3]
-    moved = np.empty_like(driven)
-    cross(driven, origin - points, moved)
+    moved = se3.cross(driven, origin - points)
     moved[~turning] = driven[~turning]
     return (
         np.einsum('jb,jcb->cb', rates[turning], driven[turning]),
@@ -292,14 +291,6 @@ def _indices(numbers: Iterable[int]) -> NDArray[np.intp]:
     found = np.array([*numbers], dtype=np.intp)
     found.setflags(write=False)
     return found
-
-
-def cross(first: FloatArray, second: FloatArray, out: FloatArray) -> None:
-    """Write the cross product of (..., 3, B) arrays into `out`."""
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        np.multiply(first[..., i, :], second[..., j, :], out=out[..., k, :])
-        out[..., k, :] -= first[..., j, :] * second[..., i, :]
 
 
 def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
@@ -318,13 +309,12 @@ def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
     1/2 sum_k r_k x m_k, which is as long as log(R^T R_measured).
 
     """
-    parts = np.empty_like(model)
-    cross(model, measured, parts)
-    sine_vector = 0.5 * parts.sum(axis=0)
+    sine_vector = 0.5 * se3.cross(model, measured).sum(axis=0)
     cosine = 0.5 * (np.einsum('kib,kib->b', model, measured) - 1.0)
     sine = np.sqrt(np.einsum('ib,ib->b', sine_vector, sine_vector))
     angle = np.arctan2(sine, cosine)
-    error: FloatArray = sine_vector * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 1.0)
+    least = np.maximum(sine, se3.ROUNDING)
+    error: FloatArray = sine_vector * np.where(sine > se3.ROUNDING, angle / least, 1.0)
     half_turn = np.flatnonzero(cosine < -0.99)  # the sine loses the axis near 180 degrees
     if half_turn.size:
         turned = np.einsum('kib,kjb->bij', measured[..., half_turn], model[..., half_turn])

@@ -77,6 +77,15 @@ class Joint:
         """Return the parameter that the joint's value is added to."""
         return Parameter(self.name, 'theta' if self.type == 'revolute' else 'd')
 
+    @property
+    def range(self) -> tuple[float, float]:
+        """Return the limits [rad or m], +-180 degrees or +-0.5 m where none are given."""
+        reach = np.pi if self.type == 'revolute' else 0.5
+        lower, upper = self.lower, self.upper
+        if lower is None:
+            lower = -reach if upper is None else min(-reach, upper - 2.0 * reach)
+        return lower, max(reach, lower + 2.0 * reach) if upper is None else upper
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -102,13 +111,9 @@ class Frame:
         turn = [offsets.get(kind, 0.0) for kind in FRAME_KINDS[3:]]
         if any(turn):
             matrix[:3, :3] = se3.turned(*turn) @ matrix[:3, :3]
-        delay = self.delay
-        if DELAY in offsets:
-            delay = (delay or 0.0) + offsets[DELAY]
-        lens = self.lens
-        if lens is not None:
-            lens = lens.moved({kind: offsets[kind] for kind in LENS_KINDS if kind in offsets})
-        return Frame(matrix, self.fixed, delay, lens)
+        later = (self.delay or 0.0) + offsets[DELAY] if DELAY in offsets else self.delay
+        seen = {kind: offsets[kind] for kind in LENS_KINDS if kind in offsets}
+        return Frame(matrix, self.fixed, later, self.lens and self.lens.moved(seen))
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
         """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""

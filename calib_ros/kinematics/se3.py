@@ -92,6 +92,16 @@ def skew(vector: FloatArray) -> FloatArray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def cross(first: FloatArray, second: FloatArray, out: FloatArray | None = None) -> FloatArray:
+    """Return the cross product of (..., 3, B) arrays, in `out` if given."""
+    found = np.empty(np.broadcast_shapes(first.shape, second.shape)) if out is None else out
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        np.multiply(first[..., i, :], second[..., j, :], out=found[..., k, :])
+        found[..., k, :] -= first[..., j, :] * second[..., i, :]
+    return found
+
+
 def left_jacobian_inverse(vector: FloatArray) -> FloatArray:
     """Return J_l(v)^-1 (3, 3) (Chirikjian 2012).
 

@@ -27,7 +27,14 @@ import numpy as np
 
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Convention, Frame, Joint
+from calib_ros.kinematics.chain import (
+    PARALLEL_TOLERANCE,
+    Chain,
+    Convention,
+    Frame,
+    Joint,
+    JointType,
+)
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
 
@@ -188,9 +195,8 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
 
 def _row(joint: DescribedJoint) -> Joint:
     """Return the row of a joint, without geometry."""
-    if joint.type == 'prismatic':
-        return Joint(joint.name, 'prismatic', lower=joint.lower, upper=joint.upper)
-    return Joint(joint.name, lower=joint.lower, upper=joint.upper)
+    kind: JointType = 'prismatic' if joint.type == 'prismatic' else 'revolute'
+    return Joint(joint.name, kind, lower=joint.lower, upper=joint.upper)
 
 
 def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:

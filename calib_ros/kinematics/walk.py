@@ -19,6 +19,9 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 
+BLOCK = 1024
+"""Samples that one operation runs over: their arrays stay in the caches (benchmarks/peers.py)."""
+
 
 class Walk:
     """What of a chain's links does not depend on the joint values.

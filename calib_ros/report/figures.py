@@ -170,20 +170,13 @@ def unit_of(joint: Joint) -> tuple[float, str, int]:
     return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
 
 
-def range_of(joint: Joint) -> tuple[float, float]:
-    """Return the range of a joint [rad or m]: its limits, else those that are drawn from."""
-    reach = np.pi if joint.type == 'revolute' else 0.5
-    lower = -reach if joint.lower is None else joint.lower
-    return lower, reach if joint.upper is None else joint.upper
-
-
 def coverage(chain: Chain, joints: FloatArray) -> tuple[Figure, tuple[tuple[str, ...], ...]]:
     """Return how often joint values (N, n) lie where in the range of each, and a table."""
     counts = np.zeros((len(chain.joints), BINS))
     labels, rows = [], []
     for k, joint in enumerate(chain.joints):
         factor, unit, digits = unit_of(joint)
-        lower, upper = range_of(joint)
+        lower, upper = joint.range
         low, high = float(joints[:, k].min()), float(joints[:, k].max())
         lower, upper = min(lower, low), max(upper, high)
         counts[k] = np.histogram(joints[:, k], BINS, (lower, upper))[0]

@@ -12,7 +12,7 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
-from calib_ros.files.rows import EPOCH_NS
+from calib_ros.files.rows import is_time
 from calib_ros.identification.validation import CONFIDENCE, Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -117,7 +117,7 @@ def identity_of(
 
 def _measured(poses: Poses | None) -> str:
     """Return when it was measured, where the stamps tell."""
-    if poses is None or not len(poses) or poses.lines or poses.stamps_ns[0] < EPOCH_NS:
+    if poses is None or not len(poses) or poses.lines or not is_time(poses.stamps_ns[0]):
         return ''
     first, last = (
         datetime.fromtimestamp(int(stamp) // 10**9, timezone.utc).strftime('%Y-%m-%d %H:%M')

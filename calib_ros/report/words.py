@@ -14,6 +14,7 @@ import numpy as np
 import calib_ros
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import FALSE, reason_in_words
+from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identification import Identification, Noise, Outlier
 from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.region import Region
@@ -117,8 +118,11 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     return dump_yaml({'/**': {'ros__parameters': parameters}})
 
 
-def checked(found: Recalibration) -> tuple[bool, str]:
-    """Return whether the last stops agree with the calibration in use, and why in words."""
+def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
+    """Return whether the last stops agree with the calibration in use, and why in words.
+
+    It must hold as for `verdict`, and nothing may have changed.
+    """
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} samples'
     if found.changed:
         reasons = '; '.join(reason_in_words(each) for each in found.changed)
@@ -131,24 +135,35 @@ def checked(found: Recalibration) -> tuple[bool, str]:
             f'{text}, more than the calibration in use and noise explain, and no few parameters '
             'do: measure new poses and call ~/identify'
         )
+    if previous.holds(1e-3 * found.before.rms_mm) is False:
+        return False, _lost(previous, text)
     return True, f'the calibration in use agrees with what was measured: {text}'
 
 
 def verdict(
-    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures
+    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures, reused: float = 0.0
 ) -> tuple[bool, str]:
-    """Return whether a calibration still holds on new samples, and why in words."""
+    """Return whether a calibration still holds on new samples, and why in words.
+
+    A share of them may be `reused`: fitted before, as of a bag that is played again.
+    """
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} samples taken since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    if warning := reused_in_words(reused):
+        text += f'; {warning}'
     if calibration.residual is None:
         return True, text
-    judged = 1e3 * calibration.residual
     if not calibration.holds(1e-3 * now.rms_mm):
-        return False, (
-            f'the calibration does not hold any more: {text}; it had {judged:.3f} mm. Was the '
-            'tracker, the target or the robot moved?'
-        )
-    return True, f'the calibration holds: {text}; it had {judged:.3f} mm'
+        return False, _lost(calibration, text)
+    return True, f'the calibration holds: {text}; it had {1e3 * calibration.residual:.3f} mm'
+
+
+def _lost(calibration: Calibration, text: str) -> str:
+    return (
+        f'the calibration does not hold any more: {text}; it had '
+        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, the target or the robot '
+        'moved?'
+    )
 
 
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
@@ -40,23 +39,21 @@ from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
 from calib_ros.sampling.cdr import trajectory_size
-from calib_ros.sampling.live import Estimate
+from calib_ros.sampling.live import LOOK, Estimate
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 
 CANDIDATES = 300
 """Random poses among which the next one is looked for, where no file gives any."""
-TASK = 100
-"""Random poses at which the arm is to be accurate."""
 CLOUD = 10_000
 """Points of the cloud of errors."""
 MOST_POINTS = 50_000
 """Points of a trajectory; a longer one is refused."""
 MOST_JOINTS = 1000
 """Joints that a trajectory names; one of more is refused."""
-MOST_BYTES = 20_000_000
-"""Size of a serialised trajectory; 50,000 points of ten joints with all rates take 18 MB."""
-MOST_WAITING = 10
+MOST_SIZE = 400 * MOST_POINTS
+"""Bytes of a serialised trajectory: ten joints with all rates take 352 a point."""
+MOST_QUEUED = 10
 """Trajectories that may wait; those that come on top are refused."""
 MOST_REASONS = 3
 """Refused points whose reasons are told."""
@@ -65,24 +62,14 @@ MOST_REASONS = 3
 class Guide:
     """Publishes what helps before and after an identification.
 
-    Parameters
-    ----------
-    node : Node
-    session : CalibrationSession
-    latched : QoSProfile
-        For topics whose last message a late subscriber gets.
-    guarded : callable
-        Makes a function of one that logs what it raises.
-    candidates : (N, n), optional
-        Joint values among which the next pose is chosen; random ones within the limits if None.
-
+    `guarded` makes a function of one that logs what it raises. The next pose is chosen among
+    `candidates` (N, n), or among random ones within the limits.
     """
 
     def __init__(
         self,
         node: Node,
         session: CalibrationSession,
-        latched: QoSProfile,
         guarded: Callable[[Callable[..., None]], Callable[..., None]],
         candidates: FloatArray | None,
     ) -> None:
@@ -95,8 +82,8 @@ class Guide:
         self._advising: Future[None] | None = None
         self._compensator: tuple[Calibration, Compensator] | None = None
         self._last_trajectory = ''
-        self._next_pose = node.create_publisher(JointState, '~/next_pose', latched)
-        self._errors = node.create_publisher(PointCloud2, '~/workspace_error', latched)
+        self._next_pose = node.create_publisher(JointState, '~/next_pose', to_ros.LATCHED)
+        self._errors = node.create_publisher(PointCloud2, '~/workspace_error', to_ros.LATCHED)
         self._corrected = node.create_publisher(
             JointTrajectory, '~/compensated_joint_trajectory', 10
         )
@@ -159,7 +146,7 @@ class Guide:
         apart = np.abs(candidates[:, np.newaxis] - taken).max(axis=2).min(axis=1)
         candidates = candidates[apart > STILL]
         if len(candidates):
-            task = design.chain.random_joints(TASK, rng)
+            task = design.chain.random_joints(LOOK, rng)
             found = next_pose(design, candidates, task, self._session.settings.wanted_accuracy)
             self._next_pose.publish(
                 to_ros.joints(self._session.joint_names, found.joints, self._now())
@@ -177,8 +164,8 @@ class Guide:
         )
 
     def _on_trajectory(self, data: bytes) -> None:
-        if sum(not each.done() for each in self._pending) > MOST_WAITING:
-            self._refuse(f'{MOST_WAITING} others wait already, send them more slowly')
+        if sum(not each.done() for each in self._pending) > MOST_QUEUED:
+            self._refuse(f'{MOST_QUEUED} others wait already, send them more slowly')
         elif too_large := _too_large(data):
             self._refuse(too_large)
         else:
@@ -248,9 +235,9 @@ def _too_large(data: bytes) -> str:
 
     To decode a million points takes many seconds, and no other thread runs meanwhile.
     """
-    names, points = trajectory_size(data)
+    names, points = trajectory_size(data, MOST_JOINTS)
     for count, most, what in (
-        (len(data), MOST_BYTES, 'bytes'),
+        (len(data), MOST_SIZE, 'bytes'),
         (names, MOST_JOINTS, 'joints'),
         (points, MOST_POINTS, 'points'),
     ):

@@ -16,14 +16,7 @@ Answer = tuple[bool, str]
 
 
 class Boundary:
-    """Logs what callbacks and services raise, and goes on.
-
-    Parameters
-    ----------
-    logger
-        Of the node.
-
-    """
+    """Logs by the node's logger what callbacks and services raise, and goes on."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger

@@ -7,13 +7,13 @@ from __future__ import annotations
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.ros import to_ros
 from calib_ros.ros.parameters import FrameNames, Links
 
 
@@ -21,30 +21,12 @@ class Broadcast:
     """Publishes where the arm stands, and where on its flange the target is.
 
     The arm's base and flange are the links of the URDF that the chain lies between, if the chain
-    is that of a URDF; else the frames before and behind the DH table. Of a camera on the flange
-    the base leads to the target that stands, and the tool to the camera.
-
-    Parameters
-    ----------
-    node : Node
-    names : FrameNames
-        Without a name nothing is published of a frame.
-    in_hand : bool
-        The device is on the flange.
-    urdf, links
-        The URDF of the robot, or '', and its links.
-    latched : QoSProfile
-
+    is that of a URDF; else the frames before and behind the DH table. Where the device is on the
+    flange (`in_hand`) the base leads to the target that stands, and the tool to the camera.
     """
 
     def __init__(
-        self,
-        node: Node,
-        names: FrameNames,
-        in_hand: bool,
-        urdf: str,
-        links: Links,
-        latched: QoSProfile,
+        self, node: Node, names: FrameNames, in_hand: bool, urdf: str, links: Links
     ) -> None:
         self._node, self._names, self._in_hand = node, names, in_hand
         self._publisher = None
@@ -58,7 +40,7 @@ class Broadcast:
                 'ros-jazzy-tf2-msgs, or leave them empty'
             ) from err
         self._type = TFMessage
-        self._publisher = node.create_publisher(TFMessage, '/tf_static', latched)
+        self._publisher = node.create_publisher(TFMessage, '/tf_static', to_ros.LATCHED)
         self._base = self._tool = np.eye(4)
         if urdf:
             described = chain_from_urdf(urdf, **links)
@@ -82,10 +64,7 @@ class Broadcast:
         self._publisher.publish(self._type(transforms=transforms))
 
     def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:
-        message = TransformStamped(child_frame_id=child)
+        message = TransformStamped(child_frame_id=child, transform=to_ros.transform(matrix))
         message.header.frame_id = parent
         message.header.stamp = self._node.get_clock().now().to_msg()
-        shift, turn = message.transform.translation, message.transform.rotation
-        shift.x, shift.y, shift.z = matrix[:3, 3].tolist()
-        turn.x, turn.y, turn.z, turn.w = se3.to_quat(matrix[:3, :3]).tolist()
         return message

@@ -24,18 +24,8 @@ class DeferredTrigger:
     single-threaded executor; several threads would need a lock around all that the session holds.
     A call that comes meanwhile is refused at once.
 
-    Parameters
-    ----------
-    node : Node
-    name : str
-    answer : callable
-        Takes the name and work, which it runs; returns what that returns, or makes an answer of
-        an error.
-    prepare : callable
-        Runs on the executor's thread; returns the snapshot to work on.
-    work : callable
-        Takes the snapshot, returns success and message.
-
+    `prepare` returns a snapshot, on the executor's thread, and `work` answers with it. `answer`
+    takes the name and either, and makes an answer of what it returns or raises.
     """
 
     def __init__(
@@ -62,7 +52,6 @@ class DeferredTrigger:
         return self._thread is None or not self._thread.is_alive()
 
     def _on_call(self, request: Any, response: Any) -> Any:
-
         def prepare() -> Answer:
             if self._running.is_set():
                 return False, 'refused: the call before is still running, wait for its answer'

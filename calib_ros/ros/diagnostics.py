@@ -19,20 +19,7 @@ from calib_ros.sampling.session import CalibrationSession
 
 
 class Diagnostics:
-    """Judges what goes on and publishes it.
-
-    Parameters
-    ----------
-    node : Node
-    session : CalibrationSession
-    archive : Archive
-    inputs : Inputs
-    boundary : Boundary
-        Knows what has failed.
-    serial : str
-        Of the robot.
-
-    """
+    """Judges what goes on and publishes it."""
 
     def __init__(
         self,

@@ -25,22 +25,9 @@ from calib_ros.settings import Settings
 
 
 class Filer:
-    """Files results of one robot; does nothing without a place.
+    """Files results of one robot, by its serial number, in a folder or URL; without one nothing.
 
-    Parameters
-    ----------
-    place : str
-        Folder or URL of the history; empty for none.
-    serial : str
-        Of the robot.
-    nominal : Chain
-        What identifications begin with.
-
-    Raises
-    ------
-    ConfigError
-        When the serial number is missing, or what a history needs.
-
+    Identifications begin with the `nominal` chain.
     """
 
     def __init__(self, place: str, serial: str, nominal: Chain) -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from visualization_msgs.msg import MarkerArray
 
+from calib_ros.errors import shortened
 from calib_ros.files.archive import Archive
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
@@ -55,20 +55,9 @@ class Snapshot(NamedTuple):
 
 
 class Identifying:
-    """Identifies, tells the result in words, and hands over what is accepted.
+    """Identifies, tells the result in words, and hands over what is `accepted`.
 
-    Parameters
-    ----------
-    node : Node
-    session : CalibrationSession
-    archive : Archive
-    filer : Filer
-    configuration : callable
-        Returns what the node is set to as a parameter file.
-    accepted : callable
-        Takes an accepted calibration, as what it is published, and its samples.
-    latched : QoSProfile
-
+    `configuration` returns what the node is set to as a parameter file.
     """
 
     def __init__(
@@ -79,19 +68,19 @@ class Identifying:
         filer: Filer,
         configuration: Callable[[], str],
         accepted: Callable[[Calibration, Published, Sequence[Sample]], None],
-        latched: QoSProfile,
     ) -> None:
         self._node, self._session, self._archive, self._filer = node, session, archive, filer
         self._configuration, self._accepted = configuration, accepted
-        self._residuals = node.create_publisher(MarkerArray, '~/residuals', latched)
+        self._residuals = node.create_publisher(MarkerArray, '~/residuals', to_ros.LATCHED)
         self.progress = Progress('identifying')
         self.last = 'nothing identified yet'
         """What came of the last identification or ~/load, in words."""
         self.observability = ''
+        self._advice = ''  # of the last identification, that on what is graver first
 
     def snapshot(self, topics: Sequence[str], serial: str) -> Snapshot:
         """Return the problem and all that goes with it, as they are now."""
-        session = self._session
+        session, self._advice = self._session, ''
         problem = session.problem()
         samples = tuple(session.usable)
         origin = {
@@ -113,6 +102,8 @@ class Identifying:
         with self.progress.running():
             result = identify_model(given.problem, given.model, self.progress)
         self.last = words.summary(result, given.numbers_of(result.outliers), given.warnings)
+        advice = (*result.refusals, *given.warnings, *words.remarks(result))
+        self._advice = next(iter(advice), '')
         self.observability = words.observability_in_words(result)
         self._residuals.publish(
             to_ros.residual_markers(
@@ -123,7 +114,8 @@ class Identifying:
             )
         )
         if result.accepted:
-            found = Calibration.of(result, given.origin, named(given.samples).owners)
+            owners, sets = named(given.samples).owners, given.problem.sets
+            found = Calibration.of(result, given.origin, owners, sets)
             page = partial(_page, given, result)
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples
@@ -134,13 +126,26 @@ class Identifying:
         return result.accepted, self.last
 
     def shortened(self, answer: Answer) -> Answer:
-        """Return an answer cut to a few lines; all of it is in the log, and beside the journal."""
+        """Return an answer cut to a few lines: the verdict, and what to do first.
+
+        All of it is in the log, and beside the journal.
+        """
         success, text = answer
         if len(text) > ANSWER_LENGTH:
             path = self._archive.note(text)
             more = f' ... all of it: {path.name if path else "in the log"}'
-            text = textwrap.shorten(text, ANSWER_LENGTH, placeholder=more)
+            before, advice, _ = text.partition(self._advice or text)
+            text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
         return success, text
+
+
+def _without_middle(text: str, longest: int) -> str:
+    """Return a text whose last clause, the advice, is whole; what stands before it is cut."""
+    end = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
+    room = longest - len(text) + end - 1
+    if len(text) <= longest or not longest // 4 < room < end:
+        return shortened(text, longest)
+    return f'{textwrap.shorten(text[:end], room, placeholder=" ...")} {text[end:]}'
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:

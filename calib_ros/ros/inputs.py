@@ -26,6 +26,7 @@ from rclpy.subscription import Subscription
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.intake import Stream, links_of
 from calib_ros.sampling.messages import PICTURES
+from calib_ros.sampling.slices import SILENCE
 
 INPUT_QUEUE = 2000
 """Messages of a topic that may wait while the node is busy; what comes on top is lost."""
@@ -33,8 +34,6 @@ IMAGE_QUEUE = 20
 """Images that may wait: of 30 Hz for as long as the node is ever busy."""
 MOST_LOST = 2**30
 """Messages that may get lost between two reports of DDS: two weeks of 1 kHz."""
-SILENCE = 5.0
-"""A source that has been heard before and is silent for so long [s] is reported."""
 
 
 @dataclass
@@ -88,16 +87,7 @@ class Hearing:
 
 
 class Inputs:
-    """Subscriptions to streams of messages, emptied by hand.
-
-    Parameters
-    ----------
-    node : Node
-    streams : sequence of Stream
-    guarded : callable
-        Makes a function of one that logs what it raises.
-
-    """
+    """Subscriptions to streams of messages, emptied by hand."""
 
     def __init__(
         self,

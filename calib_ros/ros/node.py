@@ -22,7 +22,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
 from std_msgs.msg import String
@@ -46,6 +45,7 @@ from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import Exportable, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.running import run
+from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.problems import check_settings
@@ -60,9 +60,6 @@ DIAGNOSTICS_PERIOD = 1.0
 JOIN_TIMEOUT = 1.0
 STATUS_LENGTH = 120
 """Most characters of the status: `ros2 topic echo` cuts texts at 128."""
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
 
 
 class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
@@ -100,16 +97,16 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         refuse_unknown(self, names)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
-        self._keeper = Keeper(self, self.session, self._archive, given, urdf, LATCHED)
+        self._keeper = Keeper(self, self.session, self._archive, given, urdf)
         self._identifying = Identifying(
-            self, self.session, self._archive, filer, self._configuration, self._accept, LATCHED
+            self, self.session, self._archive, filer, self._configuration, self._accept
         )
         self._status = self.create_publisher(String, '~/status', LATCHED)
         self._diagnostics = Diagnostics(
             self, self.session, self._archive, self._inputs, self._boundary, given.serial
         )
         candidates = read_joints(given.candidates, chain) if given.candidates else None
-        self._guide = Guide(self, self.session, LATCHED, self._boundary.guarded, candidates)
+        self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
         for period, work in (
@@ -297,7 +294,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         figures = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # else there was nothing to judge
-        holds, text = words.verdict(calibration, *figures)
+        holds, text = words.verdict(calibration, *figures, self.session.reused())
         return holds, text + self._filer.validated(self.session, figures, holds)
 
     def _to_check(self) -> tuple[Calibration, Problem]:
@@ -306,7 +303,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
-        return words.checked(recalibrate(calibration, problem, years_since(calibration.record)))
+        years = years_since(calibration.record)
+        return words.checked(calibration, recalibrate(calibration, problem, years))
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros.atomic import confined, write_file
@@ -21,15 +20,13 @@ from calib_ros.files.archive import Archive
 from calib_ros.files.export import exports, urdf_foot
 from calib_ros.files.vendors import vendor_files
 from calib_ros.identification.calibration import Calibration, parse_calibration
-from calib_ros.kinematics.chain_file import (
-    parse_chain,
-    read_text,
-)
+from calib_ros.kinematics.chain_file import parse_chain, read_text
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import corrected_urdf
 from calib_ros.ros import to_ros
 from calib_ros.ros.broadcast import Broadcast
 from calib_ros.ros.parameters import Given
+from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
@@ -55,21 +52,7 @@ class Exportable(NamedTuple):
 
 
 class Keeper:
-    """Keeps the calibration of a session, its publishers and its files together.
-
-    Parameters
-    ----------
-    node : Node
-    session : CalibrationSession
-    archive : Archive
-    given : Given
-        What the node was started with.
-    urdf : str
-        The URDF of the robot, if there is one.
-    latched : QoSProfile
-        For topics whose last message a late subscriber gets.
-
-    """
+    """Keeps the calibration of a session, its publishers and its files together."""
 
     def __init__(
         self,
@@ -78,20 +61,19 @@ class Keeper:
         archive: Archive,
         given: Given,
         urdf: str,
-        latched: QoSProfile,
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
         self._given, self._urdf = given, urdf
         self._published = Published('', '')
         self._lock = threading.Lock()  # identifications end on a thread of their own
         self._posed: tuple[int, Sequence[float]] | None = None
-        self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', latched)
-        self._calibration = node.create_publisher(String, '~/calibration', latched)
+        self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', LATCHED)
+        self._calibration = node.create_publisher(String, '~/calibration', LATCHED)
         for name in ('target_filename', 'calibration_filename'):
             self._named(name)  # refused now rather than after a day's work
         sources = parse_sources(given.settings.sources)
         in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
-        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links, latched)
+        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links)
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(

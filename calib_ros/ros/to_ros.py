@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, PoseStamped
+from geometry_msgs.msg import Point, PoseStamped, Quaternion, Transform, Vector3
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
@@ -26,6 +27,10 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
 
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+"""For topics whose last message a late subscriber gets."""
 MOST_ARROWS = 1000
 
 
@@ -43,15 +48,22 @@ def dh_parameters(chain: Chain) -> Float64MultiArray:
 
 def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) -> PoseStamped:
     """Return the pose of the target at joint values (n) of a stamp."""
-    matrix = chain.forward(np.array([joints]))[0]
+    found = transform(chain.forward(np.array([joints]))[0])
+    at = found.translation
     message = PoseStamped()
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
     message.header.frame_id = frame_id
-    point, turn = message.pose.position, message.pose.orientation
-    point.x, point.y, point.z = matrix[:3, 3].tolist()
-    turn.x, turn.y, turn.z, turn.w = to_quat(matrix[:3, :3]).tolist()
+    message.pose.position = Point(x=at.x, y=at.y, z=at.z)
+    message.pose.orientation = found.rotation
     return message
+
+
+def transform(matrix: FloatArray) -> Transform:
+    """Return a matrix (4, 4)."""
+    x, y, z, w = to_quat(matrix[:3, :3]).tolist()
+    shift = dict(zip('xyz', matrix[:3, 3].tolist(), strict=True))
+    return Transform(translation=Vector3(**shift), rotation=Quaternion(x=x, y=y, z=z, w=w))
 
 
 def joints(names: Sequence[str], values: FloatArray, stamp: Any) -> JointState:

@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.sampling.messages import JOINT_STATE, Readings, frame_name
+from calib_ros.sampling.names import MOST_NAMES
 from calib_ros.sampling.rows import Stamps
 
 LITTLE_ENDIAN = b'\x00\x01'
-MOST_NAMES = 10_000
-"""Joints of a trajectory that are passed over on the way to its points."""
-MOST_LAYOUTS = 100
+MOST_LAYOUTS = 2 * MOST_NAMES
 """Layouts of messages of one length that are remembered, and such lengths."""
 _HEAD, _STAMP = 4, 8  # bytes of the encapsulation and of the stamp
 
@@ -96,16 +95,11 @@ class Alike:
     ends: tuple[bytes, bytes]
     rows: NDArray[np.uint8]
 
-    @property
-    def links(self) -> tuple[tuple[str, str], ...]:
-        """Return which frames their transforms link."""
-        return self.layout.links
-
     def of(self, k: int) -> Readings:
         """Return stamps (N,) and numbers (N, 7) of one transform of each."""
         numbers = _numbers(self.rows, self.layout.numbers[k], '<f8', 7).astype(np.float64)
         stamps = _stamps(_numbers(self.rows, self.layout.stamps[k], '<u4', 2))
-        return Readings(stamps, self.links[k], numbers)
+        return Readings(stamps, self.layout.links[k], numbers)
 
     def span(self, k: int) -> tuple[int, int]:
         """Return the first and the last stamp of one transform of each."""
@@ -214,19 +208,20 @@ def head(blob: bytes) -> tuple[int, str]:
     return seconds * 1_000_000_000 + nanoseconds, _string(blob, _HEAD + _STAMP, order)[0]
 
 
-def trajectory_size(blob: bytes) -> tuple[int, int]:
+def trajectory_size(blob: bytes, most_names: int) -> tuple[int, int]:
     """Return how many joints and points a serialised JointTrajectory has.
 
-    Zero for what cannot be read: such a message cannot be decoded either.
+    Zero points where names are too many to be passed over on the way to these, or cannot be read:
+    such a message cannot be decoded either.
     """
     order = '<' if blob[:2] == LITTLE_ENDIAN else '>'
     names = 0
     try:
         at = _string(blob, _HEAD + _STAMP, order)[1]
         names, at = _integer(blob, at, order)
-        for _ in range(min(names, MOST_NAMES)):
+        for _ in range(min(names, most_names)):
             at = _string(blob, at, order)[1]
-        points = _integer(blob, at, order)[0] if names <= MOST_NAMES else 0
+        points = _integer(blob, at, order)[0] if names <= most_names else 0
     except (struct.error, UnicodeDecodeError):
         return names, 0
     return names, points

@@ -11,25 +11,26 @@ import numpy as np
 
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.sampling.collector import Collector
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.collector import ADVANCE_NS, Collector
 from calib_ros.sampling.delay import Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
-from calib_ros.sampling.rows import Rows
+from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import JOINTS, Piece, Slice, StreamKey, merged
 from calib_ros.settings import Settings
 
 WATCH_NS = 15_000_000_000
 """Time over which a watch looks."""
-WATCHED = 20_000
-"""Samples that it keeps at most."""
 DENSE_NS = 4_000_000
 """Time between two samples that it keeps; nearer ones tell no more."""
-CLOCKS_MOVED = 0.05
-"""Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
 MOST_MOVES = 5
 """Moves of the clocks that are remembered."""
-LOOK_AGAIN_NS = 2_000_000_000
+WATCHED = 5 * WATCH_NS // DENSE_NS
+"""Samples that it keeps at most, of several streams."""
+CLOCKS_MOVED = 0.05
+"""Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
+LOOK_AGAIN_NS = 4 * ADVANCE_NS
 """Time between two looks for the delay."""
 EARLY = 0.03
 """Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
@@ -41,16 +42,7 @@ class Watch:
     """Joint values and poses while the arm moves, to see whether the clocks agree.
 
     Once that is seen it sleeps until measurements at stops show unrest: where a clock was moved
-    they do, and are left out or refused.
-
-    Parameters
-    ----------
-    chain : Chain
-    sleepless : bool
-        Watch all the time, as there are no stops.
-    max_gap : float
-        Longest time [s] between two joint samples whose motion is known.
-
+    they do, and are left out or refused. Without stops it is `sleepless`.
     """
 
     def __init__(self, chain: Chain, sleepless: bool, max_gap: float) -> None:
@@ -103,24 +95,14 @@ class Watch:
 
     def look(self, now_ns: int) -> None:
         """Look what the motion shows if it is time to, and begin anew."""
-        if self.awake and self.begun_ns and abs(now_ns - self.begun_ns) > WATCH_NS:
-            self._look()
-
-    def _look(self) -> None:
-        self._joints.sort()
-        self._poses.sort()
-        values = self._poses.values
-        oriented = len(values) > 0 and not np.isnan(values).any()
-        found = find_delay(
-            self._chain,
-            self._joints.stamps,
-            self._joints.values,
-            self._poses.stamps,
-            values[:, :3],
-            se3.from_quat(values[:, 3:]) if oriented else None,
-            self._max_gap,
-        )
-        for rows in (self._joints, self._poses):
+        if not (self.awake and self.begun_ns and abs(now_ns - self.begun_ns) > WATCH_NS):
+            return
+        joints, poses = self._joints, self._poses
+        for rows in (joints, poses):
+            rows.sort()
+        both = (joints.stamps, joints.values), (poses.stamps, poses.values)
+        found = _delay_of(self._chain, *both, self._max_gap)
+        for rows in (joints, poses):
             rows.release(rows.count)
         if found is None:
             return
@@ -138,20 +120,13 @@ class Watch:
 
 
 class Clocks:
-    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops.
-
-    Parameters
-    ----------
-    chain : Chain
-    settings : Settings
-
-    """
+    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops."""
 
     def __init__(self, chain: Chain, settings: Settings) -> None:
         self.settings = settings
         self._chain = chain
         self._continuous = settings.mode == 'continuous'
-        self._watch = Watch(chain, self._continuous, settings.max_gap)
+        self.watch = Watch(chain, self._continuous, settings.max_gap)
         self._found: Delay | None = None  # in the motion that is sampled
         self._looked_ns = 0
 
@@ -159,12 +134,12 @@ class Clocks:
     def delay(self) -> Delay | None:
         """Return how late the measurements are stamped, as far as the motion shows."""
         if not self._continuous:
-            return self._watch.delay
+            return self.watch.delay
         return None if self._found is None or self._found.rivals else self._found
 
     def take(self, given: Slice) -> None:
         """Take messages."""
-        if self._watch.awake:
+        if self.watch.awake:
             joints, poses = [], []
             for each in given.pieces:
                 if not isinstance(each.key, StreamKey):
@@ -172,18 +147,14 @@ class Clocks:
                         joints.append(each)
                 elif not (each.key.distance or each.key.eye_in_hand or each.key.images):
                     poses.append(each)
-            self._watch.take(joints, poses)
+            self.watch.take(joints, poses)
 
     def calm(self, given: Slice) -> tuple[int, int]:
         """Return stamps of joints between which there is nothing to look for."""
-        begun = self._watch.begun_ns
+        begun = self.watch.begun_ns
         if begun is None:
             begun = int(given.times[given.where(JOINTS)[:1]].sum())
         return begun - WATCH_NS, begun + WATCH_NS
-
-    def look(self, now_ns: int) -> None:
-        """Look whether the clocks agree if it is time to."""
-        self._watch.look(now_ns)
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
         """Look for the delay after some time of motion, until it shows.
@@ -203,23 +174,10 @@ class Clocks:
 
         One that has rivals is not used.
         """
-        stamps, joints, positions = collector.known(now_ns)
-        found = []
-        for measured, rows in positions:
-            quats = rows[:, QUAT]
-            oriented = len(rows) > 0 and not np.isnan(quats).any()
-            rotations = se3.from_quat(quats) if oriented else None
-            delay = find_delay(
-                self._chain,
-                stamps,
-                joints,
-                measured,
-                rows[:, POSITION],
-                rotations,
-                self.settings.max_gap,
-            )
-            if delay is not None:
-                found.append(delay)
+        known, positions = collector.known(now_ns)
+        gap = self.settings.max_gap
+        delays = [_delay_of(self._chain, known, measured, gap) for measured in positions]
+        found = [each for each in delays if each is not None]
         if not found:
             return None
         best = max(found, key=lambda delay: (not delay.rivals, delay.correlation))
@@ -227,19 +185,15 @@ class Clocks:
             collector.delay_ns = round(best.seconds * 1e9)
         return best
 
-    def wake(self, unrest: int, calm: int, taken: int) -> None:
-        """Watch again if more measurements at stops were not at rest (`Watch.wake`)."""
-        self._watch.wake(unrest, calm, taken)
-
     def hints(self) -> list[Hint]:
         """Return what looks wrong with the clocks."""
         found = []
         delay, known = self.delay, self.settings.delay
-        if self._watch.moves:
-            found.append(moved(self._watch.moves))
+        if self.watch.moves:
+            found.append(moved(self.watch.moves))
         elif delay is not None and not self._continuous and self._spoils(delay.seconds):
             found.append(disagreement(delay.seconds, known))  # in motion it is fitted
-        unclear = self._found if self._continuous else self._watch.unclear
+        unclear = self._found if self._continuous else self.watch.unclear
         if unclear is not None and unclear.rivals and not known:
             delays = (unclear.seconds, *unclear.rivals)
             if self._continuous or all(map(self._spoils, delays)):
@@ -249,3 +203,16 @@ class Clocks:
     def _spoils(self, delay: float) -> bool:
         """Tell whether a delay [s] spoils stops."""
         return not -EARLY <= delay - self.settings.delay <= self.settings.settle
+
+
+def _delay_of(
+    chain: Chain,
+    joints: tuple[Stamps, FloatArray],
+    measured: tuple[Stamps, FloatArray],
+    max_gap: float,
+) -> Delay | None:
+    """Return how late poses are: rows (N, 7 or more), with NaN where no rotation is known."""
+    stamps, rows = measured
+    oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
+    rotations = se3.from_quat(rows[:, QUAT]) if oriented else None
+    return find_delay(chain, *joints, stamps, rows[:, POSITION], rotations, max_gap)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +21,10 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.hints import Hint, restless, sparse
 from calib_ros.sampling.making import WIDTH, Maker, Numbered
-from calib_ros.sampling.rests import Rests, seen_stops
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, Slice, StreamKey
-from calib_ros.sampling.stands import SAMPLED, Known, Plan
-from calib_ros.sampling.strays import JUMP
+from calib_ros.sampling.slices import JOINTS, MANY, Slice, StreamKey
+from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.sampling.waiting import Waiting
 from calib_ros.settings import Settings
@@ -41,12 +38,7 @@ ADVANCE_NS = 500_000_000
 class Collector:
     """Bounded buffers of joint samples and measurements, and what they are made into.
 
-    Parameters
-    ----------
-    revolute : (n,) bool
-        True for the joints whose values are angles.
-    settings : Settings
-
+    Joints that are `revolute` (n,) have angles for values.
     """
 
     def __init__(self, revolute: Sequence[bool], settings: Settings) -> None:
@@ -59,7 +51,7 @@ class Collector:
         self._advanced_ns = 0  # that at the last round
         self._settled_ns = 0  # measurements before have been dealt with
         self._sampled_ns = 0  # a stop that stands at this moment has been sampled
-        self.rests = Rests()
+        self.rests = Rests(settings.pose_buffer)
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
         """How much later than the joints' the stamps of measurements are."""
@@ -72,7 +64,9 @@ class Collector:
         """What no sample is made of in the ordinary course of things, by cause."""
         self.notes: Counter[str] = Counter()
 
-    def known(self, now_ns: int | None) -> tuple[Stamps, FloatArray, list[Any]]:
+    def known(
+        self, now_ns: int | None
+    ) -> tuple[tuple[Stamps, FloatArray], list[tuple[Stamps, FloatArray]]]:
         """Return stamps and joint values, and stamps and rows (N, WIDTH) of waiting positions.
 
         Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
@@ -86,7 +80,7 @@ class Collector:
             for key, rows in self.waiting.items()
             if not (key.distance or key.eye_in_hand or key.images)
         ]
-        return stamps[complete], joints[complete], positions
+        return (stamps[complete], joints[complete]), positions
 
     def reach(self, given: Slice, calm: tuple[int, int]) -> int:
         """Return how many of the first messages come up to one that gives something to do.
@@ -147,7 +141,7 @@ class Collector:
             newest = int(stamps[-1])
             if newest < self.track.horizon_ns:
                 self._backwards += 1
-                if self._backwards < JUMP:
+                if self._backwards < MANY:
                     self.dropped['joints: later than lateness allows'] += 1
                     return []
                 self.start_anew()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.rows import Stamps
+from calib_ros.sampling.rows import FEWEST, Stamps
 
 STEP = 5e-3
 """Time between two values of the speeds [s]."""
@@ -34,11 +34,9 @@ RIVAL = 3.0
 """A rival explains the speeds unless it leaves so many times what the best delay leaves."""
 MOVING = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
-FEWEST = 10
-"""Fewest samples of joints, and measurements, that are looked at."""
-MOST_TIME = 300.0
+MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
-SMOOTHING = 0.05
+SMOOTHING = 10.0 * STEP
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
 
 

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.sampling.cdr import Alike, decode, head, transforms
+from calib_ros.sampling.cdr import decode, head, transforms
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
@@ -49,6 +49,19 @@ Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 Places: TypeAlias = NDArray[np.intp]
 Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
 """Place, stamp [ns] and numbers of one message."""
+
+
+class Linked(NamedTuple):
+    """Transforms between the same two frames, and the places of their messages.
+
+    Their numbers are read only where they are wanted; the first and the last stamp are known.
+    """
+
+    stream: Stream
+    places: Places
+    link: Pair
+    span: tuple[int, int]
+    read: Callable[[], Readings]
 
 
 @dataclass(frozen=True)
@@ -97,17 +110,8 @@ def links_of(streams: Iterable[Stream]) -> list[Links]:
 def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) -> list[str]:
     """Let a session take messages in their order; return what went wrong with some, in words.
 
-    How they are divided into batches makes no difference.
-
-    Parameters
-    ----------
-    session : CalibrationSession
-        Takes the messages.
-    batch : sequence of (Stream, bytes)
-        Messages in the order in which they came.
-    deserialise : Deserialise
-        For those that are not decoded at once.
-
+    How they are divided into batches makes no difference. Those that are not decoded at once are
+    deserialised.
     """
     found = Intake(batch, deserialise, session.pictures)
     for kind, causes in found.faults.items():
@@ -123,15 +127,8 @@ def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) ->
 class Intake:
     """What a batch of messages holds.
 
-    Attributes
-    ----------
-    parts : list of Part
-        What can be used.
-    faults : dict of str to Counter
-        How many messages cannot be used, by kind and cause.
-    problems : list of str
-        What cannot be decoded, in words.
-
+    That is the `parts` that can be used, how many cannot, by kind and cause (`faults`), and what
+    cannot be decoded in words (`problems`).
     """
 
     def __init__(
@@ -148,7 +145,7 @@ class Intake:
                 continue
             size = len(data) if isinstance(data, bytes) else 0
             lengths.setdefault((stream.topic, size), []).append(place)
-        linked: list[tuple[Stream, Places, Alike | OneLink]] = []
+        linked: list[Linked] = []
         single: list[int] = []
         for (_, size), places in lengths.items():
             stream = batch[places[0]][0]
@@ -164,8 +161,11 @@ class Intake:
             if size and stream.type == TRANSFORMS:
                 for alike in transforms(blobs, stream.links.layouts):
                     where = np.array(places)[alike.which]
-                    linked.append((stream, where, alike))
                     left.difference_update(where.tolist())
+                    linked += [
+                        Linked(stream, where, link, alike.span(k), partial(alike.of, k))
+                        for k, link in enumerate(alike.layout.links)
+                    ]
             single += left
         self._add_links([*linked, *self._decode(sorted(single))])
 
@@ -198,8 +198,8 @@ class Intake:
         found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
         self._add(source, stream.type, np.array([place]), found)
 
-    def _decode(self, places: Sequence[int]) -> list[tuple[Stream, Places, OneLink]]:
-        """Add messages one after the other; return those of links between frames."""
+    def _decode(self, places: Sequence[int]) -> Iterator[Linked]:
+        """Add messages one after the other; yield those of links between frames."""
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         links: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
@@ -223,67 +223,44 @@ class Intake:
                 into.setdefault((stream, strings, len(row[2])), []).append(row)
         for (stream, strings, _), some in alike.items():
             self._add(stream.source, stream.type, *_stacked(some, strings))
-        return [
-            (stream, where, OneLink((frame_name(strings[0]), frame_name(strings[1])), each))
-            for (stream, strings, _), some in links.items()
-            for where, each in [_stacked(some, strings)]
-        ]
+        for (stream, strings, _), some in links.items():
+            where, each = _stacked(some, strings)
+            link = frame_name(strings[0]), frame_name(strings[1])
+            span = int(each.stamps_ns[0]), int(each.stamps_ns[-1])
+            yield Linked(stream, where, link, span, partial(Readings, *each))
 
-    def _add_links(self, come: Sequence[tuple[Stream, Places, Alike | OneLink]]) -> None:
+    def _add_links(self, come: Sequence[Linked]) -> None:
         """Add what is measured by links between frames.
 
         Frames that are named anywhere in the batch are known for all of it.
         """
-        for stream, where, alike in come:
+        for stream, where, link, span, read in come:
             assert stream.links is not None
-            for k, link in enumerate(alike.links):
-                if not stream.still:
-                    stream.links.move(link, len(where), *alike.span(k))
-                    continue
-                found = alike.of(k)  # what stands still may have no stamp
-                good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(where)))
-                for row in found.numbers[good]:
-                    stream.links.fix(link, row)
-        for links in links_of(stream for stream, *_ in come):
-            first = min(int(where[0]) for stream, where, _ in come if stream.links is links)
+            if not stream.still:
+                stream.links.move(link, len(where), *span)
+                continue
+            found = read()  # what stands still may have no stamp
+            good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(where)))
+            for row in found.numbers[good]:
+                stream.links.fix(link, row)
+        for links in links_of(each.stream for each in come):
+            first = min(int(each.places[0]) for each in come if each.stream.links is links)
             for source, found in links.released():
                 self._add(source, TRANSFORM, np.full(len(found.stamps_ns), first), found)
-        for stream, where, alike in come:
+        for stream, where, link, _, read in come:
             assert stream.links is not None
-            for k, link in enumerate(alike.links):
-                if stream.still or not stream.links.wanted(link):
-                    continue
-                found = alike.of(k)
-                good, causes = usable(TRANSFORM, found)
-                sources = stream.links.measured_by(link)
-                self.faults[POSES] += Counter({c: n * len(sources) for c, n in causes.items()})
-                found = found.rows(good)
-                for source, each in stream.links.readings(link, found.stamps_ns, found.numbers):
-                    self._add(source, TRANSFORM, where[good], each)
+            if stream.still or not stream.links.wanted(link):
+                continue
+            found = read()
+            good, causes = usable(TRANSFORM, found)
+            sources = stream.links.measured_by(link)
+            self.faults[POSES] += Counter({c: n * len(sources) for c, n in causes.items()})
+            found = found.rows(good)
+            for source, each in stream.links.readings(link, found.stamps_ns, found.numbers):
+                self._add(source, TRANSFORM, where[good], each)
         for links in links_of(stream for stream, _ in self._batch):
             cause = 'buffer full before their frames were linked'
             self.faults[POSES] += Counter({cause: links.let_go()})
-
-
-@dataclass(frozen=True, eq=False)
-class OneLink:
-    """Transforms that link the same frames, out of messages that were decoded one by one."""
-
-    link: Pair
-    found: Readings
-
-    @property
-    def links(self) -> tuple[Pair, ...]:
-        """Return which frames are linked."""
-        return (self.link,)
-
-    def of(self, k: int) -> Readings:
-        """Return stamps (N,) and numbers (N, 7)."""
-        return self.found
-
-    def span(self, k: int) -> tuple[int, int]:
-        """Return the first and the last stamp."""
-        return int(self.found.stamps_ns[0]), int(self.found.stamps_ns[-1])
 
 
 def _stacked(rows: Sequence[Row], strings: tuple[str, ...]) -> tuple[Places, Readings]:

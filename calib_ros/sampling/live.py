@@ -55,16 +55,14 @@ MOST_THOROUGH = 60
 """Parameters up to which it begins with the thorough fit, which takes too long for more."""
 GROWN = 1.2
 """Growth of the number of samples from which all of them are judged anew."""
-MOST_AT_ONCE = 2000
+MOST_AT_ONCE = 4 * MOST_ANEW
 """Samples that one update adds at most; the rest waits for the next ones."""
 FAR_OFF = 7.0
 """Distance [standard deviations] from which a sample is left out as suspicious."""
 LEAST_NOISE = 1e-3
 """Smallest noise [sigma given] that residuals are taken to show."""
-LOOKED_AT = 200
-"""Samples at which is looked whether the residuals are as small as the noise."""
 LOOK = 100
-"""Configurations at which the accuracy is predicted."""
+"""Configurations at which the arm is to be accurate."""
 LITTLE = 0.35
 """Range [rad] of a joint over all samples that is too little; a tenth of it [m]."""
 
@@ -300,7 +298,7 @@ class LiveEstimate:
 
     def _excess(self, chain: Chain) -> float:
         """Return the RMS residual of positions in units of what measurements scatter by."""
-        chosen = np.linspace(0, len(self._added) - 1, LOOKED_AT).round().astype(int)
+        chosen = np.linspace(0, len(self._added) - 1, MOST_ANEW).round().astype(int)
         some = [self._added[k] for k in np.unique(chosen)]
         total = 0.0
         for members, each in self._groups(some):

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.sampling.messages import MessageError
-from calib_ros.sampling.slices import Columns
+from calib_ros.sampling.slices import MANY, Columns
 
 Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
 
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
-USUAL = 20
-"""So many measurements in one frame make it the usual one of a device."""
 FEW = 0.1
 """Share of measurements in other frames up to which they are stray ones; more is a mistake."""
 
@@ -104,7 +102,7 @@ class FrameNames:
         if frame_id not in known and len(known) == MOST_NAMES:
             raise MessageError(f'in one of more than {MOST_NAMES} frames')
         known[frame_id] += count
-        if known[frame_id] >= USUAL:
+        if known[frame_id] >= MANY:
             self._usual.setdefault(device, frame_id)
 
     def usual(self, device: str) -> str | None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From samples and settings to a problem of the identification."""
+"""From samples and settings to a problem of the identification, or to judges of a calibration."""
 
 from __future__ import annotations
 
@@ -9,25 +9,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.sampling.sample import Frames, Sample, collect, lenses, named, socket_pairs
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 
 
 def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
-    """Refuse names of joints in messages that are not one for each joint of a chain.
-
-    Raises
-    ------
-    ConfigError
-        With the joints of the chain.
-
-    """
+    """Refuse names of joints in messages by a ConfigError unless there is one for each joint."""
     count = len(chain.joints)
     if not len(names) == len(set(names)) == count:
         raise ConfigError(
@@ -37,14 +31,7 @@ def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
 
 
 def check_settings(chain: Chain, settings: Settings) -> None:
-    """Refuse settings that no identification of a chain could use, before anything is measured.
-
-    Raises
-    ------
-    ConfigError
-        When a name is unknown to this chain, say.
-
-    """
+    """Refuse settings by a ConfigError that no identification of a chain could use."""
     if settings.mode == 'continuous' and any(
         each.board for each in parse_sources(settings.sources)
     ):
@@ -89,3 +76,49 @@ def problem_of(
         world_frame=samples[0].frame_id,  # it is the frame of `base`
         **settings.for_problem(),
     )
+
+
+def in_frames_of(
+    calibration: Calibration,
+    since: Sequence[Sample],
+    usable: Sequence[Sample],
+    settings: Settings,
+) -> list[Observations]:
+    """Return the samples taken since a calibration, those among all usable ones, in its frames.
+
+    Without any, or where they are between frames that it does not have, that is an InputError.
+    """
+    sigmas = (settings.sigma_position, settings.sigma_orientation)
+    # the first device and target are those of a file that does not name any
+    frames = Frames(calibration.owners) if calibration.owners else named(usable)
+    sets = [each for part in collect(since, sigmas, frames) for each in part]
+    if not sets:
+        raise InputError('no samples have been taken since: measure some new poses first')
+    known = calibration.chain.frame_names
+    if not all(each.base in known and each.tool in known for each in sets):
+        raise InputError(
+            'the samples since were measured by a device or on a target that the '
+            'calibration does not know'
+        )
+    return sets
+
+
+def problem_since(
+    calibration: Calibration, chain: Chain, sets: Sequence[Observations], settings: Settings
+) -> Problem:
+    """Return sets between the frames of a calibration as a problem of the nominal chain."""
+    first, *more = sets
+    cameras = {each.camera for each in sets if each.pixels is not None}
+    known = {name: calibration.chain.frame(name).lens for name in cameras}
+    chain = with_lenses(chain, {name: lens for name, lens in known.items() if lens})
+    return Problem(chain, first, more=tuple(more), **settings.for_problem())
+
+
+def refuse_other_joints(calibration: Calibration, chain: Chain) -> None:
+    """Refuse a calibration of other joints by an InputError."""
+    theirs = calibration.chain.joint_names
+    if theirs != chain.joint_names:
+        raise InputError(
+            f'the calibration has the joints {", ".join(theirs)}, the robot has '
+            f'{", ".join(chain.joint_names)}'
+        )

@@ -17,7 +17,7 @@ from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.strays import Gate
 from calib_ros.settings import Settings
 
-LEAST_FAR = 1.0
+LEAST_FAR = Settings.lateness
 """Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
 what has not come yet; joint states up to `max_gap` apart belong together."""
 
@@ -75,7 +75,7 @@ class Road:
         """Hand over the samples made."""
         made, shaken = self.collector.maker.take()
         count = self._taken(made)
-        self.clocks.wake(self.collector.maker.unrest, count - shaken, count)
+        self.clocks.watch.wake(self.collector.maker.unrest, count - shaken, count)
 
     def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
         """Yield messages up to one that gives something to do, when those before are kept."""
@@ -110,4 +110,4 @@ class Road:
             self.collector.round(rounds)
         self.hand_over()
         if rounds:
-            self.clocks.look(rounds[-1])
+            self.clocks.watch.look(rounds[-1])

@@ -21,22 +21,25 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, Part
-from calib_ros.sampling.hints import Hint
-from calib_ros.sampling.judging import in_frames_of, problem_since, refuse_other_joints
+from calib_ros.sampling.hints import Hint, progress
 from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.names import FrameNames, JointNames
 from calib_ros.sampling.pictures import Pictures
-from calib_ros.sampling.problems import check_joint_names, check_settings, problem_of
-from calib_ros.sampling.progress import progress
+from calib_ros.sampling.problems import (
+    check_joint_names,
+    check_settings,
+    in_frames_of,
+    problem_of,
+    problem_since,
+    refuse_other_joints,
+)
 from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import SOCKETS, Sample, named, socket_place
-from calib_ros.sampling.slices import POSES
+from calib_ros.sampling.slices import POSES, SILENCE
 from calib_ros.sampling.strays import STRAY
 from calib_ros.settings import Settings
 
-SILENT_NS = 5_000_000_000
-"""Time after which joints of which nothing is heard, while others are, count as silent."""
 ONE_FRAME = (
     'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
     'its own for each source'
@@ -201,7 +204,7 @@ class CalibrationSession:
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
         track = self._collector.track
-        silent = [self.joint_names[k] for k in track.silent(SILENT_NS)]
+        silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
         if silent:
             return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
         return self._names.foreign_ones(track.missing) or self._collector.state()
@@ -315,10 +318,11 @@ class CalibrationSession:
         try:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
-            raise InputError(f'{err} ({self._came})') from err
+            few, _, advice = str(err).rpartition('; ')
+            raise InputError(f'{few} ({self._came}); {advice}') from err
         if result.accepted:
             owners = named(self.samples).owners
-            self.adopt(Calibration.of(result, owners=owners), self.samples)
+            self.adopt(Calibration.of(result, owners=owners, fitted=problem.sets), self.samples)
         return result
 
     def adopt(self, calibration: Calibration, samples: Sequence[Sample] | None = None) -> None:
@@ -351,6 +355,11 @@ class CalibrationSession:
         calibration, sets = self._since()
         nominal, now = compare(calibration.before, calibration.chain, sets).figures
         return now, nominal
+
+    def reused(self) -> float:
+        """Return the share of the samples since that the calibration was fitted to."""
+        calibration, sets = self._since()
+        return calibration.reused(sets)
 
     def recent(self) -> tuple[Calibration, Problem]:
         """Return the calibration in use, and the last stops since then as a problem.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which of the times in which the arm stood become samples, and what becomes of the rest."""
+"""Which of the times in which the arm stood become samples, and which stops pass unseen."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.sampling.stops import SPIKE
 from calib_ros.settings import Settings
 
 SAMPLED = 'of a stop that is sampled already'
@@ -138,3 +139,44 @@ class Known:
         """Forget the stop that stands at a stamp of the joints."""
         since = stamp_ns - self._stops.stamps
         self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
+
+
+class Rests:
+    """How many stops were `sampled`, and the noise of the joints where they rested unseen.
+
+    They pass unseen where their values are noisier than `still`. Up to a `capacity` are counted.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.sampled = 0
+        self._capacity = capacity
+        self._unseen: list[float] = []
+        self._resting = False
+
+    def note(self, noise: float | None) -> None:
+        """Note the noise of joints that rest though no stop is found, None while they do not."""
+        before, self._resting = self._resting, noise is not None
+        if noise is not None and not before and len(self._unseen) < self._capacity:
+            self._unseen.append(noise)
+
+    def needed(self, still: float) -> float | None:
+        """Return what `still` must be at least where more rests passed unseen than not."""
+        if len(self._unseen) <= self.sampled:
+            return None
+        needed = SPIKE * float(np.median(self._unseen))
+        return needed if needed > still else None
+
+
+def seen_stops(
+    stands: Stamps, rounds: Sequence[int], settled_ns: int, late_ns: int, shortest_ns: int
+) -> list[bool]:
+    """Tell of each round whether a stop shows in what the one before has not dealt with.
+
+    Stands (K, 2) of the joints, and stamps of the rounds, of which each deals with what is older
+    than it by `late_ns`.
+    """
+    times = np.array(rounds)[:, np.newaxis]
+    settled = np.concatenate([[[settled_ns]], times[:-1] - late_ns])
+    lengths = np.minimum(stands[:, 1], times) - stands[:, 0]
+    found = ((lengths >= shortest_ns) & (stands[:, 1] > settled)).any(axis=1)
+    return [bool(each) for each in found]

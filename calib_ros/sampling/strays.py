@@ -15,10 +15,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib_ros.sampling.slices import JOINTS, POSES, Slice
+from calib_ros.sampling.slices import JOINTS, MANY, POSES, Slice
 
-JUMP = 20
-"""So many messages of one stream in succession elsewhere mean that the clock was moved."""
 STRAY = 'stamp far from those before and after'
 
 
@@ -98,7 +96,7 @@ class Gate:
                 self._held = [each for each in self._held if each[0] != kind]
             return found, False
         self._held.append((kind, time_ns, given))
-        if self.held(kind) < JUMP:
+        if self.held(kind) < MANY:
             return [], False
         moved = [time for other, time, _ in self._held if other == kind]
         passing = [

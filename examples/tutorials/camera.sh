@@ -38,4 +38,5 @@ Path('camera.yaml').write_text(
     f'data: [{lens.k1}, {lens.k2}, {lens.p1}, {lens.p2}, {lens.k3}]}}\n'
 )
 END
-calib_ros identify --chain ur10e --detections corners.csv --board board.yaml --places places.csv --intrinsics camera.yaml --eye-in-hand --sigma-pixel 0.1 --out result
+calib_ros identify --chain ur10e --detections corners.csv --board board.yaml \
+    --places places.csv --intrinsics camera.yaml --eye-in-hand --sigma-pixel 0.1 --out result

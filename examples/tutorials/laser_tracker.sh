@@ -20,6 +20,8 @@ rows = np.column_stack([new, true.forward(new)[:, :3, 3]])
 head = 'q1,q2,q3,q4,q5,q6,x,y,z'
 np.savetxt('new.csv', rows, delimiter=',', header=head, comments='', fmt='%.9f')
 END
-calib_ros identify measured.csv --chain staubli_tx90l --out result --tolerance 0.2 --sigma-position 2e-5 --operator "A. Smith" --serial 4711 --device "AT960 12345" --pdf
+calib_ros identify measured.csv --chain staubli_tx90l --out result --tolerance 0.2 \
+    --sigma-position 2e-5 --operator "A. Smith" --serial 4711 --device "AT960 12345" --pdf
 calib_ros workspace result --chain staubli_tx90l --poses 500 --out map
-calib_ros verify new.csv --chain staubli_tx90l --calibration result --new-base --tolerance 0.2 --out verified
+calib_ros verify new.csv --chain staubli_tx90l --calibration result --new-base --tolerance 0.2 \
+    --out verified

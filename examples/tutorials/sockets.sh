@@ -27,4 +27,5 @@ with open('sockets.csv', 'w') as file:
     for row in rows:
         file.write(','.join(map(str, row)) + '\n')
 END
-calib_ros identify sockets.csv --chain ur10e --socket-distance 0.05 --sigma-position 2e-5 --out result
+calib_ros identify sockets.csv --chain ur10e --socket-distance 0.05 --sigma-position 2e-5 \
+    --out result

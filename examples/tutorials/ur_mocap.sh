@@ -25,4 +25,5 @@ np.savetxt(
     fmt='%.9f',
 )
 END
-calib_ros verify measured.csv --commanded tests.csv --chain ur10e --calibration result --tolerance 0.5 --out verified
+calib_ros verify measured.csv --commanded tests.csv --chain ur10e --calibration result \
+    --tolerance 0.5 --out verified

@@ -1,14 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-import os
 from dataclasses import replace
 from itertools import combinations, permutations
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from robots import DATA, needs_data
 from scipy.spatial.distance import pdist
 
 from calib_ros.apply import choice, planning, simulation
@@ -37,7 +36,6 @@ from calib_ros.sampling.live import LOOK, LiveEstimate
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[3] / 'shared' / 'data'))
 SIGMAS = (1e-4, 1e-4 / 0.3)
 TOOL = Frame(transform(np.eye(3), np.array([0.05, 0.05, 0.1])))
 POSTURE = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
@@ -409,19 +407,13 @@ def test_over_the_whole_range_no_25_poses_are_worth_50_random_ones():
     assert np.mean(random) < least
 
 
-measured_robots = pytest.mark.skipif(
-    not DATA.is_dir() and 'CI' not in os.environ,
-    reason=f'no measured robots at {DATA}; set CALIB_ROS_DATA',
-)
-
-
 def measured_problem(name, session):
     chain = load_chain(DATA / name / 'chain.yaml')
     table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
     return Problem(chain, table.fitted[0], table.held_out)
 
 
-@measured_robots
+@needs_data
 @pytest.mark.parametrize(
     ('name', 'session'), [('wam7_jacobi_lasertracker', 'grid'), ('fr3_camera_eyeinhand', 'all')]
 )
@@ -438,7 +430,7 @@ def test_half_of_the_measured_poses_predict_as_well_as_all(name, session):
     assert 0.8 < np.sqrt(np.mean((left / noise) ** 2)) < 1.25
 
 
-@measured_robots
+@needs_data
 @pytest.mark.parametrize(
     ('name', 'session', 'least'),
     [('wam7_jacobi_lasertracker', 'grid', 0.8), ('positioner_2axis_pose', 'all', 0.45)],
@@ -704,7 +696,7 @@ def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
     [
         ('q1,q2\n0,0\n', 'has no column q3, q4, q5, q6'),
         ('q1,q2,q3,q4,q5,q6\n', 'has no rows'),
-        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but "ur10e" has 6 joints only'),
+        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but the arm has 6 joints only'),
         (
             'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
             'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',

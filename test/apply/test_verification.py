@@ -33,12 +33,12 @@ def cell():
     rng = np.random.default_rng(0)
     true = simulation.faulty(UR, simulation.Cell(), rng)
     seen = simulation.measure(true, UR.random_joints(40, rng), rng, *NOISE)
-    return true, identify(Problem(UR, seen))
+    return true, identify(Problem(UR, seen)), seen
 
 
 @pytest.fixture(scope='module')
 def arm(cell):
-    return Calibration.of(cell[1])
+    return Calibration.of(cell[1], fitted=[cell[2]])
 
 
 @pytest.fixture(scope='module')
@@ -94,7 +94,7 @@ def test_an_arm_that_keeps_no_orientation_is_told_so(rng):
 
 def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
     """Commands compensated by the calibration: what is wanted against what is reached."""
-    true, result = cell
+    true, result, _ = cell
     wanted = UR.random_joints(200, np.random.default_rng(4))
     moved = compensate(Compensator(UR, result.chain), wanted).joints
     moved = moved[~np.isnan(moved).any(axis=1)]
@@ -110,7 +110,7 @@ def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
 
 def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
     """Against what was commanded: corrected commands pass, uncorrected ones do not."""
-    true, result = cell
+    true, result, _ = cell
     meant = program
     moved = compensate(Compensator(UR, result.chain), meant).joints
     for joints, verdict in ((moved, 'PASS'), (meant, 'FAIL')):
@@ -128,7 +128,7 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
 
 
 def test_pass_fail_and_undecided(cell, arm, program):
-    true, _ = cell
+    true = cell[0]
     seen = [measured(true, program)]
     rms = verify(arm, seen, 1.0).rms
     found = {scale: verify(arm, seen, scale * rms) for scale in (0.4, 1.0, 3.0)}
@@ -194,7 +194,7 @@ def test_repeats_do_not_count_as_more_configurations(arm):
 
 
 def test_a_device_that_stands_elsewhere(cell, arm):
-    true, _ = cell
+    true = cell[0]
     joints = UR.random_joints(30, np.random.default_rng(3))
     there = simulation.random_frame(np.random.default_rng(9), 3.0)
     moved = replace(true, base=replace(true.base, matrix=there.matrix @ true.base.matrix))
@@ -214,7 +214,7 @@ def test_a_device_that_stands_elsewhere(cell, arm):
 @pytest.mark.parametrize('oriented', [True, False])
 def test_a_target_that_was_mounted_anew(cell, arm, oriented):
     """Its change counts as the arm's error unless its frame is fitted as well."""
-    true, _ = cell
+    true = cell[0]
     there, tool = (simulation.random_frame(np.random.default_rng(k), 0.3) for k in (9, 10))
     moved = replace(true, base=there, tool=tool)
     joints = UR.random_joints(40, np.random.default_rng(3))
@@ -233,7 +233,7 @@ def test_a_target_that_was_mounted_anew(cell, arm, oriented):
 
 
 def test_a_new_target_alone(cell, arm):
-    true, _ = cell
+    true = cell[0]
     moved = replace(true, tool=simulation.random_frame(np.random.default_rng(10), 0.3))
     joints = UR.random_joints(40, np.random.default_rng(3))
     assert verify(arm, [measured(moved, joints)], 3e-4, new_tool=True).verdict == 'PASS'
@@ -241,7 +241,7 @@ def test_a_new_target_alone(cell, arm):
 
 def test_the_better_calibration_wins_on_a_session_of_its_own(cell, arm):
     """With a tool of an earlier session, the worse one may look better."""
-    true, result = cell
+    true, result, _ = cell
     tool = result.chain.frame('tool').matrix.copy()
     tool[:3, 3] += [2e-3, -1e-3, 1e-3]
     moved = replace(true, tool=replace(true.tool, matrix=tool))
@@ -272,6 +272,23 @@ def test_a_session_is_judged_without_a_tolerance(arm, cell):
     assert '\nthe RMS error over poses like these is below 0.' in words
 
 
+def test_measurements_that_were_fitted_prove_nothing(cell, arm, folder, capsys):
+    """They pass as before, but it is said, on the screen and in the report."""
+    true, _, fitted = cell
+    new = measured(true, UR.random_joints(40, np.random.default_rng(5)), 1)
+    half = verify(arm, [fitted, new], 5e-4)
+    assert half.reused == 0.5
+    assert '\n50 % of these are the measurements that the calibration was fitted' in in_words(half)
+    assert verify(arm, [new], 5e-4).reused == 0.0
+    for name, seen, warned in (('fitted', fitted, True), ('new', new, False)):
+        write_table(folder / f'{name}.csv', seen)
+        judge = ['verify', f'{name}.csv', '--chain', 'ur10e', '--calibration', 'result']
+        assert main([*judge, '--tolerance', '1', '--out', name]) == 0
+        files = [folder / name / each for each in ('report.html', 'verification.txt')]
+        for text in (capsys.readouterr().out, *(file.read_text() for file in files)):
+            assert ('that the calibration was fitted to' in ' '.join(text.split())) is warned
+
+
 def test_the_fitted_frame_costs_its_freedom(arm):
     """Errors that are noise alone: their size is found, though a frame was fitted to them."""
     rng = np.random.default_rng(3)
@@ -284,7 +301,7 @@ def test_the_fitted_frame_costs_its_freedom(arm):
 
 
 def test_what_cannot_be_verified_is_refused(cell, arm):
-    true, _ = cell
+    true = cell[0]
     joints = UR.random_joints(6, np.random.default_rng(0))
     seen = measured(true, joints)
     for tolerance, confidence in ((0.0, 0.95), (1e-3, 0.4), (1e-3, 1.0), (np.nan, 0.95)):
@@ -307,7 +324,9 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
 def folder(cell, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / 'result').mkdir()
-    (tmp_path / 'result' / 'calibration.yaml').write_text(Calibration.of(cell[1]).dump())
+    (tmp_path / 'result' / 'calibration.yaml').write_text(
+        Calibration.of(cell[1], fitted=[cell[2]]).dump()
+    )
     return tmp_path
 
 
@@ -319,7 +338,7 @@ def write_table(path, seen):
 
 def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
     """Plan the test poses, correct them, measure the real arm there, and judge."""
-    true, _ = cell
+    true = cell[0]
     assert main(['plan', '--chain', 'ur10e', '--iso9283', '--out', 'tests.csv']) == 0
     assert 'P1 to P5 of ISO 9283 in a cube of' in capsys.readouterr().out
     correct = ['compensate', 'tests.csv', '--chain', 'ur10e', '--out', 'corrected.csv']

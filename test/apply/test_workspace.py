@@ -12,7 +12,7 @@ from calib_ros.apply import simulation, workspace
 from calib_ros.apply.placement import place, task_of
 from calib_ros.apply.workspace import regions, survey
 from calib_ros.cli.main import main
-from calib_ros.cli.workspace import BOX_POSES, PLACEMENT_FILES, WORKSPACE_FILES, _task
+from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES, _task
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.waypoints import csv_of, read_joints, read_poses
 from calib_ros.identification.calibration import MODELS, Calibration, load_calibration
@@ -399,7 +399,7 @@ def test_a_box_of_joint_values_is_a_task(cell):
     box = (0, -1.6, 1.4, -0.6, 0.9, 0, 0.3, -1.3, 1.6, -0.4, 1.1, 0.4)
     options = Namespace(task=None, joint_box=box, model='corrected')
     task = _task(options, arm, np.random.default_rng(0))
-    assert task.shape == (BOX_POSES, 4, 4)
+    assert task.shape == (30, 4, 4)
     np.testing.assert_allclose(task[:, :3, 3].max(axis=0), -task[:, :3, 3].min(axis=0))
 
 

@@ -215,6 +215,7 @@ def test_simulate_then_identify(run, identified, tmp_path):
     assert str(bag) in out
     status, document = identified(bag, '--chain', 'ur5e')
     assert status == 0
+    assert document['samples']['read'] == document['samples']['recorded'] > 0
     assert document['samples']['samples'] == 25
     assert document['samples']['configurations'] == 25
     truth = load_chain(bag.parent / 'bag_truth.yaml')
@@ -344,22 +345,23 @@ def test_joint_names_map_those_of_the_bag_to_the_chain(run, identified, table, t
         assert new[1] == old[1]
 
 
-def test_a_damaged_bag_warns_and_says_so_in_the_report(run, tmp_path):
+def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_path):
     bag = tmp_path / 'bag'
     run('simulate', bag, '--chain', 'ur5e', '--poses', 40)
     (file,) = bag.glob('*.mcap')
     file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
-    out = tmp_path / 'out'
-    given = ('identify', bag, '--chain', 'ur5e', '--json', '--out')
-    assert run(*given, tmp_path / 'refused')[0] == 3
-    status, said, err = run(*given, out, '--largest-loss', '0.5')
+    given = ('identify', bag, '--chain', 'ur5e', '--json')
+    status, said, _ = run(*given)
+    assert status == NOT_ACCEPTED
+    assert 'of the messages could not be read' in json.loads(said)['refusals'][0]
+    status, said, err = run(*given, '--out', tmp_path / 'out', '--largest-loss', '0.5')
     assert status == 0
     assert err.startswith('warning: ')
     assert err.count('\n') == 1
     document = json.loads(said)
     assert document['warnings'] == [err.removeprefix('warning: ').rstrip('\n')]
     assert 15 < document['samples']['samples'] < 40
-    assert document['warnings'][0] in (out / 'report.md').read_text()
+    assert document['warnings'][0] in (tmp_path / 'out' / 'report.md').read_text()
 
 
 def bad_inputs():

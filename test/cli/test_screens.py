@@ -209,18 +209,15 @@ def test_in_a_log_the_sign_of_life_is_a_line(shown, monkeypatch):
     assert ESCAPE not in text
 
 
-@pytest.mark.parametrize('term', ['dumb', 'xterm-256color'])
-def test_on_a_terminal_the_sign_is_one_line_that_vanishes(shown, monkeypatch, term):
-    if term != 'dumb':
-        pytest.importorskip('rich')
-    monkeypatch.setenv('TERM', term)
+def test_on_a_terminal_the_sign_is_a_bar_that_vanishes(shown, monkeypatch):
+    pytest.importorskip('rich')
+    monkeypatch.setenv('TERM', 'xterm-256color')
     monkeypatch.setattr(screen, 'FIRST_S', 1e-4)
     monkeypatch.setattr(sys, 'stderr', Terminal())
     main(['identify', 'measured.csv', *UR5E])
     said = sys.stderr.getvalue()
     assert 'identifying' in said
-    assert (ESCAPE in said) == (term != 'dumb')
-    assert said.endswith('\r' if term == 'dumb' else '\x1b[2K')
+    assert said.endswith('\x1b[2K')
 
 
 def test_work_tells_the_time_left(monkeypatch):

@@ -103,26 +103,6 @@ def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
     archive.close()
     with pytest.raises(InputError, match='q3'):
         open_archive(tmp_path, joints=3).resume()
-    (path,) = tmp_path.glob('*.csv')
-    path.write_text(path.read_text().replace('spread', 'width'))
-    with pytest.raises(InputError, match="does not have this robot's columns"):
-        open_archive(tmp_path, joints=2).resume()
-
-
-@pytest.mark.parametrize('cut', [1, 40])
-def test_a_row_that_was_cut_off_is_left_out(tmp_path, cut):
-    archive = open_archive(tmp_path)
-    archive.add(sample(1))
-    archive.add(sample(2))
-    with archive.journal.open('r+b') as file:
-        file.truncate(archive.journal.stat().st_size - cut)
-    archive.close()
-    again = open_archive(tmp_path)
-    found, (warning,) = again.resume()
-    assert [each.stamp_ns for each in found] == [1]
-    assert 'line 3 was cut off' in warning
-    again.add(sample(3))
-    assert stamps(tmp_path) == [1, 3]
 
 
 def test_a_full_disk_loses_nothing(tmp_path):

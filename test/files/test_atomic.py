@@ -4,52 +4,23 @@
 
 import errno
 import fcntl
-import itertools
 import os
-import resource
-import shutil
-import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
-from unittest.mock import Mock
 
-import numpy as np
 import pytest
-from measured import measured, rows_of, write_csv
-from rosbags.rosbag2 import Writer
+from killed import every_kill, forked, killed_at, status_of, tree
 
 from calib_ros.atomic import confined, whole_folder, write_file, write_files
-from calib_ros.cli import identify, main, options, results
-from calib_ros.cli.inputs import Loaded
-from calib_ros.cli.results import Identified
 from calib_ros.errors import InputError
-from calib_ros.files.bags import replay
-from calib_ros.files.recording import Recording, write_bag
-from calib_ros.identification import calibration
-from calib_ros.identification.identification import identify as identified_from
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report import plots, words
-from calib_ros.report.page import Origin
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 OWN = ('a.txt', 'b.txt', 'sub')
-KILLED = 77
 
 
 def make(path, label, *, overwrite=True, own=OWN):
     with whole_folder(path, own, overwrite=overwrite) as folder:
         write_files(folder, {name: f'{name} of {label}' for name in ('a.txt', 'b.txt')})
         write_files(folder / 'sub', {'c.txt': f'c of {label}'})
-
-
-def tree(folder):
-    """Return the text of each file below a folder."""
-    paths = sorted(path for path in folder.rglob('*') if path.is_file())
-    return {str(path.relative_to(folder)): path.read_text() for path in paths}
 
 
 def expected(label):
@@ -67,59 +38,6 @@ def add_notes(path):
     (path / 'mine' / 'deep').mkdir(parents=True)
     for name, text in NOTES.items():
         (path / name).write_text(text)
-
-
-def forked(work):
-    """Run some work in a child process; return its id."""
-    child = os.fork()
-    if child:
-        return child
-    status = 1
-    try:
-        work()
-        status = 0
-    except InputError:
-        status = 3
-    finally:
-        os._exit(status)
-
-
-def status_of(child):
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-
-
-def killed_at(number, where, work):
-    """Run some work that is killed just before its n-th call that touches files below `where`.
-
-    Returns whether it was: False when it has ended before.
-    """
-
-    def child():
-        calls = 0
-
-        def count(event, arguments):
-            nonlocal calls
-            touched = event.partition('.')[0] in ('open', 'os', 'shutil') and arguments
-            if touched and str(arguments[0]).startswith(str(where)):
-                calls += 1
-                if calls == number:
-                    os._exit(KILLED)
-
-        sys.addaudithook(count)
-        work()
-
-    status = status_of(forked(child))
-    assert status in (0, KILLED)
-    return status == KILLED
-
-
-def every_kill(where, work, check, step=1):
-    """Kill some work at its calls in turn, and check what is left; return how many there are."""
-    number = 1
-    while killed_at(number, where, work):
-        check()
-        number += step
-    return number - step
 
 
 @pytest.mark.parametrize('earlier', ['none', 'A and notes'])
@@ -194,7 +112,7 @@ def test_of_several_processes_one_wins(tmp_path, monkeypatch, overwrite, locks):
     """Also on a file system without locks."""
     if not locks:
         monkeypatch.setattr(fcntl, 'flock', unsupported)
-    for number in range(5):
+    for number in range(2):
         path = tmp_path / f'out{number}'
         hear, tell = os.pipe()
 
@@ -211,7 +129,7 @@ def test_of_several_processes_one_wins(tmp_path, monkeypatch, overwrite, locks):
         winners = [k for k, status in enumerate(statuses) if status == 0]
         assert len(winners) == 1 or (overwrite and winners)
         assert tree(path) in [expected(str(k)) for k in winners]
-    assert len(list(tmp_path.iterdir())) == 5
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def unsupported(*arguments, **more):
@@ -365,156 +283,3 @@ def test_names_of_others_lead_into_the_folders_only(tmp_path):
     with pytest.raises(InputError) as caught:
         confined('/' + 5000 * 'x', folders, 'set it')
     assert len(str(caught.value)) < 400
-
-
-def dwells(count):
-    recorded = measured(count=count)
-    names = tuple(load_chain('ur5e').joint_names)
-    return Recording.of_dwells(names, recorded, np.zeros(count, bool))
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_a_bag_whose_writing_is_killed_is_absent(tmp_path, monkeypatch, storage):
-    path, truth = tmp_path / 'cells' / 'bag', tmp_path / 'cells' / 'truth.yaml'
-
-    recording = dwells(3)
-
-    def write():
-        write_bag(path, recording, storage, {truth: 'truth'})
-
-    def check():
-        if path.exists():
-            assert truth.read_text() == 'truth'
-            assert (path / 'metadata.yaml').read_text().endswith('\n')
-            session = CalibrationSession(load_chain('ur5e'), Settings())
-            assert replay(path, session).warnings == ()
-            assert len(session.samples) == 3
-            shutil.rmtree(path)
-
-    write()  # here first, so that no child has to load the message types
-    check()
-    assert every_kill(tmp_path, write, check) > 10
-    check()
-    write_message = Writer.write
-    for last in (1, 7, 17):
-        with monkeypatch.context() as patch:
-            count = itertools.count(1)
-
-            def write_one(*arguments, last=last, count=count):
-                if next(count) == last:
-                    os._exit(KILLED)
-                write_message(*arguments)
-
-            patch.setattr(Writer, 'write', write_one)
-            assert status_of(forked(write)) == KILLED
-            assert not path.exists()
-    write()
-    check()
-    assert not [each for each in (tmp_path / 'cells').iterdir() if 'bag' in each.name]
-
-
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-@pytest.mark.parametrize('limit', [0, 1000, 20000])
-def test_a_bag_on_a_full_disk_is_absent(tmp_path, storage, limit):
-    def child():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-        with pytest.raises(OSError, match=r'cannot write .*bag: '):
-            write_bag(tmp_path / 'bag', dwells(40), storage, {tmp_path / 'truth': 'true'})
-
-    assert status_of(forked(child)) == 0
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_command_that_writes_a_bag_says_so_when_the_disk_is_full(tmp_path):
-    """It ends with status 1 and one line, in a process of its own."""
-    table = write_csv(tmp_path / 'cell.csv', rows_of(measured()))
-    line = 'import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000)); '
-    line += 'from calib_ros.cli.main import main; sys.exit(main())'
-    done = subprocess.run(
-        [sys.executable, '-c', line, 'csv2bag', str(table), 'bag', '--chain', 'ur5e'],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert 'calib_ros: cannot write bag: [Errno 27] File too large' in done.stderr.splitlines()[-1]
-    assert [path.name for path in tmp_path.iterdir()] == ['cell.csv']
-
-
-@pytest.fixture
-def identified(monkeypatch):
-    """Return results of A and B, as the command line has them, and a stamp that stays."""
-
-    def found(label, seed):
-        problem = Problem(load_chain('ur5e'), measured(seed=seed))
-        result, settings = identified_from(problem), Settings(folds=seed)
-        origin = Origin(settings=words.configuration_yaml('ur5e', settings))
-        loaded = Loaded(problem, {'samples': label}, (f'of {label}',))
-        return Identified(loaded, result, origin)
-
-    monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
-    monkeypatch.setattr(results, 'identification_report', lambda *of: of[1])
-    monkeypatch.setattr(options, 'render', lambda result: f'page of {result.names}')
-    monkeypatch.setattr(results, 'markdown', lambda result, samples: f'{samples} {result.names}')
-    monkeypatch.setattr(
-        calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
-    )
-    return {'A': found('A', 5), 'B': found('B', 6)}
-
-
-@pytest.mark.parametrize('accepted', [True, False])
-def test_an_identification_that_is_killed_mixes_nothing(
-    tmp_path, monkeypatch, identified, accepted
-):
-    if not accepted:
-        found = identified['B']
-        refused = replace(found.result, refusals=(Reason(Rule.GAIN, 'no gain'),))
-        identified['B'] = replace(found, result=refused)
-    out = tmp_path / 'out'
-
-    def run(label):
-        monkeypatch.setattr(identify, '_identified', lambda *given: identified[label])
-        arguments = ['--csv', 'unread', '--chain', 'ur5e', '--out', str(out), '--force']
-        main.main(['identify', *arguments])
-        return tree(out)
-
-    run('A')
-    (out / 'notes.txt').write_text('mine')
-    a, b = run('A'), run('B')
-    assert ('calibration.yaml' in b) == accepted
-    assert accepted or b['calibration.previous.yaml'] == a['calibration.yaml']
-    assert a['notes.txt'] == b['notes.txt'] == 'mine'
-    (out / 'calibration.previous.yaml').unlink(missing_ok=True)
-
-    def check():
-        kept = out if out.exists() else tmp_path / '.out.partial' / 'out.old'
-        assert tree(kept) in (a, b)
-        assert run('A').items() >= a.items()
-        assert [each.name for each in tmp_path.iterdir()] == ['out']
-        (out / 'calibration.previous.yaml').unlink(missing_ok=True)
-
-    run('A')
-    assert every_kill(tmp_path, lambda: run('B'), check, step=11) > 50
-    assert tree(out) == b
-
-
-def test_two_identifications_into_one_folder(tmp_path):
-    """One is accepted, the other one says why not; nothing of both is mixed."""
-    command = [sys.executable, '-m', 'calib_ros.cli.main', 'identify', '--chain', 'ur5e', '--json']
-    tables = [write_csv(tmp_path / f'{seed}.csv', rows_of(measured(seed=seed))) for seed in (5, 6)]
-    runs = [
-        subprocess.Popen(
-            [*command, '--csv', str(table), '--out', str(tmp_path / 'out')],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for table in tables
-    ]
-    answers = [(*run.communicate(), run.returncode) for run in runs]
-    (_, error, _), (said, _, _) = sorted(answers, key=lambda each: -each[2])
-    assert sorted(status for _, _, status in answers) == [0, 1]
-    assert error.startswith('calib_ros: ')
-    assert 'another process is writing' in error or 'already' in error
-    assert (tmp_path / 'out' / 'result.json').read_text() == said

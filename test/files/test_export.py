@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty
@@ -56,7 +56,6 @@ def test_a_table_in_yaml_is_a_chain_file_with_its_origin(convention):
 
 
 @given(st.integers(0, 10_000), st.sampled_from([*ROBOTS, 'scara']))
-@settings(max_examples=60, deadline=None)
 def test_both_conventions_are_the_same_arm(seed, name):
     nominal = scara() if name == 'scara' else load_chain(name)
     chain = faulty(nominal, Cell(), np.random.default_rng(seed))
@@ -79,21 +78,6 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
     assert f'{1e3 * offsets.error:.3f} mm off' in offsets.content.splitlines()[0]
     # Beta can be given up where no axes are parallel, and only there.
     assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
-
-
-def test_the_table_without_beta_is_best_where_it_is_asked_for():
-    nominal, chain = corrected('ur10e', 3)
-    rng = np.random.default_rng(4)
-    near = chain.random_joints(1, rng) + rng.uniform(-0.2, 0.2, (300, 6))
-    text = next(
-        each for each in exports(chain, nominal, near) if each.name == 'dh_without_beta.csv'
-    )
-    everywhere = next(
-        each for each in exports(chain, nominal) if each.name == 'dh_without_beta.csv'
-    )
-    rows = list(csv.DictReader(text.content.splitlines()[1:]))
-    assert all(float(row['beta']) == 0.0 for row in rows)
-    assert text.error < 0.5 * everywhere.error
 
 
 def test_kinematics_tell_a_changed_robot_by_their_hash():
@@ -151,10 +135,13 @@ def test_the_command_line_hands_on_where_the_numbers_come_from(files):
 
 def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
     rng = np.random.default_rng(4)
-    near = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2]) + rng.uniform(-0.2, 0.2, (300, 6))
-    (tmp_path / 'measured.csv').write_text(joints_csv(near))
+    region = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2]) + rng.uniform(-0.2, 0.2, (300, 6))
+    (tmp_path / 'measured.csv').write_text(joints_csv(region))
 
     def error(found):
         return float(re.search('up to (.*) mm off', found['dh_without_beta.csv']).group(1))
 
-    assert error(files('--measured', 'measured.csv')) < 0.5 * error(files())
+    near = files('--measured', 'measured.csv')
+    assert error(near) < 0.5 * error(files())
+    rows = csv.DictReader(near['dh_without_beta.csv'].splitlines()[1:])
+    assert all(float(row['beta']) == 0.0 for row in rows)

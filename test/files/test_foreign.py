@@ -2,11 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables that others have written."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from robots import DATA, needs_data
 from scipy.spatial.transform import Rotation
 
 from calib_ros.cli.main import main
@@ -16,11 +14,6 @@ from calib_ros.files.layouts import Expression, Layout, load_layout, parse_colum
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain_file import load_chain
 
-DATA = Path(os.environ.get('CALIB_ROS_DATA', Path(__file__).parents[3] / 'shared' / 'data'))
-needs_data = pytest.mark.skipif(
-    not DATA.is_dir() and 'CI' not in os.environ,
-    reason=f'no measured robots at {DATA}; set CALIB_ROS_DATA',
-)
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
 TURNED = Rotation.from_rotvec([[0.1, 0.2, 0.3], [-1.0, 0.5, 2.0], [0.2, -0.1, 1.0]])

@@ -12,7 +12,7 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.history import UNCACHED, History
+from calib_ros.files.history import History
 from calib_ros.files.rows import Filing, Row, identified, measured_at, settings_hash
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
@@ -98,7 +98,7 @@ def test_pandas_and_arrow_read_it_as_a_plain_dataset(tmp_path):
 
 def test_what_was_read_before_is_kept_and_never_needed(tmp_path):
     store = History(tmp_path)
-    for k in range(UNCACHED):
+    for k in range(8):
         store.file(row(k))
     first = store.rows('SN 1/ö')
     (kept,) = (tmp_path / '.cache').iterdir()

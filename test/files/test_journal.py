@@ -130,8 +130,8 @@ def test_what_was_taken_back_is_left_out_and_can_be_taken_again(tmp_path):
     journal = Journal(tmp_path / 'cell.csv', JOINTS)
     for number in (1, 2, 3):
         journal.add(plain(number))
-    journal.remove(plain(3))
-    journal.remove(plain(2))
+    journal.add(plain(3), removed=True)
+    journal.add(plain(2), removed=True)
     journal.add(plain(2, count=7))
     journal.close()
     found, _ = read_journal(tmp_path / 'cell.csv', JOINTS)

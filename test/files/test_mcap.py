@@ -111,7 +111,7 @@ def test_the_zstd_of_older_rosbags_will_do(monkeypatch):
 
 
 @pytest.mark.parametrize('compression', ['lz4', 'zstd'])
-@pytest.mark.parametrize('said', [100, LARGEST_CHUNK, 1 << 40])
+@pytest.mark.parametrize('said', [100, 1 << 40])
 def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_refused(compression, said):
     bomb = bytearray(chunk(bytes(LARGEST_CHUNK + 1000), compression))
     bomb[25:33] = struct.pack('<Q', said)

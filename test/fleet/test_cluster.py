@@ -21,7 +21,7 @@ from calib_ros.cli.main import main
 from calib_ros.files.history import History
 
 DASK = Path(sys.executable).with_name('dask')
-TWO = ('--nworkers', '2', '--nthreads', '1')
+ONE = ('--nworkers', '1', '--nthreads', '1')
 ALONE = ('--host', '127.0.0.1', '--no-dashboard')
 
 
@@ -67,7 +67,7 @@ def test_whatever_is_killed_each_result_is_filed_once(served):
     history, known = served / 'history', served / 'scheduler.json'
     with (
         started(DASK, 'scheduler', *ALONE, '--port', '0', '--scheduler-file', known),
-        started(DASK, 'worker', '--scheduler-file', known, *TWO, *ALONE) as nannies,
+        started(DASK, 'worker', '--scheduler-file', known, *ONE, *ALONE) as nannies,
     ):
         until(lambda: known.exists() and known.read_text().endswith('}'))
         address = json.loads(known.read_text())['address']

@@ -119,14 +119,14 @@ def test_a_scheduler_that_dies_is_told_of(plant):
 
 def test_faults_of_ours_cost_their_source_only(plant, cluster, tmp_path, monkeypatch):
     history = History(tmp_path / 'history')
-    original = running.work.__globals__['read_table']
+    original = running.work.__globals__['table']
 
     def faulty(path, *rest):
         if path.name == '000.csv':
             raise ZeroDivisionError('by zero')
         return original(path, *rest)
 
-    monkeypatch.setitem(running.work.__globals__, 'read_table', faulty)
+    monkeypatch.setitem(running.work.__globals__, 'table', faulty)
     found = run(plant, history, cluster)
     assert found.filed == 2
     assert [next(iter(each.values())) for each in found.errors.values()] == [

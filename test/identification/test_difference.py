@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is said to be different between two calibrations of one robot."""
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from robots import DATA, needs_data
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
@@ -20,7 +19,7 @@ from calib_ros.kinematics.chain_file import load_chain
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
-DATA = Path(os.environ.get('CALIB_ROS_DATA', 'nowhere')) / 'ur10_ipa_leica'
+UR10 = DATA / 'ur10_ipa_leica'
 
 
 def calibrated(true, seed, **more):
@@ -118,7 +117,7 @@ def test_the_command_says_it_and_ends_accordingly(nights, tmp_path, capsys):
     assert 'wrist_2_joint.theta by +0.' in capsys.readouterr().out
 
 
-@pytest.mark.skipif(not DATA.exists(), reason='no measured robots')
+@needs_data
 def test_two_nights_of_a_measured_robot_are_not_known_well_enough_to_differ():
     """Session A is a grid, B scattered configurations; neighbours share what the model lacks.
 
@@ -127,10 +126,10 @@ def test_two_nights_of_a_measured_robot_are_not_known_well_enough_to_differ():
     """
     from calib_ros.files.tables import read_table
 
-    chain = load_chain(DATA / 'chain.yaml')
+    chain = load_chain(UR10 / 'chain.yaml')
     pair = []
     for session in ('A', 'B'):
-        (fitted,) = read_table(DATA / 'uniform.csv', 6, (session,)).fitted
+        (fitted,) = read_table(UR10 / 'uniform.csv', 6, (session,)).fitted
         few = fitted.select(np.arange(0, len(fitted), max(1, len(fitted) // 300)))
         pair.append(Calibration.of(identify(Problem(chain, few))))
     found = difference(*pair)

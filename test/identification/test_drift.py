@@ -3,6 +3,7 @@
 """A drifting tracker must not pass for a gain of the arm."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -64,23 +65,22 @@ def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
 
 @pytest.mark.parametrize('kind', DRIFTS)
 def test_a_drift_is_no_gain_of_the_arm(kind):
-    """At 95 %: of 15 arms without any error three or more are accepted once in 28 times."""
-    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(15)]
-    assert sum(result.accepted for result in results) <= 2
+    """At 95 %: of 8 arms without any error two or more are accepted once in 17 times."""
+    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(8)]
+    assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
     alone = [all('of a drift' in text for text in result.refusals) for result in results]
-    assert sum(alone) > 4
+    assert sum(alone) > 2
 
 
-@pytest.mark.parametrize('kind', DRIFTS)
-def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts(kind):
+def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
     """One of eight may be refused: 0.3 mm of drift in a narrow path leave its risk above 2 %."""
     accepted = 0
-    for seed in range(4):
+    for seed, kind in product(range(2), DRIFTS):
         accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
         shuffled = session(seed, 0.3, kind, width=None, shuffled=True)
         accepted += identify(Problem(UR10E, shuffled, **SIGMAS)).accepted
-    assert accepted >= 7
+    assert accepted >= 14
 
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
@@ -123,12 +123,12 @@ def test_sessions_move_each_in_itself():
     assert identify(Problem(UR10E, apart[0], more=apart[1:], **SIGMAS)).chance > 0.05
 
 
-@pytest.mark.parametrize(('kind', 'count', 'width'), [('walk', 60, None), ('swing', 120, 0.8)])
-def test_a_drift_of_the_tracker_chooses_no_effects(kind, count, width):
+def test_a_drift_of_the_tracker_chooses_no_effects():
     """At 99 % a group: of 8 sessions one or none."""
     chosen = 0
     for seed in range(8):
-        problem = Problem(UR10E, session(seed, 0.0, kind, count, width), **SIGMAS)
+        design = ('walk', 60, None) if seed % 4 < 2 else ('swing', 120, 0.8)
+        problem = Problem(UR10E, session(seed, 0.0, *design), **SIGMAS)
         chosen += bool(identify_model(problem, 'auto').chain.effects)
     assert chosen <= 1
 

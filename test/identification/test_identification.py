@@ -54,7 +54,7 @@ def worst_prediction(found, true, rng):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([6, 7]))
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_noise_free_poses_give_exact_predictions(seed, joints):
     rng = np.random.default_rng(seed)
     nominal = random_arm(rng, joints)
@@ -69,7 +69,7 @@ def test_noise_free_poses_give_exact_predictions(seed, joints):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_noise_free_positions_give_exact_predictions(seed):
     rng = np.random.default_rng(seed)
     nominal = random_arm(rng, 6)
@@ -250,18 +250,20 @@ def test_a_tool_that_is_given_stays_where_orientations_do_not_tell():
     np.testing.assert_allclose(still, [0.1, 0.2, 0.3], atol=1e-12)
 
 
+def scores_of(result, true):
+    """Return the errors of the parameters in their standard deviations."""
+    return [(p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None]
+
+
 def test_standard_deviations_are_honest():
     """Deviations from the truth in units of the standard deviation given: spread 1, seeded."""
     scores = []
-    for seed in range(60):
+    for seed in range(40):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = measure(true, UR10E.random_joints(40, rng), rng, 5e-5, 5e-5 / 0.3)
-        result = fitted(Problem(UR10E, seen))
-        scores += [
-            (p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None
-        ]
-    assert len(scores) == 60 * 30
+        scores += scores_of(fitted(Problem(UR10E, seen)), true)
+    assert len(scores) == 40 * 30
     assert np.std(scores) == pytest.approx(1.0, abs=0.06)
     assert abs(np.mean(scores)) < 0.1
     assert np.mean(np.abs(scores) < 1.96) == pytest.approx(0.95, abs=0.015)
@@ -323,15 +325,13 @@ def test_held_out_pairs_never_influence_the_fit():
 
 
 def test_no_gain_is_claimed_where_there_is_none():
-    accepted = 0
-    for seed in range(20):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         arm = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
         seen = measure(arm, UR10E.random_joints(40, rng), rng, 1e-4, 3e-4)
         result = identify(Problem(UR10E, seen))
-        accepted += result.accepted
-        assert result.accepted or any('no gain' in text for text in result.refusals)
-    assert accepted == 0
+        assert not result.accepted
+        assert any('no gain' in text for text in result.refusals)
 
 
 def test_a_joint_that_stands_still_is_named_and_the_result_not_accepted():
@@ -520,37 +520,32 @@ def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():
 def test_errors_shared_by_a_configuration_count_once():
     """Three pairs at each configuration with the same error tell no more than one."""
     scores = []
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         once = measure(true, UR10E.random_joints(40, rng), rng, 1e-4, 1e-4 / 0.3)
         thrice = once.select(np.repeat(np.arange(40), 3))
-        result = fitted(Problem(UR10E, thrice))
-        scores += [
-            (p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None
-        ]
+        scores += scores_of(fitted(Problem(UR10E, thrice)), true)
     assert np.std(scores) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize(('position', 'orientation'), [(1e-4, 3e-5), (1e-5, 1e-3)])
 def test_standard_deviations_follow_the_noise_that_is_there(position, orientation):
     scores = []
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         seen = measure(true, UR10E.random_joints(40, rng), rng, position, orientation)
         result = fitted(Problem(UR10E, seen))
         assert not result.noise.consistent
-        scores += [
-            (p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None
-        ]
+        scores += scores_of(result, true)
     assert np.std(scores) == pytest.approx(1.0, abs=0.1)
 
 
 def test_what_another_robot_leaves_is_never_accepted():
     """Seeded arms of another kind with the same number of joints, some of which fit by chance."""
     other, nominal = load_chain('franka_panda'), load_chain('kuka_iiwa14')
-    for seed in (3, 14, 16, 17):
+    for seed in (3, 16):
         rng = np.random.default_rng(seed)
         true = faulty(other, Cell(), rng)
         seen = measure(true, other.random_joints(60, rng), rng, 5e-5, 2e-4)
@@ -568,7 +563,7 @@ def test_few_poses_and_manufacturing_tolerances_are_judged_by_leaving_out_one(
 ):
     """Six poses hold as many equations as needed without priors and none to judge by."""
     nominal_errors, errors, estimates, sigmas = [], [], [], []
-    for seed in range(10):
+    for seed in range(6):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         q, unseen = UR10E.random_joints(count, rng), UR10E.random_joints(300, rng)
@@ -606,9 +601,9 @@ def test_few_poses_without_priors_that_say_anything_stay_refused(priors):
 
 def test_few_poses_and_priors_of_an_arm_without_errors_gain_nothing():
     accepted = 0
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng(seed)
         true = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
         seen = measure(true, UR10E.random_joints(8, rng), rng, 5e-5, 2e-4)
         accepted += identify(Problem(UR10E, seen, priors=TOLERANCES)).accepted
-    assert accepted <= 3  # of 20 by a one-sided test of 95 %
+    assert accepted <= 2  # of 10 by a one-sided test of 95 %

@@ -71,12 +71,13 @@ SPOILT = {
 }
 
 
-OF_ROTATIONS = ('wxyz', 'transposed', 'inverse', 'eye in hand')
-CASES = [(name, True) for name in SPOILT]
-CASES += [(name, False) for name in SPOILT if name not in OF_ROTATIONS]
+POSITIONS_TELL = ('mm', 'left-handed', 'sign', 'coupled')
 
 
-@pytest.mark.parametrize(('mistake', 'oriented'), CASES)
+@pytest.mark.parametrize(
+    ('mistake', 'oriented'),
+    [*((name, True) for name in SPOILT), *((name, False) for name in POSITIONS_TELL)],
+)
 def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     change, remedy = SPOILT[mistake]
     found = explained(Problem(UR, change(seen_of(oriented=oriented))))
@@ -92,7 +93,7 @@ def test_another_robot_and_the_other_convention_are_named():
     assert 'convention: standard' in str(explained(Problem(other, seen)))
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_where_nothing_is_wrong_nothing_is_said(seed):
     rng = np.random.default_rng(seed)
     seen = seen_of(seed=seed, oriented=bool(seed % 2))

@@ -73,19 +73,19 @@ def hits(true, result, widened=True):
 
 @pytest.mark.parametrize('order', ['path', 'random'])
 def test_independent_errors_stay_independent(order):
-    """At 99 %: of 60 sessions with nothing shared one or two at most are said to share."""
-    found = [run(seed, 48, order)[1] for seed in range(60)]
-    assert sum(bool(result.noise.shared) for result in found) <= 3
+    """At 99 %: of 30 sessions with nothing shared three are said to share once in 300 times."""
+    found = [run(seed, 48, order)[1] for seed in range(30)]
+    assert sum(bool(result.noise.shared) for result in found) <= 2
     # and then standard deviations are those of the Cramer-Rao bound
     quiet = [result for result in found if not result.noise.shared and result.noise.consistent]
-    assert len(quiet) > 50
+    assert len(quiet) > 25
     assert all(result.noise.widened == 1.0 for result in quiet)
     assert all(np.isinf(p.freedom) for result in quiet for p in result.parameters if p.std)
 
 
 def test_intervals_hold_the_truth_though_the_tracker_drifts():
-    """60 sessions of 30 parameters: their coverage spreads by 0.06 a session, 0.008 in all."""
-    runs = [run(seed, drift=10.0) for seed in range(60)]
+    """30 sessions of 30 parameters: their coverage spreads by 0.06 a session, 0.011 in all."""
+    runs = [run(seed, drift=10.0) for seed in range(30)]
     assert all('successive' in result.noise.shared for _, result in runs)
     covered = np.mean([hits(*each) for each in runs])
     alone = np.mean([hits(*each, widened=False) for each in runs])
@@ -96,7 +96,7 @@ def test_intervals_hold_the_truth_though_the_tracker_drifts():
 def test_errors_smooth_over_the_joint_space_are_shared_by_what_is_near():
     """The path is measured in random order: successive configurations have nothing in common."""
     kinds, covered, alone = [], [], []
-    for seed in range(25):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         true = faulty(UR10E, Cell(), rng)
         q = rng.permutation(along_path(180, rng))
@@ -106,14 +106,14 @@ def test_errors_smooth_over_the_joint_space_are_shared_by_what_is_near():
         covered.append(hits(true, result))
         alone.append(hits(true, result, widened=False))
     assert all('near' in kind for kind in kinds)
-    assert sum('successive' in kind for kind in kinds) <= 2
+    assert sum('successive' in kind for kind in kinds) <= 1
     assert np.mean(covered) == pytest.approx(0.95, abs=0.04)
     assert np.mean(alone) < 0.85
 
 
 def test_the_correlation_is_that_of_the_errors():
     """The drift has 4/5 of the variance and decays by exp(-1/10) from one pose to the next."""
-    found = [run(seed, 300, 'random', drift=10.0)[1].noise for seed in range(8)]
+    found = [run(seed, 300, 'random', drift=10.0)[1].noise for seed in range(6)]
     expected = 0.8 * np.exp(-0.1)
     assert np.mean([noise.successive for noise in found]) == pytest.approx(expected, abs=0.08)
     assert np.abs(np.mean([noise.near for noise in found])) < 0.1

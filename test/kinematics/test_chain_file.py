@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib_ros.errors import ConfigError, UnknownNameError
@@ -176,6 +176,7 @@ def chains(draw):
     )
 
 
+@settings(max_examples=12)
 @given(chains(), st.integers(0, 1000))
 def test_a_dumped_chain_is_read_as_it_was(chain, seed):
     again = parse_chain(dump_chain(chain, {'created': 'today', 'pairs': 3}))

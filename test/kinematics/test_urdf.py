@@ -48,7 +48,7 @@ from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=80)
+@settings(max_examples=30)
 @given(seed=SEEDS)
 def test_any_serial_arm_moves_as_its_urdf(convention, seed):
     rng = np.random.default_rng(seed)
@@ -360,7 +360,7 @@ def stripped(text):
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(seed=SEEDS)
 def test_a_corrected_urdf_moves_as_the_corrected_arm(convention, seed):
     rng = np.random.default_rng(seed)
@@ -531,8 +531,10 @@ def test_a_doctype_is_refused_before_the_parser_sees_it(head):
 # ---- from the URDF, by measurements, to the corrected URDF
 
 
-@pytest.mark.parametrize(('convention', 'text'), [('standard', UR10E), ('modified', IIWA)])
-@pytest.mark.parametrize(('noise', 'largest'), [(0.0, 1e-9), (5e-5, 4e-5)])
+@pytest.mark.parametrize(
+    ('convention', 'text', 'noise', 'largest'),
+    [('standard', UR10E, 0.0, 1e-9), ('modified', IIWA, 5e-5, 4e-5)],
+)
 def test_from_urdf_to_corrected_urdf(convention, text, noise, largest, tmp_path, rng):
     """An arm with errors, seen by a tracker anywhere; judged on unseen poses.
 

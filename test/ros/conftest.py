@@ -20,6 +20,22 @@ def recording(truth):
 
 
 @pytest.fixture
+def ended_by(monkeypatch):
+    """Return a function that runs the node with parameters until it ends; it returns the status.
+
+    Signals stay with the tests.
+    """
+    from calib_ros.ros import node, running
+
+    monkeypatch.setattr(running, '_handle_signals', lambda handler: None)
+
+    def run(*parameters):
+        return node.main(['--ros-args', *(w for given in parameters for w in ('-p', given))])
+
+    return run
+
+
+@pytest.fixture
 def cell(tmp_path):
     from ros_cell import Cell
 

@@ -96,7 +96,7 @@ def test_a_calibration_that_is_loaded_is_broadcast(published, tmp_path):
 def broadcast(published, chain, world='leica', names=NAMES, in_hand=False, urdf=''):
     published.clear()
     with Cell() as cell:
-        Broadcast(cell.peer, names, in_hand, urdf, {}, LATCHED).publish(chain, world)
+        Broadcast(cell.peer, names, in_hand, urdf, {}).publish(chain, world)
     return transforms(published[0])
 
 

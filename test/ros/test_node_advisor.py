@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ros_cell import (
     STOPS,
     Cell,
-    Child,
     joint_messages,
     pose_messages,
     topics,
@@ -255,8 +254,10 @@ def test_other_joints_and_names_of_the_robot(tmp_path, recording):
 
 
 def test_nothing_is_corrected_without_a_calibration(cell, corrected):
+    logged = cell.log()
     said = send(cell, trajectory(path(5)[0]))
     assert 'refused: there is no accepted calibration' in said
+    cell.spin_until(lambda: any(f'trajectory {said}' == each.msg for each in logged))
     assert not corrected
 
 
@@ -381,21 +382,10 @@ def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
         for _ in range(3):
             publisher.publish(trajectory(path(5)[0]))
         cell.spin_until(lambda: begun.is_set() and len(cell.node._guide._pending) == 3)
-        monkeypatch.setattr(guide_module, 'MOST_WAITING', 2)
+        monkeypatch.setattr(guide_module, 'MOST_QUEUED', 2)
         publisher.publish(trajectory(path(5)[0]))
         cell.spin_until(lambda: cell.node._guide._last_trajectory)
         assert 'refused: 2 others wait already' in cell.node._guide._last_trajectory
         assert not cell.node._guide.join(0.05)
         free.set()
         assert cell.node._guide.join(20.0)
-
-
-def test_a_node_in_a_process_of_its_own_refuses_aloud(tmp_path):
-    with (
-        Cell() as cell,
-        Child(domain=cell.domain, chain='ur10e', data_dir=str(tmp_path)) as child,
-    ):
-        child.wait_for('ready to calibrate')
-        publisher = cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory')
-        publisher.publish(trajectory(path(3)[0]))
-        child.wait_for('trajectory refused: there is no accepted calibration')

@@ -38,7 +38,7 @@ from photographs import CHARUCO, rendered
 
 LENS = Lens(800.0, 810.0, 322.0, 243.0)
 VIEW = Camera(LENS, 640, 480, depth=0.5)
-STOPS, EACH = 36, 2
+STOPS, EACH = 24, 2
 SPOILT = {3: 'blurred', 7: 'with too little of the board'}
 """Stops whose images cannot be used."""
 

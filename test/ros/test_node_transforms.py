@@ -64,11 +64,9 @@ def still():
     )
 
 
-def moving(recording, parent):
+def moving(recording):
     """Return the measured poses among the frames of the robot."""
-    poses = se3.transform(recording.poses.rotations, recording.poses.positions)
-    if parent == 'hall':
-        poses = TRACKER @ poses
+    poses = TRACKER @ se3.transform(recording.poses.rotations, recording.poses.positions)
     names = ['base_link', *(f'link_{k}' for k in range(1, 29))]
     frames = [se3.transform(se3.exp_rotation(np.full(3, 0.1 * k)), np.ones(3)) for k in range(29)]
     found = []
@@ -77,22 +75,22 @@ def moving(recording, parent):
             link(*pair, stamp, matrix)
             for pair, matrix in zip(itertools.pairwise(names), frames, strict=False)
         ]
-        found.append(TFMessage(transforms=[*robot, link(parent, 'tool', stamp, pose), *robot]))
+        found.append(TFMessage(transforms=[*robot, link('hall', 'tool', stamp, pose), *robot]))
     return found
 
 
-def serialised(recording, parent):
+def serialised(recording):
     """Return topics, stamps and bytes of a recording, the frames that stand still first."""
     found = [('/tf_static', recording.joint_stamps_ns[0], still())]
-    found += [('/tf', stamp_ns(each), each) for each in moving(recording, parent)]
+    found += [('/tf', stamp_ns(each), each) for each in moving(recording)]
     found += [('/joint_states', stamp_ns(each), each) for each in joint_messages(recording)]
     found.sort(key=lambda each: each[1])
     return [(topic, int(stamp), serialize_message(message)) for topic, stamp, message in found]
 
 
-def write(path, content, storage):
+def write(path, content):
     types = {'/tf': TRANSFORMS, '/tf_static': TRANSFORMS, '/joint_states': JOINT_STATE}
-    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections = {
             topic: writer.add_connection(topic, kind, typestore=STORE)
             for topic, kind in types.items()
@@ -102,23 +100,22 @@ def write(path, content, storage):
     return path
 
 
-@pytest.mark.parametrize(('parent', 'storage'), [('tracker', 'sqlite3'), ('hall', 'mcap')])
-def test_direct_bag_and_live_give_equal_observations(tmp_path, recording, parent, storage):
+def test_direct_bag_and_live_give_equal_observations(tmp_path, recording):
     """As of poses: one by one without ROS, through a bag, and through a running node."""
     settings = Settings(sources=(SOURCE,))
-    content = serialised(recording, parent)
+    content = serialised(recording)
     alone = CalibrationSession(load_chain('ur10e'), settings)
     streams = {each.topic: each for each in measured(parse_sources([SOURCE]), {})}
     streams['/joint_states'] = Stream('/joint_states', JOINT_STATE)
     for topic, _, data in content:
         assert feed(alone, [(streams[topic], data)], deserialised) == []
     replayed = CalibrationSession(load_chain('ur10e'), settings)
-    assert replay(write(tmp_path / 'bag', content, storage), replayed).warnings == ()
+    assert replay(write(tmp_path / 'bag', content), replayed).warnings == ()
     parameters = {'chain': 'ur10e', 'sources': [SOURCE], 'data_dir': str(tmp_path)}
     with Cell(**parameters) as cell:
         latched = cell.peer.create_publisher(TFMessage, '/tf_static', LATCHED)
         latched.publish(still())
-        cell.play({'/tf': moving(recording, parent), 'joint_states': joint_messages(recording)})
+        cell.play({'/tf': moving(recording), 'joint_states': joint_messages(recording)})
         live = cell.node.session
         expected = alone.problem().observations
         assert_same(expected, replayed.problem().observations)
@@ -131,16 +128,16 @@ def test_direct_bag_and_live_give_equal_observations(tmp_path, recording, parent
 
 
 def test_the_diagnostics_tell_which_frames_are_there(tmp_path, recording):
-    source = '/tf parent=tracker child=tol'
+    source = '/tf parent=hall child=tol'
     with Cell(chain='ur10e', sources=[source], data_dir=str(tmp_path)) as cell:
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         publisher = cell.publisher(TFMessage, '/tf')
-        for message in moving(recording, 'tracker')[:5]:
+        for message in moving(recording)[:5]:
             publisher.publish(message)
         cell.spin_until(lambda: any('nothing links' in m.status[0].message for m in heard))
         words = heard[-1].status[0].message
-        assert 'nothing links frame "tol" to "tracker" on /tf' in words
-        assert 'parent=tracker child=tool"' in words
+        assert 'nothing links frame "tol" to "hall" on /tf' in words
+        assert 'parent=hall child=tool"' in words
 
 
 def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
@@ -360,6 +360,7 @@ def test_in_continuous_mode_a_capture_takes_nothing_away():
 # Order of arrival
 
 
+@settings(max_examples=16)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from(['dwell', 'continuous']),
@@ -373,8 +374,8 @@ def test_the_order_of_arrival_within_lateness_does_not_matter(seed, mode, latene
     measured = pose_events(motion, 7.0, delay=delay)
     measured += pose_events(motion, 7.0, 17.0, key=WIRE, delay=delay)
     shaken = [(time + rng.uniform(0.0, 0.95 * lateness), *what) for time, *what in measured]
-    settings = {'mode': mode, 'lateness': lateness, 'delay': delay}
-    orderly, other = (collector(**settings) for _ in range(2))
+    given_ = {'mode': mode, 'lateness': lateness, 'delay': delay}
+    orderly, other = (collector(**given_) for _ in range(2))
     expected = play(orderly, joints, measured)
     found = play(other, joints, shaken)
 
@@ -496,11 +497,11 @@ def test_a_small_joint_buffer_costs_only_what_it_cannot_hold():
     assert_same(samples, play(whole, joint_events(motion, 9.5), pose_events(motion, 9.5)))
 
 
-@pytest.mark.parametrize('capacity', [2, 3, 20, 60])
+@pytest.mark.parametrize('capacity', [2, 60])
 def test_a_joint_buffer_that_is_too_small_says_so(capacity):
     motion = tour()
     made = collector(joint_buffer=capacity)
-    play(made, joint_events(motion, 9.5), pose_events(motion, 9.5))
+    play(made, joint_events(motion, 4.5), pose_events(motion, 4.5))
     assert made.notes['joint samples let go, the joint buffer was full'] > 0
 
 

@@ -53,9 +53,7 @@ def error(chain, true, motion):
     return np.sqrt((apart**2).sum(axis=1).mean())
 
 
-@pytest.mark.parametrize(
-    ('delay', 'oriented'), [(0.035, True), (0.2, False), (-0.05, True), (-0.05, False)]
-)
+@pytest.mark.parametrize(('delay', 'oriented'), [(0.2, False), (-0.05, True)])
 def test_a_delay_is_found_and_costs_nothing(delay, oriented):
     session, true, motion = recorded(delay, oriented=oriented)
     # by positions alone the speeds compared are those of two points, the flange and the target

@@ -51,7 +51,7 @@ def point(stamp_ns, position):
     return CAMERA, bytes(STORE.serialize_cdr(message, POINT))
 
 
-def shift(rng, stops=8):
+def shift(rng, stops=5):
     """Return messages of a shift with what may go wrong, in the order in which they come."""
     cell = Cell(joint_rate=100.0, move=0.7, dwell=0.6)
     true = faulty(ARM, Cell(), rng)
@@ -87,14 +87,17 @@ def shift(rng, stops=8):
 
 
 def outcome(session):
-    """Return all that a session has made of its messages, as plain values."""
+    """Return all that a session has made of its messages, as plain values.
+
+    What is estimated of the samples is a function of these.
+    """
     account = session.account()
     samples = [
         (s.stamp_ns, s.device, s.count, s.joints.tolist(), s.approach.tolist(), s.spread)
         for s in session.samples
     ]
     stamp_ns, values = session.latest or (0, ())
-    return account, samples, stamp_ns, list(values), session.delay, session.status()
+    return account, samples, stamp_ns, list(values), session.delay, session.state, session.warnings
 
 
 @pytest.mark.parametrize(
@@ -178,7 +181,7 @@ def test_a_damaged_message_is_told_and_the_others_are_taken():
 def test_numbers_that_stand_for_nothing_are_dropped(value, together):
     """Some devices send the largest number that there is while they see no target."""
     messages = []
-    for k in range(600):
+    for k in range(150):
         stamp = START + k * 10_000_000
         lost = k % 5 == 0
         values = np.full(6, value if k % 50 == 1 else 0.3 * np.sin(0.01 * k))
@@ -186,14 +189,14 @@ def test_numbers_that_stand_for_nothing_are_dropped(value, together):
         place = (0.5, value if lost else 0.4, 0.1)
         messages.append(pose(stamp + 300_000, place, (0.0, 0.0, 0.0, 1.0)))
     session = CalibrationSession(ARM, Settings(mode='continuous', delay=1e-3))
-    for begin in range(0, 1200, 1200 if together else 1):
-        part = messages[begin : begin + (1200 if together else 1)]
+    for begin in range(0, 300, 300 if together else 1):
+        part = messages[begin : begin + (300 if together else 1)]
         assert feed(session, part, STORE.deserialize_cdr) == []
     session.finish()
     dropped = session.account().dropped
-    assert dropped['poses: position beyond 1000 km'] == 120
-    assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 12
-    assert 'samples' in session.status()
+    assert dropped['poses: position beyond 1000 km'] == 30
+    assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 3
+    assert len(session.samples) > 100
 
 
 def test_streams_of_the_same_joints_share_a_buffer():

@@ -54,8 +54,7 @@ def apart(first, second, rng, count=300):
     return np.sqrt((shift**2).sum(axis=1).mean())
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('seed', [1, 2])
+@pytest.mark.parametrize(('oriented', 'seed'), [(True, 1), (False, 2)])
 def test_at_the_end_it_is_the_batch(oriented, seed):
     rng = np.random.default_rng(seed)
     samples = seen(faulty(UR10E, Cell(), rng), 80, rng, oriented)
@@ -73,8 +72,9 @@ def test_what_it_expects_is_what_comes(rng):
     ratios = []
     for _ in range(10):
         true = faulty(UR10E, Cell(), rng)
-        _, said = growing(seen(true, 50, rng))
-        ratios += [apart(said[k].chain, true, rng) / said[k].sigma for k in (24, 49)]
+        samples, live = seen(true, 50, rng), LiveEstimate(session().problem_of)
+        said = [live.update(samples[:count]) for count in (25, 50)]
+        ratios += [apart(each.chain, true, rng) / each.sigma for each in said]
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.3)
 
 
@@ -136,8 +136,10 @@ def test_a_sample_of_gross_error_is_flagged_and_left_out(oriented, rng):
     assert apart(said[-1].chain, true, rng) < 3.0 * said[-1].sigma
 
 
-@pytest.mark.parametrize('places', [[0], [1], [9], [0, 3, 8], list(range(START))])
-@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize(
+    ('oriented', 'places'),
+    [(True, [0]), (False, [0, 3, 8]), (True, list(range(START))), (False, list(range(START)))],
+)
 def test_gross_errors_among_the_first_samples_are_found_later(oriented, places, rng):
     """However the estimate bent to them: at the end it is that of the good ones alone."""
     samples = seen(faulty(UR10E, Cell(), rng), 50, rng, oriented)
@@ -182,7 +184,7 @@ def test_good_samples_are_not_flagged(times):
     """Nor are they where the noise is larger than the sigmas given."""
     given = {name: sigma / times for name, sigma in SIGMAS.items()}
     flagged = 0
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         live, _ = growing(seen(faulty(UR10E, Cell(), rng), 60, rng), **given)
         flagged += len(live.suspicious)

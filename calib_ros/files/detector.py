@@ -1,0 +1,350 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The corners of a board in photographs.
+
+An image is refused with the reason where its corners would harm: blurred, another board, or too
+little of this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.files.boards import Board, Detections
+from calib_ros.files.images import Image, opencv
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.pictures import Refusal
+
+Corners = tuple[NDArray[np.intp], FloatArray]
+"""Numbers (K,) and pixels (K, 2) of a board's corners."""
+Markers = tuple[FloatArray, NDArray[np.intp]]
+"""Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
+
+FEWEST = 6
+"""Corners of an image from which on it is used."""
+BLURRED = 8.0
+"""Width [px] of the sharpest edges from which on an image is blurred."""
+WINDOW = 0.6
+"""Half the window that refines a corner, by the distance to the nearest marker; measured, as is
+WIDEST, by benchmarks/images.py."""
+WIDEST = 10
+"""Half of the widest such window [px]."""
+COARSE = 700
+"""Longer side [px] of the smallest image in which markers are sought."""
+BENT = 5.0
+"""Distance [px] from where the other corners say up to which lens and board may bend a board."""
+BENT_SHARE = 0.1
+"""The same as a share of the distance between corners."""
+
+
+@dataclass(frozen=True)
+class Refused:
+    """An image that is not used, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What was found in images, and the images that are not used."""
+
+    detections: Detections
+    refused: tuple[Refused, ...]
+
+
+def dictionaries() -> tuple[str, ...]:
+    """Return the names of the dictionaries of markers."""
+    return tuple(sorted(name for name in dir(opencv().aruco) if name.startswith('DICT_')))
+
+
+def _dictionary(name: str) -> Any:
+    aruco = opencv().aruco
+    if name not in dictionaries():
+        raise UnknownNameError('dictionary', name, dictionaries())
+    return aruco.getPredefinedDictionary(getattr(aruco, name))
+
+
+def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
+    """Return which cells (B, B) of each marker are black, its border included."""
+    aruco, dictionary = opencv().aruco, _dictionary(board.dictionary)
+    count = len(board.markers)
+    if count > len(dictionary.bytesList):
+        raise ConfigError(
+            f'{board.dictionary} has {len(dictionary.bytesList)} markers, the board needs {count}'
+        )
+    size = dictionary.markerSize + 2
+    draw = getattr(aruco, 'generateImageMarker', None) or aruco.drawMarker
+    return [np.asarray(draw(dictionary, k, size)) < 128 for k in range(count)]
+
+
+class Detector:
+    """Finds the corners of one board.
+
+    Markers are sought in an image of half the size or less, and those that must be in view and
+    were not found in larger ones. Corners are refined in the image as it is.
+
+    Parameters
+    ----------
+    board : Board
+    fewest : int
+        Corners that an image must show.
+
+    """
+
+    def __init__(self, board: Board, fewest: int = FEWEST) -> None:
+        self._board, self._fewest = board, fewest
+        self._cv2 = cv2 = opencv()
+        aruco = cv2.aruco
+        self._new = hasattr(aruco, 'ArucoDetector')
+        self._count = len(marker_cells(board))
+        self._dictionary = _dictionary(board.dictionary)
+        self._parameters = (
+            aruco.DetectorParameters() if self._new else aruco.DetectorParameters_create()
+        )
+        if board.type == 'markers':
+            self._parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+        self._corners = self._charuco() if board.type == 'charuco' else _of_markers
+
+    def of(self, image: Image) -> Corners | Refusal:
+        """Return numbers (K,) and pixels (K, 2) of the corners, or why the image is not used."""
+        if not image.size:
+            return Refusal('that cannot be decoded', 'it is no image that OpenCV can read')
+        width = _edge_width(self._cv2, image)
+        if width > BLURRED:
+            reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
+            return Refusal('blurred', reason)
+        found = self._judged(image, *self._sought(image))
+        if not isinstance(found, Refusal):
+            return found
+        corners, ids = self._markers(image, self._dictionary)
+        if not len(ids):
+            reason = f'it shows no marker of {self._board.dictionary}{self._others(image)}'
+            return Refusal('without the board', reason)
+        own = ids < self._count
+        if (~own).sum() > len(ids) // 2:
+            return Refusal(
+                'of another board',
+                f'it shows another board: marker {int(ids[~own][0])}, and this board has 0 to '
+                f'{self._count - 1}',
+            )
+        return self._judged(image, corners[own], ids[own])
+
+    def _sought(self, image: Image) -> Markers:
+        """Return the markers of the board, by as few pixels and candidates as it takes."""
+        size = np.array(image.shape[1::-1])
+        halvings = int(np.log2(max(*size / COARSE, 1.0))) if self._board.type == 'charuco' else 0
+        steps = [(k, range(13, 14)) for k in range(halvings, -1, -1)]
+        corners, ids = np.zeros((0, 4, 2)), np.zeros(0, np.intp)
+        missing, first, last = np.arange(self._count), np.zeros(2, np.intp), size
+        for k, windows in (*steps, (0, range(3, 24, 20))):
+            part = image[first[1] : last[1], first[0] : last[0]]
+            smaller = tuple(np.maximum((last - first) // 2**k, 1).tolist())
+            if k:
+                part = self._cv2.resize(part, smaller, interpolation=self._cv2.INTER_AREA)
+            among = _dictionary(self._board.dictionary)
+            among.bytesList = among.bytesList[missing]
+            share = max(last - first) / max(size)
+            more, number = self._markers(part, among, windows, share)
+            more = (more + 0.5) * ((last - first) / smaller) - 0.5 + first
+            corners = np.concatenate([corners, more])
+            ids = np.concatenate([ids, missing[number]])
+            missing, first, last = self._hidden(corners, ids, size)
+            if not len(missing):
+                break
+        return corners, ids
+
+    def _hidden(
+        self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp], ...]:
+        """Return which other markers must be in an image, and the box (2,), (2,) around them.
+
+        By the plane of those that were found.
+        """
+        around = self._board.marker * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        points = self._board.markers[:, np.newaxis] + around
+        others = np.setdiff1d(np.arange(self._count), ids)
+        matrix = None
+        if len(ids) and len(others):
+            matrix, _ = self._cv2.findHomography(
+                points[ids].reshape(-1, 2), corners.reshape(-1, 2)
+            )
+        if matrix is None:
+            return others, np.zeros(2, np.intp), size
+        placed = self._cv2.perspectiveTransform(points[others].reshape(1, -1, 2), matrix)
+        placed = placed.reshape(-1, 4, 2)
+        inside = ((placed >= 0.0) & (placed <= size - 1)).all(axis=(1, 2))
+        if not inside.any():
+            return others[inside], np.zeros(2, np.intp), size
+        box = placed[inside].reshape(-1, 2)
+        margin = np.ptp(placed[inside], axis=1).max()
+        first = np.maximum(box.min(axis=0) - margin, 0).astype(np.intp)
+        return others[inside], first, np.minimum(box.max(axis=0) + margin, size).astype(np.intp)
+
+    def _judged(
+        self, image: Image, corners: FloatArray, ids: NDArray[np.intp]
+    ) -> Corners | Refusal:
+        """Return the corners of the board by its markers, or why they are not used."""
+        number, pixels = self._corners(image, corners, ids)
+        whole = len(self._board.corners)
+        if len(number) < self._fewest:
+            return Refusal(
+                'with too little of the board',
+                f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, and '
+                f'{len(ids)} markers: is it a part of the board only, or another board?',
+            )
+        points = self._board.corners[number, :2]
+        matrix, _ = self._cv2.findHomography(points, pixels)
+        apart = np.inf
+        if matrix is not None:
+            placed = self._cv2.perspectiveTransform(points[np.newaxis], matrix)[0]
+            apart = float(np.linalg.norm(placed - pixels, axis=1).max())
+        spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
+        if apart > max(BENT, BENT_SHARE * spacing):
+            return Refusal(
+                'whose corners do not fit the board',
+                f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, square'
+                ' and marker those of this board, and is it flat?',
+            )
+        return number, pixels
+
+    def _charuco(self) -> Callable[[Image, FloatArray, NDArray[np.intp]], Corners]:
+        """Return what finds the corners between markers."""
+        board, aruco = self._board, self._cv2.aruco
+        size = (board.columns, board.rows)
+        if self._new:
+            made = aruco.CharucoBoard(size, board.square, board.marker, self._dictionary)
+            if hasattr(made, 'setLegacyPattern'):
+                made.setLegacyPattern(board.legacy)
+            elif board.legacy_pattern:
+                raise ConfigError('OpenCV 4.7 knows no legacy boards: take another version')
+            detect_board = aruco.CharucoDetector(made).detectBoard
+        elif board.rows % 2 == 0 and not board.legacy:
+            raise ConfigError(
+                'this OpenCV knows boards of an even number of rows with a white square at the '
+                'upper left only (legacy: true): take an odd number, or OpenCV 4.7'
+            )
+        else:
+            made = aruco.CharucoBoard_create(*size, board.square, board.marker, self._dictionary)
+
+        def found(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:
+            pixels = number = None
+            around = [each[np.newaxis] for each in corners.astype(np.float32)]
+            shape = ids.astype(np.int32)[:, np.newaxis]
+            if self._new and around:
+                pixels, number, _, _ = detect_board(image, markerCorners=around, markerIds=shape)
+            elif around:
+                _, pixels, number = aruco.interpolateCornersCharuco(around, shape, image, made)
+            if number is None or not len(number):
+                return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+            flat = np.asarray(pixels, dtype=float).reshape(-1, 2)
+            return np.ravel(number).astype(np.intp), self._refined(image, flat, corners)
+
+        return found
+
+    def _refined(self, image: Image, pixels: FloatArray, markers: FloatArray) -> FloatArray:
+        """Return corners where the edges around them cross.
+
+        What OpenCV interpolates is refined by it with a window that reaches into the markers and
+        up to a tenth of a pixel, and is half a pixel off before version 5.
+        """
+        cv2 = self._cv2
+        apart = np.linalg.norm(pixels[:, np.newaxis] - markers.reshape(-1, 2), axis=2).min(axis=1)
+        windows = np.clip((WINDOW * apart).astype(int), 1, WIDEST)
+        criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 0.01)
+        found = pixels.astype(np.float32)
+        for size in np.unique(windows).tolist():
+            these = windows == size
+            start = found[these, np.newaxis].copy()
+            found[these] = cv2.cornerSubPix(image, start, (size, size), (-1, -1), criteria)[:, 0]
+        return found.astype(float)
+
+    def _markers(
+        self, image: Image, dictionary: Any, windows: range = range(3, 24, 10), share: float = 1.0
+    ) -> Markers:
+        """Return markers by thresholds over windows [px]; `share` of an image is looked at."""
+        aruco, given = self._cv2.aruco, self._parameters
+        given.minMarkerPerimeterRate = 0.03 / share
+        given.adaptiveThreshWinSizeMin, given.adaptiveThreshWinSizeMax = windows[0], windows[-1]
+        given.adaptiveThreshWinSizeStep = max(
+            (windows[-1] - windows[0]) // (len(windows) - 1 or 1), 1
+        )
+        if self._new:
+            corners, ids, _ = aruco.ArucoDetector(dictionary, given).detectMarkers(image)
+        else:
+            corners, ids, _ = aruco.detectMarkers(image, dictionary, parameters=given)
+        numbers = np.zeros(0, np.intp) if ids is None else ids.ravel().astype(np.intp)
+        return np.array(corners, dtype=float).reshape(-1, 4, 2), numbers
+
+    def _others(self, image: Image) -> str:
+        """Return in words which other dictionary's markers an image shows."""
+        for name in dictionaries():
+            if name != self._board.dictionary and 'ARUCO_MIP' not in name:
+                found = len(self._markers(image, _dictionary(name))[1])
+                if found >= FEWEST:
+                    return f', but {found} of {name}: is it the right board file?'
+        return ': is the board in sight, and well lit?'
+
+
+def detect(
+    images: Iterable[tuple[str, Image]],
+    board: Board,
+    fewest: int = FEWEST,
+    heard: Callable[[str], None] = lambda line: None,
+) -> Found:
+    """Return the corners of a board in named images."""
+    detector = Detector(board, fewest)
+    names: list[str] = []
+    image, corner, pixels, refused = [], [], [], []
+    for name, picture in images:
+        found = detector.of(picture)
+        if isinstance(found, Refusal):
+            refused.append(Refused(name, found.reason))
+            heard(f'{name}: not used, {found.reason}')
+            continue
+        heard(f'{name}: {len(found[0])} corners')
+        image.append(np.full(len(found[0]), len(names)))
+        names.append(name)
+        corner.append(found[0])
+        pixels.append(found[1])
+    if not names:
+        first = refused[0] if refused else Refused('', 'there is none')
+        raise InputError(f'no image can be used; {first.name}: {first.reason}')
+    detections = Detections(
+        tuple(names), np.concatenate(image), np.concatenate(corner), np.concatenate(pixels)
+    )
+    return Found(detections, tuple(refused))
+
+
+def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:
+    """Return the corners of markers as those of the board."""
+    del image
+    order = np.argsort(ids)
+    number = (4 * ids[order, np.newaxis] + np.arange(4)).ravel()
+    return number, corners[order].reshape(-1, 2)
+
+
+def _edge_width(cv2: Any, image: Image) -> float:
+    """Return how wide [px] the sharpest edges are: the contrast over the steepest gradient."""
+    half = image[::2, ::2] if image.shape[0] > 2000 else image
+    across, down = (np.abs(slope[::3, ::3]).ravel() for slope in cv2.spatialGradient(half))
+    steepest = _nth(np.concatenate([across, down]), 99.9) / 8.0  # of a Sobel
+    some = half[::7, ::7].ravel()
+    return (_nth(some, 99.0) - _nth(some, 1.0)) / max(steepest, 1e-3) * (len(image) / len(half))
+
+
+def _nth(values: NDArray[Any], percent: float) -> float:
+    """Return a percentile of whole numbers from 0 on."""
+    counts = np.cumsum(np.bincount(values))
+    return float(np.searchsorted(counts, 0.01 * percent * counts[-1]))
+
+
+def _area(points: FloatArray) -> float:
+    """Return the area that points (K, 2) spread over."""
+    return float(np.sqrt(max(np.linalg.det(np.cov(points.T)), 0.0)))

@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""From a bag or a table to what is identified, and its result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.files.bags import Replayed, replay
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.tables import Table, read_table
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason
+from calib_ros.identification.records import Owner
+from calib_ros.kinematics.chain import Chain
+from calib_ros.sampling.sample import named
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+LARGEST_LOSS = 0.1
+"""Share of the messages of a bag that may be lost. As many fewer samples at random make standard
+deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """A problem, and what became of the input.
+
+    `samples` are the counts of it, `read` says them in words; `lines` tells that stamps are the
+    lines of a table, `refusals` why a result must not be accepted whatever it is, `instead` that
+    these stand instead of its own; `owners` whose frame each is, of a bag.
+    """
+
+    problem: Problem
+    samples: dict[str, Any]
+    warnings: tuple[str, ...] = ()
+    read: str = ''
+    lines: bool = False
+    refusals: tuple[Reason, ...] = ()
+    instead: bool = False
+    owners: Mapping[str, Owner] = field(default_factory=dict)
+
+    def identified(
+        self, model: str, told: Callable[[str], None] = lambda stage: None
+    ) -> Identification:
+        """Identify, and refuse the result where too much of the input is lost."""
+        try:
+            result = identify_model(self.problem, model, told)
+        except TooFewObservationsError as err:
+            if self.read:
+                raise InputError(f'{err} ({self.read})') from err
+            raise
+        own = () if self.instead else result.refusals
+        return replace(result, refusals=(*own, *self.refusals))
+
+
+def replayed(
+    path: Path,
+    chain: Chain,
+    settings: Settings,
+    told: Callable[[float], None] = lambda share: None,
+) -> tuple[CalibrationSession, Replayed]:
+    """Return a session that has taken a bag."""
+    session = CalibrationSession(chain, settings)
+    return session, replay(path, session, told)
+
+
+def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
+    """Return what is to be fitted of a bag, of which no more than a share may be lost."""
+    problem, account = session.problem(), session.account()
+    samples = {'recorded': read.recorded, 'read': read.read, **account.as_document()}
+    refusals = read.refusals(account, largest_loss)
+    words, owners = f'{read}; {account}', named(session.usable).owners
+    return Loaded(problem, samples, read.warnings, words, refusals=refusals, owners=owners)
+
+
+def table(
+    path: Path,
+    chain: Chain,
+    settings: Settings,
+    sessions: Sequence[str] = (),
+    eye_in_hand: bool = False,
+    foreign: Foreign | None = None,
+) -> Table:
+    """Return a table of measurements of a chain."""
+    sigmas = (settings.sigma_position, settings.sigma_orientation)
+    return read_table(path, len(chain.joints), sessions, sigmas, eye_in_hand, foreign)
+
+
+def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:
+    """Return what is to be fitted of a table; what is `given` goes to the problem."""
+    problem = found.problem(chain, **given, **settings.for_problem())
+    samples = {
+        'samples': sum(map(len, found.fitted)),
+        'held_out': sum(map(len, found.held_out)),
+        'sets': len(found.fitted),
+    }
+    return Loaded(problem, samples, found.warnings, lines=found.by_line)

@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import shutil
+
+import numpy as np
+import pytest
+from recorded import (
+    MS,
+    STREAMS,
+    assert_equal,
+    damage,
+    observations_of,
+    pose_stamped,
+    record,
+    record_in_chunks,
+    recording,
+    session_of,
+    standing,
+    storages,
+    text_message,
+)
+from rosbags.rosbag2 import Reader
+
+from calib_ros.files.recording import STORAGES, write_bag
+
+
+@pytest.fixture(scope='module')
+def long_bags(tmp_path_factory):
+    """A bag of each storage, and the observations in it."""
+    folder = tmp_path_factory.mktemp('long')
+    for storage in STORAGES:
+        write_bag(folder / storage, recording(80), storage)
+    return folder, observations_of(folder / STORAGES[0])
+
+
+@storages
+@pytest.mark.parametrize(
+    ('metadata', 'alone', 'share'), [(True, False, 0.45), (False, False, 0.55), (True, True, 0.8)]
+)
+def test_of_a_truncated_bag_the_rest_is_used(tmp_path, long_bags, storage, metadata, alone, share):
+    folder, whole = long_bags
+    path = shutil.copytree(folder / storage, tmp_path / 'bag')
+    file = damage(path, share, metadata)
+    session, warnings = session_of(file if alone else path)
+    part = session.problem().observations
+    (warning,) = warnings
+    assert str(path) in warning
+    assert 'damaged' in warning
+    assert 'lost' in warning
+    account = session.account()
+    assert str(account.joint_states + account.poses) in warning
+    assert 0.2 * share * len(whole) < len(part) < len(whole)
+    # What is read is what was recorded.
+    index = np.searchsorted(whole.stamps_ns, part.stamps_ns)
+    np.testing.assert_array_equal(whole.stamps_ns[index], part.stamps_ns)
+    np.testing.assert_array_equal(whole.positions[index], part.positions)
+    np.testing.assert_array_equal(whole.joints[index], part.joints)
+
+
+@storages
+def test_a_bag_that_was_never_closed_is_read(tmp_path, storage):
+    path = tmp_path / 'bag'
+    write_bag(path, recording(), storage)
+    whole = observations_of(path)
+    damage(path, metadata=False)
+    session, warnings = session_of(path)
+    assert_equal(session.problem().observations, whole)
+    assert len(warnings) == 1
+
+
+@storages
+def test_the_count_of_a_damaged_bag_is_of_the_messages_used(tmp_path, storage):
+    events = [*standing([pose_stamped(105 * MS)]), *[('/chatter', text_message())] * 7]
+    path = record(tmp_path / 'bag', events, storage)
+    damage(path, metadata=False)
+    assert ' 101 messages' in session_of(path)[1][0]
+
+
+@storages
+def test_a_damaged_bag_in_a_folder_with_an_odd_name(tmp_path, storage):
+    write_bag(tmp_path / 'bag', recording(), storage)
+    damage(tmp_path / 'bag', metadata=False)
+    path = (tmp_path / 'bag').rename(tmp_path / 'cell #1 50%20?')
+    assert session_of(path)[0].account().samples == 30
+
+
+@pytest.mark.parametrize('share', [0.3, 0.9])
+def test_of_a_truncated_compressed_bag_the_whole_chunks_are_used(tmp_path, share):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap', 'storage')
+    session, warnings = session_of(damage(path, share))
+    assert 30 * share < session.account().poses < 100
+    assert len(warnings) == 1
+
+
+@storages
+def test_a_hole_in_a_file_is_reported(tmp_path, long_bags, storage):
+    path = shutil.copytree(long_bags[0] / storage, tmp_path / 'bag')
+    file = damage(path)
+    content = bytearray(file.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 9000] = b'\xff' * 9000
+    file.write_bytes(bytes(content))
+    session, warnings = session_of(path)
+    account = session.account()
+    assert 0 < account.samples < 80
+    assert len(warnings) == 1
+    assert 'lost' in warnings[0]
+
+
+@pytest.mark.parametrize('damaged', [0, 5])
+def test_a_damaged_chunk_costs_its_messages_only(tmp_path, damaged):
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    with Reader(path) as reader:
+        chunks = list(reader.storage.storages[0].chunks)
+        wanted = [each.id for each in reader.connections if each.topic in STREAMS]
+    assert len(chunks) > 6
+    lost = sum(chunks[damaged].channel_count.get(key, 0) for key in wanted)
+    file = damage(path)
+    content = bytearray(file.read_bytes())
+    place = chunks[damaged].chunk_start_offset + 33
+    content[place : place + 4] = b'\1\2\3\4'  # not its checksum
+    file.write_bytes(bytes(content))
+    session, (warning,) = session_of(path)
+    account = session.account()
+    assert 10 < lost < 100
+    assert account.joint_states + account.poses == 280 - lost
+    assert f'{lost} of 280 messages are lost' in warning

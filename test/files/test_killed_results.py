@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Bags and results as a whole or not at all, whoever is killed."""
+
+import itertools
+import os
+import resource
+import shutil
+import sys
+from dataclasses import replace
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from killed import KILLED, every_kill, forked, status_of, tree
+from measured import measured, rows_of, write_csv
+from rosbags.rosbag2 import Writer
+
+from calib_ros.cli import identify, main, options, results
+from calib_ros.cli.results import Identified
+from calib_ros.files.bags import replay
+from calib_ros.files.loading import Loaded
+from calib_ros.files.recording import Recording, write_bag
+from calib_ros.identification import calibration
+from calib_ros.identification.identification import identify as identified_from
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report import plots, words
+from calib_ros.report.page import Origin
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+
+def dwells(count):
+    recorded = measured(count=count)
+    names = tuple(load_chain('ur5e').joint_names)
+    return Recording.of_dwells(names, recorded, np.zeros(count, bool))
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_bag_whose_writing_is_killed_is_absent(tmp_path, monkeypatch, storage):
+    path, truth = tmp_path / 'cells' / 'bag', tmp_path / 'cells' / 'truth.yaml'
+
+    recording = dwells(3)
+
+    def write():
+        write_bag(path, recording, storage, {truth: 'truth'})
+
+    def check():
+        if path.exists():
+            assert truth.read_text() == 'truth'
+            assert (path / 'metadata.yaml').read_text().endswith('\n')
+            session = CalibrationSession(load_chain('ur5e'), Settings())
+            assert replay(path, session).warnings == ()
+            assert len(session.samples) == 3
+            shutil.rmtree(path)
+
+    write()  # here first, so that no child has to load the message types
+    check()
+    assert every_kill(tmp_path, write, check) > 10
+    check()
+    write_message = Writer.write
+    for last in (1, 7, 17):
+        with monkeypatch.context() as patch:
+            count = itertools.count(1)
+
+            def write_one(*arguments, last=last, count=count):
+                if next(count) == last:
+                    os._exit(KILLED)
+                write_message(*arguments)
+
+            patch.setattr(Writer, 'write', write_one)
+            assert status_of(forked(write)) == KILLED
+            assert not path.exists()
+    write()
+    check()
+    assert not [each for each in (tmp_path / 'cells').iterdir() if 'bag' in each.name]
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('limit', [0, 1000, 20000])
+def test_a_bag_on_a_full_disk_is_absent(tmp_path, storage, limit):
+    def child():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        with pytest.raises(OSError, match=r'cannot write .*bag: '):
+            write_bag(tmp_path / 'bag', dwells(40), storage, {tmp_path / 'truth': 'true'})
+
+    assert status_of(forked(child)) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_command_that_writes_a_bag_says_so_when_the_disk_is_full(tmp_path, monkeypatch, capfd):
+    """It ends with status 1 and one line."""
+    table = write_csv(tmp_path / 'cell.csv', rows_of(measured()))
+    monkeypatch.chdir(tmp_path)
+
+    def child():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
+        assert main.main(['csv2bag', str(table), 'bag', '--chain', 'ur5e']) == 1
+        sys.stderr.flush()
+
+    assert status_of(forked(child)) == 0
+    assert 'calib_ros: cannot write bag: [Errno 27] File too large' in capfd.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['cell.csv']
+
+
+@pytest.fixture
+def identified(monkeypatch):
+    """Return results of A and B, as the command line has them, and a stamp that stays."""
+
+    def found(label, seed):
+        problem = Problem(load_chain('ur5e'), measured(seed=seed))
+        result, settings = identified_from(problem), Settings(folds=seed)
+        origin = Origin(settings=words.configuration_yaml('ur5e', settings))
+        loaded = Loaded(problem, {'samples': label}, (f'of {label}',))
+        return Identified(loaded, result, origin)
+
+    monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
+    monkeypatch.setattr(results, 'identification_report', lambda *of: of[1])
+    monkeypatch.setattr(options, 'render', lambda result: f'page of {result.names}')
+    monkeypatch.setattr(results, 'markdown', lambda result, samples: f'{samples} {result.names}')
+    monkeypatch.setattr(
+        calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
+    )
+    return {'A': found('A', 5), 'B': found('B', 6)}
+
+
+def test_an_identification_that_is_killed_mixes_nothing(tmp_path, monkeypatch, identified):
+    found = identified['B']
+    refused = replace(found.result, refusals=(Reason(Rule.GAIN, 'no gain'),))
+    identified['B'] = replace(found, result=refused)
+    out = tmp_path / 'out'
+
+    def run(label):
+        monkeypatch.setattr(identify, '_identified', lambda *given: identified[label])
+        arguments = ['--csv', 'unread', '--chain', 'ur5e', '--out', str(out), '--force']
+        main.main(['identify', *arguments])
+        return tree(out)
+
+    run('A')
+    (out / 'notes.txt').write_text('mine')
+    a, b = run('A'), run('B')
+    assert 'calibration.yaml' not in b
+    assert b['calibration.previous.yaml'] == a['calibration.yaml']
+    assert a['notes.txt'] == b['notes.txt'] == 'mine'
+    (out / 'calibration.previous.yaml').unlink(missing_ok=True)
+
+    def check():
+        kept = out if out.exists() else tmp_path / '.out.partial' / 'out.old'
+        assert tree(kept) in (a, b)
+        assert run('A').items() >= a.items()
+        assert [each.name for each in tmp_path.iterdir()] == ['out']
+        (out / 'calibration.previous.yaml').unlink(missing_ok=True)
+
+    run('A')
+    assert every_kill(tmp_path, lambda: run('B'), check, step=11) > 50
+    assert tree(out) == b

@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Bags that stand for more than they hold, and such of which much is lost."""
+
+import sqlite3
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.errors import InputError
+from calib_ros.files.bags import Replayed, replay
+from calib_ros.files.mcap import LARGEST_CHUNK
+from calib_ros.files.recording import Recording, write_bag
+from calib_ros.files.salvage import recorded
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.sampling.session import CalibrationSession
+
+ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
+
+
+def session():
+    return CalibrationSession(ARM)
+
+
+@pytest.fixture(params=['sqlite3', 'mcap'])
+def bag(tmp_path, request, rng):
+    poses = Observations.from_arrays(rng.normal(size=(20, 2)), rng.normal(size=(20, 3)))
+    write_bag(
+        tmp_path / 'bag', Recording.of_dwells(('a', 'b'), poses, np.zeros(20, bool)), request.param
+    )
+    return tmp_path / 'bag'
+
+
+@pytest.mark.parametrize(
+    'content',
+    [
+        b'\xff\xfe\x00',
+        b'rosbag2_bagfile_information:\n  message_count: many\n',
+        b'rosbag2_bagfile_information:\n  message_count: ' + b'9' * 5000 + b'\n',
+        b'[' * 100_000,
+        b'a: &a [x, x]\nb: &b [' + b'*a, ' * 10**5 + b']\nc: [*b, *b, *b]\n',
+    ],
+)
+def test_with_any_metadata_the_messages_are_read(bag, content):
+    (bag / 'metadata.yaml').write_bytes(content)
+    assert recorded(bag) is None
+    taken = session()
+    replayed = replay(bag, taken)
+    assert len(taken.samples) == 20
+    assert replayed.read == 120
+
+
+SCHEMA = (
+    'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, '
+    'offered_qos_profiles TEXT)',
+    'CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, '
+    'data BLOB)',
+)
+ENDLESS = 'WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SELECT'
+
+
+@pytest.mark.parametrize(
+    'statements',
+    [
+        (
+            SCHEMA[0],
+            f'CREATE VIEW messages AS {ENDLESS} id, 1 AS topic_id, 0 AS timestamp, '
+            'zeroblob(1000000) AS data FROM n',
+        ),
+        (f"CREATE VIEW topics AS {ENDLESS} id, 'a' AS name, 'b' AS type FROM n", SCHEMA[1]),
+        (SCHEMA[0], SCHEMA[1].replace('data BLOB', 'data AS (zeroblob(1000000000))')),
+        (SCHEMA[0], SCHEMA[1].replace(' PRIMARY KEY', '')),
+    ],
+)
+def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, statements):
+    path = tmp_path / 'bag.db3'
+    with sqlite3.connect(path) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    connection.close()
+    with pytest.raises(InputError, match='is not what a recorder makes'):
+        replay(path, session())
+
+
+@pytest.mark.parametrize('bag', ['sqlite3'], indirect=True)
+def test_messages_without_data_are_lost_and_no_more(bag):
+    (file,) = bag.glob('*.db3')
+    with sqlite3.connect(file) as connection:
+        (sql,) = connection.execute(
+            "SELECT sql FROM sqlite_master WHERE name='messages'"
+        ).fetchone()
+        connection.execute('PRAGMA writable_schema=ON')
+        loose = sql.replace('BLOB NOT NULL', 'BLOB')
+        connection.execute("UPDATE sqlite_master SET sql=? WHERE name='messages'", (loose,))
+    connection.close()
+    with sqlite3.connect(file) as connection:
+        connection.execute('UPDATE messages SET data=NULL WHERE id=7')
+    connection.close()
+    replayed = replay(bag, session())
+    assert (replayed.recorded, replayed.read) == (120, 119)
+    assert 'without data' in replayed.warnings[0]
+
+
+@pytest.mark.parametrize('bag', ['sqlite3'], indirect=True)
+@pytest.mark.parametrize('known', [True, False])
+@pytest.mark.parametrize('column', ['name', 'type'])
+def test_topics_whose_names_are_no_text_are_not_read(bag, column, known):
+    (file,) = bag.glob('*.db3')
+    with sqlite3.connect(file) as connection:
+        connection.execute(f"UPDATE topics SET {column}=x'05' WHERE type LIKE '%Point%'")
+    connection.close()
+    if not known:
+        (bag / 'metadata.yaml').unlink()
+    if known:  # the metadata name them
+        replayed = replay(bag, session())
+        assert (replayed.recorded, replayed.read) == (120, 100)
+    else:
+        with pytest.raises(InputError, match='has no pose topic'):
+            replay(bag, session())
+
+
+@pytest.mark.parametrize('bag', ['mcap'], indirect=True)
+def test_a_chunk_that_unpacks_to_more_costs_its_messages_only(bag):
+    (file,) = bag.glob('*.mcap')
+    content = bytearray(file.read_bytes())
+    place = content.index(b'\x06', 8)
+    while struct.unpack_from('<Q', content, place + 1)[0] > len(content):
+        place = content.index(b'\x06', place + 1)
+    content[place + 25 : place + 33] = struct.pack('<Q', LARGEST_CHUNK + 1)
+    file.write_bytes(bytes(content))
+    replayed = replay(bag, session())
+    assert replayed.read < replayed.recorded
+    assert 'lost' in replayed.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ('recorded_', 'read', 'largest', 'refused'),
+    [
+        (100, 100, 0.1, ''),
+        (100, 91, 0.1, ''),
+        (100, 80, 0.1, '20% of the messages could not be read'),
+        (100, 80, 0.25, ''),
+        (None, 80, 0.1, 'not known'),
+        (None, 80, 1.0, ''),
+    ],
+)
+def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, refused):
+    account = session().account()
+    found = Replayed(recorded_, read).refusals(account, largest)
+    assert bool(found) == bool(refused)
+    assert all(refused in reason and '--largest-loss' in reason for reason in found)
+
+
+@pytest.mark.parametrize(
+    ('cause', 'refused'),
+    [
+        ('poses: zero stamp', True),
+        ('poses: later than lateness allows', True),
+        ('poses: same stamp twice', False),
+        ('poses: NaN or infinite position', False),
+    ],
+)
+def test_messages_dropped_for_their_stamps_count_as_lost(cause, refused):
+    account = replace(session().account(), poses=100, dropped={cause: 50})
+    assert bool(Replayed(100, 100).refusals(account, 0.1)) == refused

@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.errors import ConfigError
+from calib_ros.identification.fingerprint import KEPT, Fingerprint, reused_in_words
+from calib_ros.identification.observations import Observations
+
+
+def rows(count, seed=0):
+    rng = np.random.default_rng(seed)
+    return Observations.from_arrays(rng.normal(size=(count, 6)), rng.normal(size=(count, 3)))
+
+
+@pytest.mark.parametrize('count', [60, 10 * KEPT])
+def test_rows_that_were_fitted_are_known_in_any_order(count):
+    fitted, new = rows(count), rows(count, 1)
+    found = Fingerprint.of_record({'rows': Fingerprint.of([fitted]).document()}, 'file')
+    again = fitted.select(np.random.default_rng(2).permutation(count))
+    rounding = replace(again, joints=again.joints + 1e-12, positions=again.positions - 1e-12)
+    assert found.share([rounding]) == 1.0
+    assert found.share([new]) == 0.0
+    assert found.share([fitted, new]) == pytest.approx(0.5, abs=0.15)
+    assert found.share([]) == 0.0
+    assert reused_in_words(0.0) == ''
+
+
+def test_what_was_measured_counts_and_not_the_configuration_alone():
+    fitted = rows(60)
+    other = np.full(60, 1.0)
+    found = Fingerprint.of([fitted])
+    assert found.share([replace(fitted, positions=fitted.positions + 1e-5)]) == 0.0
+    assert found.share([replace(fitted, distances=other)]) == 0.0
+    lengths = Fingerprint.of([replace(fitted, distances=other)])
+    assert lengths.share([replace(rows(60), distances=other)]) == 1.0
+
+
+@pytest.mark.parametrize('count', [60, 10 * KEPT])
+def test_rows_that_are_fitted_later_are_known_as_well(count):
+    earlier, later = rows(count), rows(count, 1)
+    found = Fingerprint.of([later], Fingerprint.of([earlier]))
+    assert found.share([earlier]) == found.share([later]) == 1.0
+    assert found.share([rows(count, 2)]) == 0.0
+
+
+@pytest.mark.parametrize('wrong', [1, {}, {'count': 1, 'least': 'x'}, {'count': 1, 'least': '00'}])
+def test_what_is_no_fingerprint_is_refused(wrong):
+    with pytest.raises(ConfigError, match=r'calibration\.rows'):
+        Fingerprint.of_record({'rows': wrong}, 'file')
