@@ -79,7 +79,7 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
     index = observations.images
     rows = np.empty((6, 2, len(index)))
     _seen(lens, poses, index, observations.points.T).by_twist(rows)
-    return np.linalg.inv(products_of(rows, np.flatnonzero(np.diff(index, prepend=-1))))
+    return np.asarray(np.linalg.inv(products_of(rows, np.flatnonzero(np.diff(index, prepend=-1)))))
 
 
 def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatArray) -> View:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import UnknownNameError
-from calib_ros.identification.leastsquares import ROUNDS, Fit, System, minimise
+from calib_ros.identification.leastsquares import ROUNDS, STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -161,8 +161,10 @@ def reweighted(
         distances = judged(chain)
         if not fit.converged:  # nor will the next one
             break
-    fit = minimise(chain, names, system)
-    return Robust(fit, system, distances, settled, iterations + fit.iterations, loss)
+    if not (settled and fit.left < STEP_TOLERANCE):
+        fit = minimise(chain, names, system)
+        iterations += fit.iterations
+    return Robust(fit, system, distances, settled, iterations, loss)
 
 
 def weights_of(distance: FloatArray, loss: str) -> FloatArray:
