@@ -118,9 +118,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.tolerance, options.pdf)
     if history is not None:
-        problem, measured = found.loaded.problem, options.csv or options.measured
-        judged, used = (*problem.sets, *problem.judging), options.detections or measured
-        about = filing_of(options, problem.chain, judged, used, options.largest_loss)
+        problem, measured = found.loaded.problem, options.csv or options.detections
+        sets, measured = (*problem.sets, *problem.judging), measured or options.measured
+        about = filing_of(options, problem.chain, sets, measured, options.largest_loss)
         history.file(row_of(found.result, about, found.warnings))
     for warning in (*found.warnings, *words.remarks(found.result)):
         screen.warn(warning)
