@@ -31,8 +31,6 @@ TOLERANCE = 1e-9
 ITERATIONS = 100
 DAMPING = (1e-12, 1e-6, 1e3)
 """Least damping, the first one, and that beyond which no step helps [m^2]."""
-DIFFERENCE = 1e-6
-"""Step [rad or m] for the derivatives of effects: exact to 1e-9 of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +166,11 @@ class Aim:
     def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
         """Return the derivative (n, n, B) of the effective joint values by those reported."""
         here = self._chain.effective(q, approach)
-        slope = np.empty((len(q), *q.shape))
+        slope, step = np.empty((len(q), *q.shape)), 1e-6  # right to 1e-9 of what effects add
         for k in range(len(q)):
             moved = q.copy()
-            moved[k] += DIFFERENCE
-            slope[:, k] = (self._chain.effective(moved, approach) - here) / DIFFERENCE
+            moved[k] += step
+            slope[:, k] = (self._chain.effective(moved, approach) - here) / step
         return slope
 
 
