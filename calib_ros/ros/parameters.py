@@ -92,19 +92,15 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
+    plain = ('chain', 'serial', 'history', 'resume', 'autoload', 'socket_distance')
     given = Given(
-        chain=own['chain'],
         links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
-        serial=own['serial'],
-        history=own['history'],
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
-        resume=own['resume'],
-        autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
-        socket_distance=own['socket_distance'],
         settings=settings,
+        **{name: own[name] for name in plain},
     )
     return given, [*overrides]
 
