@@ -5,6 +5,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -38,6 +39,7 @@ ONLY = {
 }
 
 
+@cache
 def imports(module):
     """Return the names that a module imports, inside functions as well.
 
@@ -47,6 +49,8 @@ def imports(module):
     waiting = [ast.parse(MODULES[module].read_text())]
     while waiting:
         node = waiting.pop()
+        if isinstance(node, ast.expr):
+            continue
         if isinstance(node, ast.If) and getattr(node.test, 'id', '') == 'TYPE_CHECKING':
             continue
         waiting += ast.iter_child_nodes(node)
@@ -98,3 +102,13 @@ def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]
     lines += [f'import calib_ros.{name}' for name in core]
     subprocess.run([sys.executable, '-c', '\n'.join(lines)], check=True)
+
+
+def test_the_overview_of_the_commands_loads_nothing_slow():
+    heavy = ['numpy', 'scipy', 'yaml', 'rich', 'argcomplete', 'difflib']
+    heavy += [f'calib_ros.{folder}' for folder in LEVEL if folder != 'cli']
+    lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in heavy)]
+    lines += ['from calib_ros.cli.main import main', 'main(["--help"])']
+    ran = subprocess.run([sys.executable, '-c', '\n'.join(lines)], capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (0, '')
+    assert 'calib_ros identify' in ran.stdout

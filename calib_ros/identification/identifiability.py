@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
+from scipy.linalg import lapack
 
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -49,6 +50,8 @@ def independent(
     least = np.where(
         [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
     ) * np.linalg.norm(factor, axis=0)
+    if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
+        return tuple(names)  # the diagonal is what is left of each
     basis = np.zeros(factor.shape)
     kept: list[str] = []
     for name, column, short in zip(names, factor.T, least.tolist(), strict=True):
@@ -173,7 +176,10 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     equation weighted by its true variance (in units of the one assumed).
     """
     scale = 1.0 / np.linalg.norm(factor, axis=0)
-    inverse = scale[:, np.newaxis] * linalg.solve_triangular(factor * scale, np.eye(len(factor)))
+    inverse, failed = lapack.dtrtri(factor * scale)
+    if failed:
+        raise np.linalg.LinAlgError('singular factor')
+    inverse *= scale[:, np.newaxis]
     if middle is None:
         return np.asarray(inverse @ inverse.T)
     sizes, directions = np.linalg.eigh(inverse.T @ middle @ inverse)

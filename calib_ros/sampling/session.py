@@ -256,7 +256,7 @@ class CalibrationSession:
         estimate = self.estimate
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
-            told.append(f'sample {number} does not fit to the others, was the target moved?')
+            told.append(f'sample {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
         told += progress(self.chain, fitted, estimate, self.settings)
         return '; '.join(filter(None, told))

@@ -159,7 +159,7 @@ def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
     assert 'fit' not in words[-1].data
     joints = topics(recording)['joint_states'][1000:]
     cell.play({'joint_states': joints, 'measured_pose': some[80:]})
-    said = 'does not fit to the others, was the target moved?'
+    said = 'does not fit the others, was the target moved?'
     cell.spin_until(lambda: said in words[-1].data)
 
 
