@@ -24,12 +24,13 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros.arguments import BESIDE_SETTINGS
+from calib_ros.sampling.slices import SILENCE
 from calib_ros.settings import STARTUP, Settings
 
 QOS = 'qos_overrides.'
 OF_ROS = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy itself declares."""
-DESCRIPTION_WAIT = 10.0
+DESCRIPTION_WAIT = 2.0 * SILENCE
 """Time [s] for which the node waits for the robot's description."""
 
 
