@@ -58,7 +58,7 @@ def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
     failed = [*_of_the_fit(problem, found)]
     validation = found.validation
     if validation is None:
-        text = 'there are too few configurations to judge the result on any held out'
+        text = 'too few configurations to leave some out of the fit and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:

@@ -22,11 +22,10 @@ the parameters is then H^-1 (J^T V J) H^-1.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, special
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
@@ -35,7 +34,6 @@ from scipy.spatial.distance import cdist
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import CERTAIN
 from calib_ros.identification.observations import FEWEST
-from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
@@ -277,18 +275,6 @@ def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
 
 
-def _sums(
-    chain: Chain, names: Sequence[str], samples: Samples, numbers: NDArray[np.intp]
-) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
-    """Yield numbers (n,) of stops and the sums of their rows, (P + 1, c, n) by part, in blocks."""
-    first = 0
-    for block in samples.parts(chain, names):
-        index = numbers[first : first + block[0].shape[2]]
-        first += len(index)
-        begins = np.flatnonzero(np.diff(index, prepend=-1))
-        yield index[begins], tuple(np.add.reduceat(part, begins, axis=2) for part in block)
-
-
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:
     """Return the stops of all sets; of many, every `share`-th run of so many."""
     widths = (max(samples.width for samples in system.sets), 3)
@@ -304,7 +290,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
             continue
         few = samples.select(chosen)
         numbers = all_numbers[chosen]
-        pieces = list(_sums(chain, names, few, numbers))
+        pieces = list(few.sums(chain, names, numbers))
         index = np.concatenate([piece[0] for piece in pieces])
         again = np.flatnonzero(np.diff(index, prepend=-1))  # stops across the end of a block
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
@@ -356,7 +342,7 @@ def _successive(
     found = np.zeros((len(names), len(names)))
     for samples in system.sets:
         before = [np.zeros((len(names), samples.width if part == 0 else 3))] * len(kernels)
-        for _, sums in _sums(chain, names, samples, samples.observations.stops):
+        for _, sums in samples.sums(chain, names, samples.observations.stops):
             if part >= len(sums):
                 continue
             rows = sums[part][:-1]

@@ -84,8 +84,7 @@ def identification_report(
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 

@@ -39,7 +39,7 @@ from calib_ros.kinematics.urdf import chain_from_urdf
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(seed=SEEDS)
 def test_any_serial_arm_moves_as_its_urdf(convention, seed):
     rng = np.random.default_rng(seed)
@@ -104,7 +104,7 @@ def test_iiwa_has_the_dimensions_of_the_shipped_table():
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@pytest.mark.parametrize('tilt', [1e-12, 1e-9, 1e-6, 1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize('tilt', [1e-12, 1e-6, 1e-3, 1e-2])
 def test_a_calibrated_ur_has_no_absurd_lengths(convention, tilt, rng):
     origins = [
         (xyz + rng.normal(scale=min(tilt, 1e-3), size=3), rpy + rng.normal(scale=tilt, size=3))
@@ -249,16 +249,8 @@ REFUSED = {
         {},
         'run "xacro FILE > robot.urdf" first',
     ),
-    'formula': (
-        edited(UR10E, '-0.6127', '${a}'),
-        {},
-        '"elbow_joint" is a formula',
-    ),
-    'two numbers': (
-        edited(UR10E, '-0.6127 0.0', '0'),
-        {},
-        '3 finite numbers, not "0 0.0"',
-    ),
+    'formula': (edited(UR10E, '-0.6127', '${a}'), {}, '"elbow_joint" is a formula'),
+    'two numbers': (edited(UR10E, '-0.6127 0.0', '0'), {}, '3 finite numbers, not "0 0.0"'),
     'no number': (edited(UR10E, '-0.6127', 'nan'), {}, 'xyz in the origin of joint "elbow_joint"'),
     'no axis': (
         edited(SCARA, '<axis xyz="0.0 0.0 -1.0"/>', '<axis xyz="0 0 0"/>'),
@@ -286,16 +278,8 @@ REFUSED = {
         'joint "elbow_joint" mimics another',
     ),
     'finger': (PANDA, {'tip_link': 'panda_rightfinger'}, '"panda_finger_joint2" mimics another'),
-    'limits': (
-        edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'),
-        {},
-        'limits of joint "elbow',
-    ),
-    'unknown child': (
-        edited(UR10E, '<link name="tool0"/>', ''),
-        {},
-        'link at joint "flange',
-    ),
+    'limits': (edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'), {}, 'limits of joint "elbow'),
+    'unknown child': (edited(UR10E, '<link name="tool0"/>', ''), {}, 'link at joint "flange'),
     'two joints': (edited(SCARA, '"lift"', '"wrist"'), {}, 'two joints are named "wrist"'),
     'two links': (
         edited(SCARA, '<link name="hand"/>', '<link name="hand"/>' * 2),
