@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.leastsquares import System, minimise, without_each
 from calib_ros.identification.levels import CONFIDENT, KNOWN
-from calib_ros.identification.observations import Observations, distinct, numbered
+from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
