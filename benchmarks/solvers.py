@@ -115,6 +115,12 @@ class Streamed:
         for chunk in self.given.chunks():
             yield from Samples(_observations(self.given, chunk), *self.sigmas).blocks(chain, names)
 
+    def products(self, *which):
+        """Return the products of all rows."""
+        from calib_ros.identification.samples import Samples
+
+        return Samples.products(self, *which)
+
 
 def streamed(given):
     """Only fit, and read the samples from the disk in each iteration."""

@@ -5,6 +5,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -38,6 +39,7 @@ ONLY = {
 }
 
 
+@cache
 def imports(module):
     """Return the names that a module imports, inside functions as well.
 
@@ -47,6 +49,8 @@ def imports(module):
     waiting = [ast.parse(MODULES[module].read_text())]
     while waiting:
         node = waiting.pop()
+        if isinstance(node, ast.expr):
+            continue
         if isinstance(node, ast.If) and getattr(node.test, 'id', '') == 'TYPE_CHECKING':
             continue
         waiting += ast.iter_child_nodes(node)

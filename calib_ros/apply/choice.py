@@ -17,6 +17,7 @@ choice by `d` is where exchanges start.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -148,12 +149,11 @@ def _score(space: Candidates, criterion: Criterion, task: FloatArray | None) -> 
         raise UnknownNameError('criterion', criterion, CRITERIA)
     if criterion == 'd':
         return _by_determinant
-    if criterion == 'task':
-        if task is None:
-            raise ConfigError('the criterion "task" needs the poses of a task')
-        wanted = space.of_task(task)
-        return lambda information, rows: _by_task(information, rows, wanted)
-    return lambda information, rows: _by_index(information, rows, criterion, space.factor)
+    if criterion != 'task':
+        return partial(_by_index, criterion=criterion, factor=space.factor)
+    if task is None:
+        raise ConfigError('the criterion "task" needs the poses of a task')
+    return partial(_by_task, wanted=space.of_task(task))
 
 
 def _by_determinant(information: FloatArray, rows: FloatArray) -> FloatArray:
@@ -178,13 +178,13 @@ def _by_index(
     total = factor.T @ information @ factor + np.swapaxes(back, 1, 2) @ back
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
     smallest, largest = singular[:, 0], singular[:, -1]
-    if criterion == 'o2':
-        return np.asarray(smallest / largest)
-    if criterion == 'o3':
-        return np.asarray(smallest)
-    if criterion == 'o4':
-        return np.asarray(smallest**2 / largest)
-    return np.asarray(1.0 / np.sum(1.0 / singular, axis=1))
+    found = {
+        'o2': smallest / largest,
+        'o3': smallest,
+        'o4': smallest**2 / largest,
+        'o5': 1.0 / np.sum(1.0 / singular, axis=1),
+    }
+    return np.asarray(found[criterion])
 
 
 def _root(information: FloatArray) -> FloatArray:

@@ -292,23 +292,21 @@ def _in_new_frames(
     names = [name for each in sets for name in parameters_of(each.tool)[:3]]
     if new_base:
         names = [name for each in sets for name in parameters_of(each.base)] + names
-    unoriented = [replace(each, oriented=np.zeros(len(each), bool)) for each in sets]
-    system = System(tuple(Samples(replace(each, covariance=None), *UNIT) for each in unoriented))
+    none = [np.zeros(len(each), dtype=bool) for each in sets]
+    plain = [replace(s, oriented=n, covariance=None) for s, n in zip(sets, none, strict=True)]
+    system = System(tuple(Samples(each, *UNIT) for each in plain))
     names = list(dict.fromkeys(names))
     known = excited(triangular_factor(chain, names, system), names)
     chain = minimise(chain, known, system).chain
     for tool in dict.fromkeys(each.tool for each in sets):
-        turns = []
-        for each in sets:
-            if each.tool == tool and each.oriented.any():
-                now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]
-                measured = each.rotations[each.oriented]
-                turns.append(np.einsum('nji,njk->ik', now[:, :3, :3], measured))
-        if turns:
+        turns = np.zeros((3, 3))
+        for each in (each for each in sets if each.tool == tool):
+            now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]
+            turns += np.einsum('nji,njk->ik', now[:, :3, :3], each.rotations[each.oriented])
+        if turns.any():
             frame = chain.frame(tool)
-            matrix = frame.matrix.copy()
-            matrix[:3, :3] = matrix[:3, :3] @ se3.nearest_rotation(np.sum(turns, axis=0))
-            chain = chain.with_frame(tool, replace(frame, matrix=matrix))
+            turn = se3.transform(se3.nearest_rotation(turns), np.zeros(3))
+            chain = chain.with_frame(tool, replace(frame, matrix=frame.matrix @ turn))
     return chain
 
 

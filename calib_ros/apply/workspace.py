@@ -63,8 +63,8 @@ def survey(arm: Calibration, count: int, rng: np.random.Generator) -> Survey:
     """Survey the errors at random configurations within the joint limits."""
     joints = arm.chain.random_joints(count, rng)
     removed, turned = arm.removed(joints)
-    positions = in_base(arm.chain, joints)[:, :3, 3]
-    return Survey(joints, positions, removed, turned, arm.sigma(joints), arm.remaining(joints))
+    positions, sigma = in_base(arm.chain, joints)[:, :3, 3], arm.sigma(joints)
+    return Survey(joints, positions, removed, turned, sigma, np.hypot(sigma, arm.residual or 0.0))
 
 
 def in_base(chain: Chain, joints: FloatArray) -> FloatArray:
@@ -85,13 +85,9 @@ class Spread:
     @classmethod
     def of(cls, errors: FloatArray) -> Spread:
         """Return the figures of errors (N,)."""
-        return cls(
-            float(np.sqrt(np.mean(errors**2))),
-            float(errors.mean()),
-            float(np.median(errors)),
-            float(np.quantile(errors, 0.95)),
-            float(errors.max()),
-        )
+        median, high = np.quantile(errors, [0.5, 0.95])
+        found = (np.sqrt(np.mean(errors**2)), errors.mean(), median, high, errors.max())
+        return cls(*map(float, found))
 
 
 @dataclass(frozen=True)

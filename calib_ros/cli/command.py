@@ -14,17 +14,9 @@ if TYPE_CHECKING:
 
 
 class Command(NamedTuple):
-    """What a command does.
+    """What a command does: `add` its options to a parser, `run` it and return the exit status.
 
-    Attributes
-    ----------
-    add : callable
-        Adds its options to a parser.
-    run : callable
-        Does it, with the options and the screen, and returns the exit status.
-    examples : tuple of str
-        Whole commands for the foot of its help, without "calib_ros".
-
+    `examples` are whole commands for the foot of its help, without "calib_ros".
     """
 
     add: Callable[[argparse.ArgumentParser], None]

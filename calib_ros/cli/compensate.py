@@ -28,24 +28,14 @@ from calib_ros.kinematics.chain_file import load_chain
 
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to correct')
-    group.add_argument(
-        'program',
-        type=Path,
-        metavar='PROGRAM',
-        help='.csv with q1 ... qn, or .yaml with a JointTrajectory',
-    )
+    text = '.csv with q1 ... qn, or .yaml with a JointTrajectory'
+    group.add_argument('program', type=Path, metavar='PROGRAM', help=text)
     add_chain(group)
     add_calibration(group)
     add_out(group, 'the corrected program', 'FILE', needed=True)
     add = parser.add_argument_group('limits').add_argument
-    add(
-        '--tool',
-        nargs=3,
-        type=float,
-        default=Compensator.tool,
-        metavar=('X', 'Y', 'Z'),
-        help='point in the flange frame whose position counts [m]',
-    )
+    text, axes = 'point in the flange frame whose position counts [m]', ('X', 'Y', 'Z')
+    add('--tool', nargs=3, type=float, default=Compensator.tool, metavar=axes, help=text)
     for name, text in (
         ('largest_turn', 'largest correction of a revolute joint [rad]'),
         ('largest_shift', 'largest correction of a prismatic joint [m]'),

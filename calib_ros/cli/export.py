@@ -24,24 +24,14 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add('calibration', type=Path, metavar='CALIBRATION', help='calibration.yaml of identify --out')
     add_chain(group)
     add_out(group, 'all forms', needed=True)
-    add(
-        '--measured',
-        type=Path,
-        metavar='FILE',
-        help='table with q1 ... qn where tables that cannot be exact are to be best; if not '
-        'given, the whole joint range',
-    )
+    text = 'table with q1 ... qn where tables that cannot be exact are to be best; if not given, '
+    add('--measured', type=Path, metavar='FILE', help=f'{text}the whole joint range')
     add = parser.add_argument_group('for URDF and drivers').add_argument
     add('--urdf', type=Path, metavar='FILE', help='nominal URDF of the robot, to correct as well')
     add('--base-link', metavar='LINK', help='of the URDF: where the arm starts')
     add('--tip-link', metavar='LINK', help='of the URDF: where the arm ends')
-    add(
-        '--ur-hash',
-        default='',
-        metavar='calib_...',
-        help='checksum that the driver of Universal Robots prints at its start, for '
-        'ur_kinematics.yaml',
-    )
+    text = 'checksum that the driver of Universal Robots prints at its start, for '
+    add('--ur-hash', default='', metavar='calib_...', help=f'{text}ur_kinematics.yaml')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:

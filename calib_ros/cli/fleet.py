@@ -31,13 +31,8 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
     add('--workers', type=int, default=0, metavar='N', help='processes here; default: one a core')
     add('--memory', default='2GiB', metavar='SIZE', help='of each of these, at most')
     group = parser.add_argument_group('alarms')
-    group.add_argument(
-        '--years',
-        type=float,
-        default=YEARS,
-        metavar='N',
-        help='between two false alarms of a robot that is measured every night',
-    )
+    text = 'between two false alarms of a robot that is measured every night'
+    group.add_argument('--years', type=float, default=YEARS, metavar='N', help=text)
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:

@@ -16,6 +16,7 @@ from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import (
     NOT_ACCEPTED,
     add_chain,
+    add_each,
     add_history,
     add_identity,
     add_layout,
@@ -59,39 +60,20 @@ OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to read')
     add = group.add_argument
-    add(
-        'measured',
-        nargs='?',
-        type=Path,
-        metavar='MEASURED',
-        help='a table of measured poses, or a bag: folder, .mcap or .db3',
-    )
+    text = 'a table of measured poses, or a bag: folder, .mcap or .db3'
+    add('measured', nargs='?', type=Path, metavar='MEASURED', help=text)
     add('--csv', type=Path, metavar='FILE', help='the same for a table of any name')
     add_chain(group)
     add('--session', metavar='NAME', help='session of the table; several joined by commas')
-    add(
-        '--eye-in-hand',
-        action='store_true',
-        help='the poses are those of a fixed target in a camera on the flange',
-    )
-    add(
-        '--largest-loss',
-        type=float,
-        default=LARGEST_LOSS,
-        metavar='SHARE',
-        help='of the messages of a bag, beyond which the result is not accepted; 1: any',
-    )
-    add(
-        '--socket-distance',
-        type=float,
-        metavar='M',
-        help='between two sockets of a place, 0.05 if not given',
-    )
-    add(
-        '--sigma-touch',
-        type=float,
-        metavar='M',
-        help='of heights over touched planes, 1e-4 if not given',
+    text = 'the poses are those of a fixed target in a camera on the flange'
+    add('--eye-in-hand', action='store_true', help=text)
+    loss = 'of the messages of a bag, beyond which the result is not accepted; 1: any'
+    add_each(
+        group,
+        float,
+        ('--largest-loss', 'SHARE', LARGEST_LOSS, loss),
+        ('--socket-distance', 'M', None, 'between two sockets of a place, 0.05 if not given'),
+        ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
     )
     group = parser.add_argument_group('what to write')
     add_out(group, 'calibration, result and report')
@@ -108,18 +90,19 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_detections(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group('what a camera saw (docs/images.md)').add_argument
-    add('--detections', type=Path, metavar='FILE', help='corners of a board, by calib_ros images')
-    add('--board', type=Path, metavar='FILE', help='YAML of that board')
-    add(
-        '--places',
-        type=Path,
-        metavar='FILE',
-        help='table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
-        'qx qy qz qw of the flange',
+    group = parser.add_argument_group('what a camera saw (docs/images.md)')
+    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
+    add_each(
+        group,
+        Path,
+        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
+        ('--board', 'FILE', None, 'YAML of that board'),
+        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
+        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
     )
-    add('--intrinsics', type=Path, metavar='FILE', help='camera_info, by camera_calibration')
-    add('--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given')
+    group.add_argument(
+        '--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given'
+    )
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:

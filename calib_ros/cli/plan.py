@@ -52,34 +52,17 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
     add('--draw', type=int, default=2000, metavar='N', help='random candidates without a file')
     add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
-    add(
-        '--apart',
-        type=float,
-        default=1e-3,
-        metavar='X',
-        help='least move of a joint between poses [rad, m]',
-    )
-    add(
-        '--velocity',
-        type=float,
-        nargs='+',
-        default=[1.0],
-        metavar='V',
-        help='of the joints [rad/s, m/s]',
-    )
+    text = 'least move of a joint between poses [rad, m]'
+    add('--apart', type=float, default=1e-3, metavar='X', help=text)
+    text = 'of the joints [rad/s, m/s]'
+    add('--velocity', type=float, nargs='+', default=[1.0], metavar='V', help=text)
     add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
     add = parser.add_argument_group('what the device sees').add_argument
     add('--measured', choices=('pose', 'position'), default='pose', help='at each pose')
     add('--box', type=float, nargs=6, metavar='M', help='measurable region: lower, upper corner')
     add('--tracker', type=float, nargs=3, metavar='M', help='where the device stands')
-    add(
-        '--axis',
-        type=float,
-        nargs=3,
-        default=[0.0, 0.0, 1.0],
-        metavar='X',
-        help='of the target, to face it',
-    )
+    forward, text = [0.0, 0.0, 1.0], 'of the target, to face it'
+    add('--axis', type=float, nargs=3, default=forward, metavar='X', help=text)
     add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
     add('--world', action='store_true', help='box and tracker are in the world, not in the base')
     add_settings(parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed'))

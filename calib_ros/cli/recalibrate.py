@@ -21,18 +21,10 @@ def add_previous(parser: argparse.ArgumentParser) -> None:
     """Add the options of an earlier calibration."""
     group = parser.add_argument_group('an earlier calibration (docs/history.md)')
     add = group.add_argument
-    add(
-        '--previous',
-        metavar='CALIBRATION',
-        help='bring this one up to date by a few poses, and say what has changed since',
-    )
-    add(
-        '--growth',
-        type=float,
-        default=1e3 * GROWTH,
-        metavar='MM',
-        help='by which lengths wander in a year; angles by twice as many mrad',
-    )
+    text = 'bring this one up to date by a few poses, and say what has changed since'
+    add('--previous', metavar='CALIBRATION', help=text)
+    text = 'by which lengths wander in a year; angles by twice as many mrad'
+    add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
     add_moved(group)
 
 

@@ -18,6 +18,7 @@ from calib_ros.cli.options import (
     Contents,
     add_calibration,
     add_chain,
+    add_each,
     add_history,
     add_identity,
     add_layout,
@@ -55,31 +56,21 @@ TITLES = {
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to judge')
     add = group.add_argument
-    add(
-        'measured',
-        type=Path,
-        metavar='MEASURED',
-        help='new measurements: a bag, or a table with q1..qn as reported, x y z ...',
-    )
+    text = 'new measurements: a bag, or a table with q1..qn as reported, x y z ...'
+    add('measured', type=Path, metavar='MEASURED', help=text)
     add_chain(group)
     add_calibration(group)
-    add(
-        '--commanded',
-        type=Path,
-        metavar='FILE',
-        help='the program before its correction, q1..qn: judge against the poses that it means',
-    )
+    text = 'the program before its correction, q1..qn: judge against the poses that it means'
+    add('--commanded', type=Path, metavar='FILE', help=text)
     add('--session', metavar='NAME', help='session of the table')
     add_moved(group)
     group = parser.add_argument_group('how to judge')
-    group.add_argument(
-        '--tolerance',
-        type=float,
-        metavar='MM',
-        help='wanted RMS position error; if not given, errors only, without a verdict',
-    )
-    group.add_argument(
-        '--confidence', type=float, default=0.95, metavar='SHARE', help='of the verdict'
+    wanted = 'wanted RMS position error; if not given, errors only, without a verdict'
+    add_each(
+        group,
+        float,
+        ('--tolerance', 'MM', None, wanted),
+        ('--confidence', 'SHARE', 0.95, 'of the verdict'),
     )
     add_out(group, 'the report and the residuals')
     add_history(group)

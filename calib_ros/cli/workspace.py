@@ -44,12 +44,8 @@ PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to map')
     add = group.add_argument
-    add(
-        'result',
-        type=Path,
-        metavar='RESULT',
-        help='folder of identify --out, or a calibrated chain file alone',
-    )
+    text = 'folder of identify --out, or a calibrated chain file alone'
+    add('result', type=Path, metavar='RESULT', help=text)
     add_chain(group)
     add_out(group, 'tables, words and figures', needed=True)
     add('--poses', type=int, default=20_000, metavar='N', help='random poses of the survey')

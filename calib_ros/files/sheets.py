@@ -59,19 +59,10 @@ class Sheet:
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
-    """Read a table.
+    """Read a table of which a layout is known.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    layout : Layout
-        What is known of it.
-    names : sequence of str
-        Columns by which the header is found: the first line that has all of them.
-    known : sequence of str
-        Where `names` holds none but numbers of columns: names by which to know a header.
-
+    The header is the first line that has all columns of some `names`; where these are numbers of
+    columns only, the first with some of the names `known`.
     """
     notes: list[str] = []
     if path.suffix.lower() in SHEETS:

@@ -32,14 +32,14 @@ from scipy import special
 
 from calib_ros.files.rows import Row
 from calib_ros.identification.changes import (
-    DOUBT,
     Columns,
     Explanation,
     Told,
     explanations,
+    likely,
     reason_in_words,
 )
-from calib_ros.identification.region import KNOWN
+from calib_ros.identification.levels import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -129,8 +129,7 @@ def watch(rows: Sequence[Row], years: float = YEARS) -> Watched:
         first, known_up_to = k + 1 - LAGS[lag], k + 1
         columns = Columns(alike[k].corrected(), data.names)
         found = explanations(data.told(tests, lag, k), columns, float(data.freedom[k]))
-        reasons = tuple(each for each in found if each.share > DOUBT) or found[:1]
-        changes.append(Change(alike[first].time, alike[k].time, reasons))
+        changes.append(Change(alike[first].time, alike[k].time, likely(found)))
     nights = tuple(
         Night(row, dict(zip(data.joints, values, strict=True)))
         for row, values in zip(alike, strengths.tolist(), strict=True)

@@ -37,7 +37,7 @@ import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from calib_ros.identification.leastsquares import Normal, System, normal_equations
+from calib_ros.identification.leastsquares import ROUNDS, Normal, System, normal_equations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -52,8 +52,6 @@ SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation)."""
 TAILS = 3.0
 """Degrees of freedom of the prior."""
-SURE = 2.0
-"""Standard deviations by which an offset that stands out is larger at first."""
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, whether they are fitted or not."""
 SHOWN, REFUTED = 1.35, 3.0
@@ -62,10 +60,9 @@ which those of usual size are refuted."""
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
 MOST = 2000
-"""Samples from which the sizes are told; of more, every so many are taken."""
+"""Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
-ROUNDS = 60
 LEAST = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
@@ -297,7 +294,7 @@ class _Evidence:
         if self._own.sum() == self._member.sum():
             free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
             mean, root = _solved(self._matrix, self._vector, free)
-            surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
+            surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt((root**2).sum(axis=1)), 0.0)
             self._lengthen(surely**2, 1.0, size)
         for _ in range(ROUNDS):
             weight = self._weight(size)

@@ -29,12 +29,13 @@ from calib_ros.identification.fitting import (
     parameter_rows,
 )
 from calib_ros.identification.leastsquares import Fit, System, minimise, normal_equations
+from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import distinct
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
-from calib_ros.identification.region import KNOWN, Region, region_of
+from calib_ros.identification.region import Region, region_of
 from calib_ros.identification.robust import MANY, OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import Step, find_step

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -38,6 +37,8 @@ MOST_ITERATIONS = 1000
 STALLED = 50
 """Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
 LEAST_FALL = 1e-3
+ROUNDS = 60
+"""Steps to a fixed point, which ends in far fewer unless it goes in circles."""
 DAMPED, UNDAMPED = 1e-6, 1e-12
 """Damping, of columns of unit length, with which it begins and below which it ends."""
 WELL_CONDITIONED = 1e9
@@ -198,33 +199,11 @@ def products_of(
 
     By position and by orientation, the residual last.
     """
-    size = len(names) + 1
     count = 1 if folds is None else 1 + max(int(each.max(initial=0)) for each in folds)
-    found = np.zeros((count, 2, size, size))
-    order = np.arange(size)
+    found = np.zeros((count, 2, len(names) + 1, len(names) + 1))
     for number, samples in enumerate(system.sets):
-        for which, shift, turn, model in samples.blocks(chain, names):
-            last = len(turn) - 1
-            ends = [shift.shape[2]]
-            if folds is not None:
-                here = folds[number][which]
-                sorting = np.argsort(here, kind='stable')
-                shift, turn = shift[..., sorting], turn[..., sorting] if last >= 0 else turn
-                ends = np.cumsum(np.bincount(here, minlength=count)).tolist()
-            for (by_position, by_orientation), (first, end) in zip(
-                found, pairwise([0, *ends]), strict=True
-            ):
-                rows = shift[..., first:end].reshape(size, -1)
-                by_position += rows @ rows.T
-                if last >= 0:
-                    rows = turn[..., first:end].reshape(last + 1, -1)
-                    products = rows @ rows.T
-                    by_orientation[:last, :last] += products[:-1, :-1]
-                    by_orientation[:last, -1] += products[:-1, -1]
-                    by_orientation[-1, -1] += products[-1, -1]
-            order[:-1] = model.order
-    found[:, 1, -1, :-1] = found[:, 1, :-1, -1]
-    return np.asarray(found[:, :, order[:, np.newaxis], order])
+        found += samples.products(chain, names, count, None if folds is None else folds[number])
+    return found
 
 
 def factor_of(chain: Chain, names: Sequence[str], system: System) -> FloatArray:

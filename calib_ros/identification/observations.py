@@ -36,7 +36,6 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     'points': (3,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
-TURN = 2.0 * np.pi
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
 SCATTER = 0.02
@@ -46,9 +45,11 @@ GAP = 5.0
 WIDEST = 2.0
 """Size of a configuration's visits in units of the longest step between them."""
 FEWEST = 8
-"""Configurations from which on their distances tell what a visit is, or who is near."""
-NEIGHBOURS = 8
-"""Nearest values among which visits are looked for."""
+"""Configurations from which on their distances tell what a visit is, or who is near; so many
+nearest ones are looked at."""
+
+POSES = 200
+"""Poses that stand for many: random ones for the joint range, even ones for those measured."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -198,7 +199,7 @@ class Observations(Shown):
             )
         return chosen
 
-    def spread(self, most: int) -> Observations:
+    def spread(self, most: int = POSES) -> Observations:
         """Return every so many pairs, at most so many."""
         step = 1 + len(self) // most
         return self if step == 1 else self.select(np.arange(0, len(self), step))
@@ -310,8 +311,8 @@ def stops(joints: FloatArray) -> NDArray[np.intp]:
 
 def _still(change: FloatArray) -> NDArray[np.bool_]:
     """Return (N,) which changes (N, n) of joint values are none; angles modulo a turn."""
-    change = np.abs(change) % TURN
-    return np.asarray(np.minimum(change, TURN - change).max(axis=1) <= STILL)
+    change = np.abs(change) % (2.0 * np.pi)
+    return np.asarray(np.minimum(change, 2.0 * np.pi - change).max(axis=1) <= STILL)
 
 
 def configurations(joints: FloatArray) -> NDArray[np.intp]:
@@ -356,7 +357,7 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
     if count < FEWEST or not len(_pairs(place, SCATTER)):
         return apart
     far, near = cKDTree(place).query(
-        place, k=range(2, 2 + min(NEIGHBOURS, count - 1)), distance_upper_bound=GAP * SCATTER
+        place, k=range(2, 2 + min(FEWEST, count - 1)), distance_upper_bound=GAP * SCATTER
     )
     first, which = np.nonzero(np.isfinite(far))
     graph = _graph(far[first, which], first, near[first, which], count)

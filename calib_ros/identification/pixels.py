@@ -7,9 +7,9 @@ their rows are
 
     [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
 
-and a triangular factor of [G | L | residual] has the same normal matrix as the rows themselves: 16
-rows an image at most, however many points it shows. Gross errors are told point by point, and
-image by image, by the sum over its points.
+and their products follow from those of [G | L | residual]: (16, 16) for an image at most, however
+many points it shows. Gross errors are told point by
+point, and image by image, by the sum over its points.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.samples import BLOCK, Block, Samples, seen_residuals
+from calib_ros.identification.resection import products_of
+from calib_ros.identification.samples import BLOCK, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import View, at_the_board, require_lens, view
+from calib_ros.kinematics.lens import View, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -37,18 +38,27 @@ class _Images:
     """Some images, linearised.
 
     `columns` (6 + K + 1, 2, C) are the weighted derivatives of all points by twist and lens, the
-    residual last; `owner` (C,) counts the image of each point from the block's first; `twist`
+    residual last; `begins` (b,) and `owner` (C,) tell the first point of each image and the image
+    of each point, both counted from the block's first; `twist`
     (P, 6, b) is what parameters do to the pose of each image; `lens` the rows of the K parameters
     of the lens among the P.
     """
 
     part: slice
+    begins: NDArray[np.intp]
     owner: NDArray[np.intp]
     columns: FloatArray
     twist: FloatArray
     lens: list[int]
     seen: View
     model: ErrorModel
+
+    def rows(self, columns: FloatArray, twist: FloatArray) -> FloatArray:
+        """Return rows (P + 1, 2, C) in the order of the names, by points or sums over images."""
+        found = np.empty((len(twist) + 1, *columns.shape[1:]))
+        np.einsum('psc,skc->pkc', twist, columns[:6], out=found[:-1])
+        found[self.lens], found[-1] = columns[6:-1], columns[-1]
+        return found[[*self.model.order, len(twist)]]
 
 
 class PixelSamples(Samples):
@@ -78,40 +88,53 @@ class PixelSamples(Samples):
         """Return the number of rows of a sample."""
         return 2
 
-    def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
-        """Yield rows (P + 1, R, images) with the normal matrix of all points, by blocks."""
+    def products(
+        self,
+        chain: Chain,
+        names: Sequence[str],
+        count: int = 1,
+        folds: NDArray[np.intp] | None = None,
+    ) -> FloatArray:
+        """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
+        size = len(names)
+        found = np.zeros((count, 2, size + 1, size + 1))
         for block in self._linearised(chain, names):
-            size, _, points = block.columns.shape
-            images = block.twist.shape[2]
-            first = np.flatnonzero(np.diff(block.owner, prepend=-1))
-            number = np.arange(points) - first[block.owner]
-            stacked = np.zeros((images, int(number.max()) + 1, 2, size))
-            stacked[block.owner, number] = block.columns.transpose(2, 1, 0)
-            factor = np.asarray(np.linalg.qr(stacked.reshape(images, -1, size), mode='r'))
-            rows = np.empty((len(block.twist) + 1, factor.shape[1], images))
-            arm = factor[:, :, :6] @ block.twist.transpose(2, 1, 0)
-            rows[:-1] = arm.transpose(2, 1, 0)
-            for k, row in enumerate(block.lens):
-                rows[row] = factor[:, :, 6 + k].T
-            rows[-1] = factor[:, :, -1].T
-            yield block.part.start + first, rows, np.zeros((0, 0, 0)), block.model
+            inner = products_of(block.columns, block.begins)
+            outer = (inner[:, :, :6] @ block.twist.transpose(2, 1, 0)).transpose(2, 1, 0)
+            own = np.array([*block.lens, size])
+            for k, (matrix, _) in enumerate(found):
+                here = slice(None)
+                if folds is not None:
+                    here = folds[block.part][block.begins] == k
+                twist = block.twist[:, :, here].reshape(size, -1)
+                matrix[:-1, :-1] += twist @ outer[:, :6, here].reshape(size, -1).T
+                mixed = outer[:, 6:, here].sum(axis=2)
+                matrix[:-1, own] += mixed
+                matrix[own, :-1] += mixed.T
+                matrix[own[:, np.newaxis], own] += inner[here, 6:, 6:].sum(axis=0)
+        order = [*block.model.order, size]
+        return found[:, :, np.array(order)[:, np.newaxis], order]
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the rows (P + 1, 2, C) of all points, a block at a time."""
         shifts = np.empty((self.count, 2, 3))
         for block in self._linearised(chain, names):
-            rows = np.empty((len(block.twist) + 1, *block.columns.shape[1:]))
-            twist = block.twist[:, :, block.owner]
-            np.einsum('psc,skc->pkc', twist, block.columns[:6], out=rows[:-1])
-            for k, row in enumerate(block.lens):
-                rows[row] = block.columns[6 + k]
-            rows[-1] = block.columns[-1]
             for k in range(2):
                 unit = np.zeros((2, len(block.owner)))
                 unit[k] = self.sigmas[0]
-                shifts[block.part, k] = at_the_board(block.seen, unit)
-            yield (rows[[*block.model.order, len(names)]],)
+                shifts[block.part, k] = block.seen.at_the_board(unit)
+            yield (block.rows(block.columns, block.twist[:, :, block.owner]),)
         self._shifts = shifts
+
+    def sums(
+        self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
+    ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
+        """Yield numbers (n,) of groups (N,) of images and the sums (P + 1, 2, n) of their rows."""
+        for block in self._linearised(chain, names):
+            index = groups[block.part][block.begins]
+            begins = np.flatnonzero(np.diff(index, prepend=-1))
+            rows = block.rows(np.add.reduceat(block.columns, block.begins, axis=2), block.twist)
+            yield index[begins], (np.add.reduceat(rows, begins, axis=2),)
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
         """Return what weighted residuals (rows,) are at the board, (N, 3) [m].
@@ -159,29 +182,22 @@ class PixelSamples(Samples):
             approach = None if self.approach is None else self.approach[:, images]
             moving = None if velocity is None else velocity[:, images]
             axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
+            begins = images - part.start
             owner = self._images[part] - self._images[part.start]
-            shape = (3, len(images))
-            seen = view(
-                lens,
-                [np.broadcast_to(axis, shape)[:, owner] for axis in axes],
-                np.broadcast_to(origin, shape)[:, owner],
-                self._points[:, part],
-                seen_by.on_flange,
-            )
-            columns = np.concatenate(
-                [
-                    seen.by_twist,
-                    lens.by_lens(seen.points, kinds),
-                    (self._pixels[:, part] - seen.pixels)[np.newaxis],
-                ]
-            )
-            columns /= self.sigmas[0]
-            if self.weights is not None:
-                columns *= self.weights[part]
+            seen = view(lens, axes, origin, owner, self._points[:, part], seen_by.on_flange)
+            columns = np.empty((7 + len(kinds), *seen.pixels.shape))
+            seen.by_twist(columns[:6])
+            lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
+            columns[-1] = self._pixels[:, part] - seen.pixels
+            columns *= (1.0 if self.weights is None else self.weights[part]) / self.sigmas[0]
             twist = np.zeros((len(names), 6, len(images)))
             twist[:, :3] = shift[:-1]
             twist[: model.rotations, 3:] = turn[:-1]
-            yield _Images(part, owner, columns, twist, [row[n] for n in own], seen, model)
+            if seen_by.on_flange:  # along the camera's axes, as it moves the other way
+                flat = twist.reshape(len(names), 2, 3, -1)
+                twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
+            rows = [row[name] for name in own]
+            yield _Images(part, begins, owner, columns, twist, rows, seen, model)
             first = last
 
 

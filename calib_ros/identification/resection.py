@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import InputError
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.lens import Lens, view
+from calib_ros.kinematics.lens import Lens, View, view
 from calib_ros.kinematics.se3 import FloatArray
 
 FLAT = 1e-3
@@ -77,11 +77,29 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
     """
     assert observations.points is not None
     index = observations.images
-    axes = [poses[index, :3, k].T for k in range(3)]
-    rows = view(lens, axes, poses[index, :3, 3].T, observations.points.T, False).by_twist
-    outer = np.einsum('pkc,rkc->cpr', rows, rows).reshape(-1, 36)
-    begins = np.flatnonzero(np.diff(index, prepend=-1))
-    return np.linalg.inv(np.add.reduceat(outer, begins).reshape(-1, 6, 6))
+    rows = np.empty((6, 2, len(index)))
+    _seen(lens, poses, index, observations.points.T).by_twist(rows)
+    return np.asarray(np.linalg.inv(products_of(rows, np.flatnonzero(np.diff(index, prepend=-1)))))
+
+
+def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatArray) -> View:
+    """Return what a camera sees of points (3, C) by the poses (M, 4, 4) of the board."""
+    axes, origin = poses[:, :3, :3].transpose(2, 1, 0), poses[:, :3, 3].T
+    return view(lens, axes, origin, index, points, False)
+
+
+def products_of(rows: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
+    """Return (M, S, S) the products of rows (S, 2, C) with each other, image by image."""
+    size, _, count = rows.shape
+    points = np.diff(begins, append=count)
+    most = int(points.max())
+    if len(points) * most == count:
+        full = rows.reshape(size, 2, len(points), most)
+    else:
+        full = np.zeros((size, 2, len(points), most))
+        full[:, :, np.arange(most) < points[:, np.newaxis]] = rows
+    parts = full.transpose(1, 2, 0, 3)
+    return np.asarray((parts @ parts.swapaxes(2, 3)).sum(axis=0))
 
 
 def resect(observations: Observations, lens: Lens) -> BoardPoses:
@@ -169,12 +187,12 @@ def _refined(
     best, least = poses.copy(), np.full(len(poses), np.inf)
     damping = np.full(len(poses), DAMPING)
     step_from = (np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6)))
+    rows = np.empty((7, 2, len(index)))
     for _ in range(STEPS):
-        axes = [poses[index, :3, k].T for k in range(3)]
-        seen = view(lens, axes, poses[index, :3, 3].T, points, False)
-        rows = np.concatenate([seen.by_twist, (pixels.T - seen.pixels)[np.newaxis]])
-        outer = np.einsum('pkc,rkc->cpr', rows, rows).reshape(-1, 49)
-        normal = np.add.reduceat(outer, begins).reshape(-1, 7, 7)
+        seen = _seen(lens, poses, index, points)
+        seen.by_twist(rows[:6])
+        rows[6] = pixels.T - seen.pixels
+        normal = products_of(rows, begins)
         better = normal[:, 6, 6] < least
         settled = least - normal[:, 6, 6] < SETTLED * least
         least = np.where(better, normal[:, 6, 6], least)

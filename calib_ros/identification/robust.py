@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import UnknownNameError
-from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, minimise
+from calib_ros.identification.leastsquares import ROUNDS, STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -44,9 +44,9 @@ OUTLIER = 6.0
 """Distance beyond which a sample is named as an outlier."""
 MANY = 20_000
 """Samples that tell which of them are gross errors, a sample in ten thousand aside."""
-REWEIGHTINGS = 40
 SUSPICIOUS = 1.2
-"""RMS residual [sigma] from which gross errors may hide in it."""
+"""Ratio of residuals to those expected from which gross errors, or errors that the samples of a
+configuration share, may hide in them."""
 SHRUNK = 0.5
 """Ratio of half of the residuals from which a fit is another one, not a detail of the first."""
 NOISE_FREE = 1e-6
@@ -110,7 +110,7 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
     if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # led away from a good start
         fit = replace(fit, chain=chain)
         distances = distances_of(chain, names, system)
-    for _ in range(REWEIGHTINGS):
+    for _ in range(ROUNDS):
         before = distances
         bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
         fit = minimise(fit.chain, names, bounded, iterations=2)
@@ -147,7 +147,7 @@ def reweighted(
     iterations = 0
     settled = False
     weights = [np.ones(0)] * len(system.sets)
-    for _ in range(REWEIGHTINGS):
+    for _ in range(ROUNDS):
         last, weights = weights, [weights_of(d, loss) for d in distances]
         settled = all(
             len(w) == len(b) and np.allclose(w, b, rtol=0, atol=1e-4)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.lens import at_the_board, require_lens, view
+from calib_ros.kinematics.lens import require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 
@@ -115,6 +116,54 @@ class Samples:
             if self.oriented:
                 turn /= self.sigmas[1]
             yield part, shift, turn if self.oriented else nothing, model
+
+    def products(
+        self,
+        chain: Chain,
+        names: Sequence[str],
+        count: int = 1,
+        folds: NDArray[np.intp] | None = None,
+    ) -> FloatArray:
+        """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
+        size = len(names) + 1
+        found = np.zeros((count, 2, size, size))
+        order = np.arange(size)
+        for which, shift, turn, model in self.blocks(chain, names):
+            last = len(turn) - 1
+            ends = [shift.shape[2]]
+            if folds is not None:
+                here = folds[which]
+                sorting = np.argsort(here, kind='stable')
+                shift, turn = shift[..., sorting], turn[..., sorting] if last >= 0 else turn
+                ends = np.cumsum(np.bincount(here, minlength=count)).tolist()
+            for (by_position, by_orientation), (first, end) in zip(
+                found, pairwise([0, *ends]), strict=True
+            ):
+                rows = shift[..., first:end].reshape(size, -1)
+                by_position += rows @ rows.T
+                if last >= 0:
+                    rows = turn[..., first:end].reshape(last + 1, -1)
+                    products = rows @ rows.T
+                    by_orientation[:last, :last] += products[:-1, :-1]
+                    by_orientation[:last, -1] += products[:-1, -1]
+                    by_orientation[-1, -1] += products[-1, -1]
+            order[:-1] = model.order
+        found[:, 1, -1, :-1] = found[:, 1, :-1, -1]
+        return np.asarray(found[:, :, order[:, np.newaxis], order])
+
+    def sums(
+        self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
+    ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
+        """Yield numbers (n,) of groups (N,) of successive samples and the sums of their rows.
+
+        They are (P + 1, c, n) by part, in blocks.
+        """
+        first = 0
+        for block in self.parts(chain, names):
+            index = groups[first : first + block[0].shape[2]]
+            first += len(index)
+            begins = np.flatnonzero(np.diff(index, prepend=-1))
+            yield index[begins], tuple(np.add.reduceat(part, begins, axis=2) for part in block)
 
     def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
         """Return joint values (n, N) at the device's delay, and velocities where it has one."""
@@ -252,18 +301,11 @@ def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray
     came = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
     axes, origin = chain.trace(chain.effective(q, came), base=then.base, tool=then.tool)
     pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
-    for start in range(0, len(then), BLOCK):
-        part = slice(start, start + BLOCK)
-        owner = then.images[part]
-        seen = view(
-            lens,
-            [axis[:, owner] for axis in axes],
-            origin[:, owner],
-            then.points[part].T,
-            then.on_flange,
-        )
+    for start in range(0, len(then), 4 * BLOCK):
+        part = slice(start, start + 4 * BLOCK)
+        seen = view(lens, axes, origin, then.images[part], then.points[part].T, then.on_flange)
         residual = then.pixels[part].T - seen.pixels
-        pixels[part], shifts[part] = residual.T, at_the_board(seen, residual)
+        pixels[part], shifts[part] = residual.T, seen.at_the_board(residual)
     return pixels, shifts
 
 

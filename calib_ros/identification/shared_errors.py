@@ -22,34 +22,30 @@ the parameters is then H^-1 (J^T V J) H^-1.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, special
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from calib_ros.identification.leastsquares import Fit, System
+from calib_ros.identification.levels import CERTAIN
 from calib_ros.identification.observations import FEWEST
-from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
-CONFIDENCE = 0.99
-"""Confidence of all tests together at which neighbours are said to share errors."""
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
 NEAREST = 3
 """Neighbours in joint space of each configuration that are tested."""
 MOST = 400
-"""Stops on which sizes are estimated; of more, every so many runs of RUN are taken."""
-RUN = 20
+"""Stops on which sizes are estimated; of more, every so many runs of a
+twentieth."""
 APART = 1e9
 """Distance of the stops of different sets, which are no neighbours."""
-ROUNDING = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +118,13 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     kinds = tuple(LENGTHS)
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // MOST))
-    few = _gather(fit.chain, names, system, share, RUN)
+    few = _gather(fit.chain, names, system, share, MOST // 20)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < FEWEST:
         return Shared(**correlations, found=(), middles={})
     extra, _ = system.extra_rows(fit.chain, names)
     forms = _Forms(few, extra)
-    limit = special.ndtri(1.0 - (1.0 - CONFIDENCE) / (len(kinds) * len(forms.parts)))
+    limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
     for kind in kinds:
         links = few.links(kind)
@@ -279,18 +275,6 @@ def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
 
 
-def _sums(
-    chain: Chain, names: Sequence[str], samples: Samples, numbers: NDArray[np.intp]
-) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
-    """Yield numbers (n,) of stops and the sums of their rows, (P + 1, c, n) by part, in blocks."""
-    first = 0
-    for block in samples.parts(chain, names):
-        index = numbers[first : first + block[0].shape[2]]
-        first += len(index)
-        begins = np.flatnonzero(np.diff(index, prepend=-1))
-        yield index[begins], tuple(np.add.reduceat(part, begins, axis=2) for part in block)
-
-
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:
     """Return the stops of all sets; of many, every `share`-th run of so many."""
     widths = (max(samples.width for samples in system.sets), 3)
@@ -306,7 +290,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
             continue
         few = samples.select(chosen)
         numbers = all_numbers[chosen]
-        pieces = list(_sums(chain, names, few, numbers))
+        pieces = list(few.sums(chain, names, numbers))
         index = np.concatenate([piece[0] for piece in pieces])
         again = np.flatnonzero(np.diff(index, prepend=-1))  # stops across the end of a block
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
@@ -358,7 +342,7 @@ def _successive(
     found = np.zeros((len(names), len(names)))
     for samples in system.sets:
         before = [np.zeros((len(names), samples.width if part == 0 else 3))] * len(kernels)
-        for _, sums in _sums(chain, names, samples, samples.observations.stops):
+        for _, sums in samples.sums(chain, names, samples.observations.stops):
             if part >= len(sums):
                 continue
             rows = sums[part][:-1]
@@ -367,7 +351,7 @@ def _successive(
                 decay = float(np.exp(-1.0 / length))
                 so_far = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
                 step = 1
-                while step < so_far.shape[2] and decay**step > ROUNDING**2:
+                while step < so_far.shape[2] and decay**step > ROUNDING:
                     so_far[..., step:] += decay**step * so_far[..., :-step]
                     step *= 2
                 before[k] = so_far[..., -1].copy()

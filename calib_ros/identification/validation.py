@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.leastsquares import System, minimise, without_each
+from calib_ros.identification.levels import CONFIDENT, KNOWN
 from calib_ros.identification.observations import Observations, distinct, numbered
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.region import KNOWN
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
@@ -24,8 +24,6 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame
 
-CONFIDENCE = 0.95
-"""One-sided confidence that a gain on held-out poses must have to be claimed."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 
@@ -227,7 +225,7 @@ def _cross_validate(
     )
     folds = _folds(problem, names, count, rows)
     if folds < 2:
-        return None, 'nothing: too few configurations to hold any out'
+        return None, 'nothing: too few configurations to leave any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     chains = zip(
@@ -366,7 +364,7 @@ def log_gain(
     before: FloatArray,
     after: FloatArray,
     configurations: NDArray[np.intp],
-    confidence: float = CONFIDENCE,
+    confidence: float = CONFIDENT,
 ) -> tuple[float, float]:
     """Return the logarithm of RMS before / RMS after, and how large chance could make it.
 

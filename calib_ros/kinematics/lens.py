@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.parameter import LENS_KINDS
@@ -63,53 +64,50 @@ class Lens:
 
         What is behind the camera is seen as at the side, so that a fit finds its way back.
         """
-        depth = np.maximum(points[2], NEAREST)
-        x, y = points[0] / depth, points[1] / depth
-        square = x * x + y * y
+        inverse = 1.0 / np.maximum(points[2], NEAREST)
+        x, y = points[0] * inverse, points[1] * inverse
+        across, along, both = x * x, y * y, x * y
+        square = across + along
         radial = 1.0 + square * (self.k1 + square * (self.k2 + square * self.k3))
-        slope = 2.0 * (self.k1 + square * (2.0 * self.k2 + square * 3.0 * self.k3))
-        both = x * y
-        pixels = np.stack(
-            [
-                x * radial + 2.0 * self.p1 * both + self.p2 * (square + 2.0 * x * x),
-                y * radial + self.p1 * (square + 2.0 * y * y) + 2.0 * self.p2 * both,
-            ]
+        slope = 2.0 * self.k1 + square * (4.0 * self.k2 + square * (6.0 * self.k3))
+        p1, p2 = 2.0 * self.p1, 2.0 * self.p2
+        mixed = both * slope + (p1 * x + p2 * y)
+        pixels = np.empty((2, len(x)))
+        by_point = np.empty((2, 3, len(x)))
+        pixels[0] = self.cx + self.fx * (
+            x * radial + p1 * both + self.p2 * (square + 2.0 * across)
         )
-        mixed = both * slope + 2.0 * (self.p1 * x + self.p2 * y)
-        by_plane = np.array(
-            [
-                [radial + x * x * slope + 2.0 * self.p1 * y + 6.0 * self.p2 * x, mixed],
-                [mixed, radial + y * y * slope + 6.0 * self.p1 * y + 2.0 * self.p2 * x],
-            ]
-        )
-        focal = np.array([self.fx, self.fy])[:, np.newaxis]
-        by_plane *= focal[:, np.newaxis] / depth
-        last = -(by_plane[:, 0] * x + by_plane[:, 1] * y)
-        by_point = np.concatenate([by_plane, last[:, np.newaxis]], axis=1)
-        return focal * pixels + np.array([[self.cx], [self.cy]]), by_point
+        pixels[1] = self.cy + self.fy * (y * radial + p2 * both + self.p1 * (square + 2.0 * along))
+        by_point[0, 0] = radial + across * slope + (p1 * y + 3.0 * p2 * x)
+        by_point[1, 1] = radial + along * slope + (3.0 * p1 * y + p2 * x)
+        by_point[0, 1] = by_point[1, 0] = mixed
+        by_point[0, :2] *= self.fx * inverse
+        by_point[1, :2] *= self.fy * inverse
+        by_point[:, 2] = -(by_point[:, 0] * x + by_point[:, 1] * y)
+        return pixels, by_point
 
-    def by_lens(self, points: FloatArray, kinds: Sequence[str]) -> FloatArray:
-        """Return the derivatives (K, 2, B) of pixels by parameters of the lens."""
-        depth = np.maximum(points[2], NEAREST)
-        x, y = points[0] / depth, points[1] / depth
+    def by_lens(
+        self, points: FloatArray, pixels: FloatArray, kinds: Sequence[str], out: FloatArray
+    ) -> None:
+        """Put the derivatives (K, 2, B) of the pixels of points by parameters of the lens."""
+        inverse = 1.0 / np.maximum(points[2], NEAREST)
+        x, y = points[0] * inverse, points[1] * inverse
         square = x * x + y * y
-        plain = self.moved({'fx': 1.0 - self.fx, 'fy': 1.0 - self.fy})
-        u, v = plain.moved({'cx': -self.cx, 'cy': -self.cy}).project(points)[0]
-        zero, one = np.zeros_like(x), np.ones_like(x)
         both = 2.0 * x * y
-        columns = {
-            'fx': (u, zero),
-            'fy': (zero, v),
-            'cx': (one, zero),
-            'cy': (zero, one),
-            'p1': (self.fx * both, self.fy * (square + 2.0 * y * y)),
-            'p2': (self.fx * (square + 2.0 * x * x), self.fy * both),
-        }
-        power = one
-        for kind in ('k1', 'k2', 'k3'):
-            power = power * square
-            columns[kind] = (self.fx * x * power, self.fy * y * power)
-        return np.array([columns[kind] for kind in kinds]).reshape(len(kinds), 2, len(x))
+        powers = {'k1': square, 'k2': square * square, 'k3': square * square * square}
+        for kind, (u, v) in zip(kinds, out, strict=True):
+            if kind in powers:
+                u[:], v[:] = self.fx * x * powers[kind], self.fy * y * powers[kind]
+            elif kind == 'p1':
+                u[:], v[:] = self.fx * both, self.fy * (square + 2.0 * y * y)
+            elif kind == 'p2':
+                u[:], v[:] = self.fx * (square + 2.0 * x * x), self.fy * both
+            elif kind == 'fx':
+                u[:], v[:] = (pixels[0] - self.cx) / self.fx, 0.0
+            elif kind == 'fy':
+                u[:], v[:] = 0.0, (pixels[1] - self.cy) / self.fy
+            else:
+                u[:], v[:] = kind == 'cx', kind == 'cy'
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Return (N, 2) the points at depth 1 of pixels (N, 2), by Newton steps."""
@@ -134,60 +132,82 @@ class View:
 
     Attributes
     ----------
-    points : (3, C)
-        In the camera's frame [m].
+    points, arm : (3, C)
+        In the camera's frame [m], from the camera and from what is at the chain's end.
     pixels : (2, C)
-    by_twist : (6, 2, C)
-        Derivative by the shift [m] and turn [rad] in the world of what is at the chain's end.
+    by_shift : (2, 3, C)
+        Derivative by a shift [m] of what is at the chain's end, along the camera's axes.
+    axes : (3, 3, C), optional
+        Those of a camera that is at the chain's end, in the world.
 
     """
 
     points: FloatArray
+    arm: FloatArray
     pixels: FloatArray
-    by_twist: FloatArray
+    by_shift: FloatArray
+    axes: FloatArray | None
+
+    def by_twist(self, out: FloatArray) -> None:
+        """Put the derivatives (6, 2, C) by shift [m] and turn [rad] along the camera's axes."""
+        out[:3] = self.by_shift.transpose(1, 0, 2)
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            np.multiply(self.arm[i], out[j], out=out[3 + k])
+            out[3 + k] -= self.arm[j] * out[i]
+
+    def at_the_board(self, residual: FloatArray) -> FloatArray:
+        """Return the shortest shifts (C, 3) [m] in the world that residuals (2, C) amount to."""
+        (first, second), (u, v) = self.by_shift, residual
+        square, mixed, other = [
+            (one * two).sum(axis=0)
+            for one, two in ((first, first), (first, second), (second, second))
+        ]
+        scale = 1.0 / (square * other - mixed * mixed)
+        shift = first * ((other * u - mixed * v) * scale) + second * (
+            (square * v - mixed * u) * scale
+        )
+        if self.axes is not None:
+            shift = np.einsum('kcn,kn->cn', self.axes, shift)
+        return np.asarray(shift.T)
 
 
 def view(
-    lens: Lens, axes: Sequence[FloatArray], origin: FloatArray, points: FloatArray, on_flange: bool
+    lens: Lens,
+    axes: FloatArray,
+    origin: FloatArray,
+    owner: NDArray[np.intp],
+    points: FloatArray,
+    on_flange: bool,
 ) -> View:
-    """Return what a camera sees of points (3, C) of a board.
+    """Return what a camera sees of points (3, C) of a board in some images.
 
     Parameters
     ----------
     lens : Lens
         Of the camera.
-    axes, origin : three (3, C), (3, C)
-        Of what is at the end of the chain, for each point: the board in a camera that is the
-        world, or with the camera `on_flange` the camera in a board that is the world.
+    axes, origin : (3, 3, M), (3, M)
+        Of what is at the end of the chain, for each image: the board in a camera that is the
+        world, or with the camera `on_flange` the camera in a board that is the world. The first
+        index counts the axes.
+    owner : (C,)
+        The image of each point.
     points : (3, C)
         In the frame of the board [m].
     on_flange : bool
         Where the camera is.
 
     """
+    placed = np.concatenate([axes.reshape(9, -1), origin]).take(owner, axis=1)
+    turned = placed[:9].reshape(3, 3, -1)
     if on_flange:
-        arm = points - origin
-        inside = np.stack([(axis * arm).sum(axis=0) for axis in axes])
+        inside = np.einsum('kcn,cn->kn', turned, points - placed[9:])
         pixels, by_point = lens.project(inside)
-        along = -np.einsum('skc,kwc->swc', by_point, np.stack(axes))
-    else:
-        arm = axes[0] * points[0] + axes[1] * points[1] + axes[2] * points[2]
-        inside = arm + origin
-        pixels, along = lens.project(inside)
-    by_twist = np.empty((6, *pixels.shape))
-    by_twist[:3] = along.transpose(1, 0, 2)
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        by_twist[3 + k] = arm[i] * along[:, j] - arm[j] * along[:, i]
-    return View(inside, pixels, by_twist)
-
-
-def at_the_board(seen: View, residual: FloatArray) -> FloatArray:
-    """Return the shortest shifts (C, 3) [m] of points that pixel residuals (2, C) amount to."""
-    along = seen.by_twist[:3].transpose(2, 1, 0)  # (C, 2, 3)
-    square = along @ along.transpose(0, 2, 1)
-    weights = np.linalg.solve(square, residual.T[..., np.newaxis])
-    return np.asarray((along.transpose(0, 2, 1) @ weights)[..., 0])
+        return View(inside, inside, pixels, -by_point, turned)
+    arm = np.einsum('kcn,kn->cn', turned, points)
+    inside = arm + placed[9:]
+    pixels, by_point = lens.project(inside)
+    return View(inside, arm, pixels, by_point, None)
 
 
 def require_lens(lens: Lens | None, camera: str) -> Lens:

@@ -53,8 +53,7 @@ def workspace_report(
         ),
         identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 
@@ -159,8 +158,7 @@ def plan_report(
         steps=steps,
         identity=identity_of(chain, origin),
         sections=tuple(sections),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 

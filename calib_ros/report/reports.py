@@ -11,9 +11,9 @@ import numpy as np
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
-from calib_ros.identification.validation import CONFIDENCE
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
 from calib_ros.report.advice import SPREAD, advice
@@ -48,7 +48,7 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
-    limits = limits_of(judged, 1, CONFIDENCE)
+    limits = limits_of(judged, 1, CONFIDENT)
     accuracy = [
         row
         for label, which in (('fitted', result.fitted), ('not fitted', result.validation))
@@ -84,8 +84,7 @@ def identification_report(
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 

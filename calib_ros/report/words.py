@@ -249,15 +249,20 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 
 def noise_in_words(result: Identification) -> str:
     """Return how large the residuals are against the sigmas given."""
-    noise = result.noise
-    text = f'residuals are {noise.position:.2f} times the sigma of position'
+    return f'{scatter_in_words(result.noise)}; {neighbours_in_words(result.noise)}'
+
+
+def scatter_in_words(noise: Noise) -> str:
+    """Return how much more is left than the device should leave."""
+    text = f'what is left is {noise.position:.2f} times the stated noise in position'
     if noise.orientation is not None:
-        text += f' and {noise.orientation:.2f} times that of orientation'
+        text += f' and {noise.orientation:.2f} times in orientation'
     if noise.consistent:
-        text += ', consistent with the sigmas given (chi-squared test)'
-    else:
-        text += '; the sigmas given are wrong, standard deviations follow the residuals'
-    return f'{text}; {neighbours_in_words(noise)}'
+        return f'{text}, consistent with it (chi-squared test)'
+    return (
+        f'{text}: the measurements are not what --sigma-position and --sigma-orientation say; '
+        'intervals follow what is left'
+    )
 
 
 NEIGHBOURS = {
@@ -283,9 +288,8 @@ def chance_in_words(result: Identification) -> list[str]:
     if result.chance is None:
         return []
     return [
-        'time-shifted residuals are explained just as well in '
-        f'{100.0 * result.chance:.1f} % of cases: the chance that the improvement is only tracker '
-        'drift'
+        'chance that the improvement is only tracker drift: '
+        f'{100.0 * result.chance:.1f} % (time-shifted residuals that are explained just as well)'
     ]
 
 

@@ -70,13 +70,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     """Declare all parameters of the node; return what they were set to, and the names that were.
 
     The node was told to declare what is set by itself, for rclpy tells no other way what that is.
-    Each is declared anew here, with what it is for.
-
-    Raises
-    ------
-    ConfigError
-        When a value cannot be, or a parameter was set that does not exist.
-
+    Each is declared anew here, with what it is for. A value that cannot be is a ConfigError.
     """
     overrides = {
         name: each.value

@@ -92,14 +92,7 @@ class Estimate:
 
 
 class LiveEstimate:
-    """An information filter over the parameters of a problem, as its samples come.
-
-    Parameters
-    ----------
-    problem_of : callable
-        Makes a problem of samples, as the identification will.
-
-    """
+    """An information filter over the parameters of the problem that samples make."""
 
     def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
         self._problem_of = problem_of

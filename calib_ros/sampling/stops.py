@@ -53,17 +53,9 @@ class Means:
 
 
 def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -> Means:
-    """Average measurements stop by stop, in the order of their stamps.
+    """Average positions (N, 3) or distances (N, 1) [m] stop by stop, in the order of their stamps.
 
-    Parameters
-    ----------
-    values : (N, 3) or (N, 1)
-        Positions or distances [m].
-    begins : (S,) int
-        Where the measurements of each stop begin.
-    sigmas : (S,)
-        Standard deviations [m] of one coordinate that are expected.
-
+    The stops begin at `begins` (S,); `sigmas` (S,) [m] are those of one coordinate expected.
     """
     used, limits = np.ones(len(values), dtype=bool), np.full(len(begins), np.inf)
     rests = np.ones(len(begins), dtype=bool)

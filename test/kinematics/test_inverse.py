@@ -4,24 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-from calib_ros.kinematics.inverse import TOLERANCE, solve
+from calib_ros.kinematics.inverse import TOLERANCE, limits, solve, solve_positive
 from calib_ros.kinematics.se3 import log_rotation
-
-
-def limits(chain):
-    return np.array(
-        [
-            (
-                -np.inf if joint.lower is None else joint.lower,
-                np.inf if joint.upper is None else joint.upper,
-            )
-            for joint in chain.joints
-        ]
-    ).T
 
 
 @pytest.mark.parametrize('robot', sorted(shipped_robots()))
@@ -125,3 +115,16 @@ def test_each_pose_is_solved_as_if_alone(rng):
         assert alone.converged[0] == together.converged[k]
         if alone.converged[0]:
             np.testing.assert_allclose(alone.joints[0], together.joints[k], atol=1e-6)
+
+
+@given(st.integers(1, 8), st.integers(0, 1000))
+def test_elimination_solves(size, seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(size, size, 4))
+    matrix = np.einsum('ikb,jkb->ijb', root, root) + 0.1 * np.eye(size)[:, :, None]
+    right = rng.normal(size=(size, 4))
+    before = matrix.copy(), right.copy()
+    expected = [np.linalg.solve(matrix[..., k], right[:, k]) for k in range(4)]
+    np.testing.assert_allclose(solve_positive(matrix, right).T, expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_array_equal(matrix, before[0])
+    np.testing.assert_array_equal(right, before[1])

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 from urdfs import (
     CONVENTIONS,
     EXACT,
@@ -26,7 +24,6 @@ from urdfs import (
     by_kinpy,
     ends,
     numbers,
-    place,
     poses_of,
     random_arm,
     random_offsets,
@@ -48,7 +45,7 @@ from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=30)
+@settings(max_examples=12)
 @given(seed=SEEDS)
 def test_any_serial_arm_moves_as_its_urdf(convention, seed):
     rng = np.random.default_rng(seed)
@@ -113,7 +110,7 @@ def test_iiwa_has_the_dimensions_of_the_shipped_table():
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@pytest.mark.parametrize('tilt', [1e-12, 1e-9, 1e-6, 1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize('tilt', [1e-12, 1e-6, 1e-3, 1e-2])
 def test_a_calibrated_ur_has_no_absurd_lengths(convention, tilt, rng):
     origins = [
         (xyz + rng.normal(scale=min(tilt, 1e-3), size=3), rpy + rng.normal(scale=tilt, size=3))
@@ -258,16 +255,8 @@ REFUSED = {
         {},
         'run "xacro FILE > robot.urdf" first',
     ),
-    'formula': (
-        edited(UR10E, '-0.6127', '${a}'),
-        {},
-        '"elbow_joint" is a formula',
-    ),
-    'two numbers': (
-        edited(UR10E, '-0.6127 0.0', '0'),
-        {},
-        '3 finite numbers, not "0 0.0"',
-    ),
+    'formula': (edited(UR10E, '-0.6127', '${a}'), {}, '"elbow_joint" is a formula'),
+    'two numbers': (edited(UR10E, '-0.6127 0.0', '0'), {}, '3 finite numbers, not "0 0.0"'),
     'no number': (edited(UR10E, '-0.6127', 'nan'), {}, 'xyz in the origin of joint "elbow_joint"'),
     'no axis': (
         edited(SCARA, '<axis xyz="0.0 0.0 -1.0"/>', '<axis xyz="0 0 0"/>'),
@@ -295,16 +284,8 @@ REFUSED = {
         'joint "elbow_joint" mimics another',
     ),
     'finger': (PANDA, {'tip_link': 'panda_rightfinger'}, '"panda_finger_joint2" mimics another'),
-    'limits': (
-        edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'),
-        {},
-        'limits of joint "elbow',
-    ),
-    'unknown child': (
-        edited(UR10E, '<link name="tool0"/>', ''),
-        {},
-        'link at joint "flange',
-    ),
+    'limits': (edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'), {}, 'limits of joint "elbow'),
+    'unknown child': (edited(UR10E, '<link name="tool0"/>', ''), {}, 'link at joint "flange'),
     'two joints': (edited(SCARA, '"lift"', '"wrist"'), {}, 'two joints are named "wrist"'),
     'two links': (
         edited(SCARA, '<link name="hand"/>', '<link name="hand"/>' * 2),
@@ -360,7 +341,7 @@ def stripped(text):
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(seed=SEEDS)
 def test_a_corrected_urdf_moves_as_the_corrected_arm(convention, seed):
     rng = np.random.default_rng(seed)
@@ -553,33 +534,16 @@ def test_from_urdf_to_corrected_urdf(convention, text, noise, largest, tmp_path,
     assert result.accepted
     corrected = corrected_urdf(text, result.chain)
     unseen = truth.random_joints(200, rng)
-    error = aligned_error(poses_of(corrected, truth, unseen), truth.forward(unseen))
-    before = aligned_error(poses_of(text, truth, unseen), truth.forward(unseen))
-    assert error < largest
-    assert before > 1e-3
 
+    def missed(file, arm):
+        """Return the RMS error [m] in the frames of an arm, which the URDF does not hold."""
+        bare = np.linalg.inv(nominal.base.matrix) @ poses_of(file, truth, unseen)
+        there = arm.base.matrix @ bare @ np.linalg.inv(nominal.tool.matrix) @ arm.tool.matrix
+        away = (there - truth.forward(unseen))[:, :3, 3]
+        return np.sqrt((away**2).sum(axis=1).mean())
 
-def aligned_error(found, expected):
-    """Return the RMS distance [m] after the best rigid base and tool, fitted to half the poses."""
-
-    def aligned(poses, x):
-        base = place(x[:3], Rotation.from_rotvec(x[3:6]))
-        tool = place(x[6:9], Rotation.from_rotvec(x[9:]))
-        return start @ base @ poses @ tool @ end
-
-    # of the poses relative to their first one both rotations follow (Park and Martin 1994)
-    turns = [np.swapaxes(p[:1, :3, :3], 1, 2) @ p[1:, :3, :3] for p in (found, expected)]
-    vectors = [Rotation.from_matrix(each).as_rotvec() for each in turns]
-    end = place(np.zeros(3), Rotation.align_vectors(vectors[0], vectors[1])[0])
-    start = expected[0] @ np.linalg.inv(found[0] @ end)
-    half = len(found) // 2
-
-    def residuals(x):
-        return (aligned(found[:half], x) - expected[:half])[:, :3].ravel()
-
-    x = least_squares(residuals, np.zeros(12), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    difference = (aligned(found[half:], x) - expected[half:])[:, :3, 3]
-    return float(np.sqrt((difference**2).sum(axis=1).mean()))
+    assert missed(corrected, result.chain) < largest
+    assert missed(text, result.before) > 1e-3
 
 
 # ---- as a chain

@@ -496,7 +496,7 @@ def test_the_status_names_a_sample_that_does_not_fit():
     made = session(given[:45])
     assert 'does not fit' not in made.status()
     made.samples.append(replace(given[45], position=given[45].position + 0.01))
-    assert 'sample 46 does not fit to the others' in made.status()
+    assert 'sample 46 does not fit the others' in made.status()
     made.remove_last()
     assert 'does not fit' not in made.status()
 
