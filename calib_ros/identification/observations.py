@@ -174,8 +174,8 @@ class Observations(Shown):
         heights = np.zeros(len(joints))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
-    def select(self, mask: NDArray[np.generic]) -> Observations:
-        """Return the pairs chosen by a mask or by indices; they have been checked."""
+    def select(self, mask: NDArray[np.generic] | slice) -> Observations:
+        """Return the pairs chosen by a mask, by indices or a slice; they have been checked."""
         chosen = object.__new__(Observations)
         vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
         vars(chosen).update({name: array[mask] for name, array in self._arrays().items()})
