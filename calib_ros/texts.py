@@ -21,7 +21,7 @@ from calib_ros.values import LONGEST_NAME
 
 LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""
-LARGEST_TABLE = 100_000_000
+LARGEST_TABLE = 10 * LARGEST_TEXT
 """Bytes of a table."""
 MOST_ROWS = LARGEST_TABLE // 500
 """Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""

@@ -26,7 +26,7 @@ from scipy import linalg
 
 from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.identification.observations import STILL
+from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import FloatArray
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']

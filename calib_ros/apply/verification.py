@@ -34,10 +34,11 @@ from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.configurations import configurations
 from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
-from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
