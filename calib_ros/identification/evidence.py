@@ -197,10 +197,9 @@ def posterior_of(
     arm = np.s_[: len(every)]
     mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
     solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
-    doubted = [(w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved]
-    own, sizes = offsets[arm], evidence.named(size)
-    square = root @ root.T
-    return Posterior(chain, every, own, mean - own, square, priors, sizes, tuple(doubted))
+    doubted = tuple((w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved)
+    shift, sizes = mean - offsets[arm], evidence.named(size)
+    return Posterior(chain, every, offsets[arm], shift, root @ root.T, priors, sizes, doubted)
 
 
 def _lengths(chain: Chain, system: System) -> dict[str, float]:

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from calib_ros.identification.configurations import STILL, stops
 from calib_ros.identification.drift import chance
 from calib_ros.identification.levels import CERTAIN, SURE
-from calib_ros.identification.observations import STILL, stops
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.kinematics.se3 import FloatArray

@@ -33,6 +33,7 @@ from calib_ros.identification.changes import (
     reasons_document,
     reasons_of,
 )
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.leastsquares import (
     System,
@@ -41,7 +42,7 @@ from calib_ros.identification.leastsquares import (
     products_of,
 )
 from calib_ros.identification.levels import chance_of
-from calib_ros.identification.observations import Observations, distinct, numbered
+from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document

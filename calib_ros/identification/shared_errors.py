@@ -31,9 +31,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from calib_ros.identification.configurations import FEWEST
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import CERTAIN
-from calib_ros.identification.observations import FEWEST
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 

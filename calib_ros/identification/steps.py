@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from calib_ros.identification.configurations import stops
 from calib_ros.identification.drift import SINGULAR, inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
 from calib_ros.identification.levels import SURE
-from calib_ros.identification.observations import stops
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import NOISE_FREE, Robust, weights_of

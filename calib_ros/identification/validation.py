@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.leastsquares import System, minimise, without_each
 from calib_ros.identification.levels import CONFIDENT, KNOWN
-from calib_ros.identification.observations import Observations, distinct, numbered
+from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
@@ -250,10 +251,15 @@ def left_out(
 
     `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
     """
+    ordered = [
+        each.select(np.argsort(numbers, kind='stable'))
+        for each, numbers in zip(sets, folds, strict=True)
+    ]
     pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
     for k, pair in enumerate(chains):
-        for each, numbers in zip(sets, folds, strict=True):
-            out = each.select(np.flatnonzero(numbers == k))
+        for each, numbers in zip(ordered, folds, strict=True):
+            first = np.count_nonzero(numbers < k)
+            out = each.select(slice(first, first + np.count_nonzero(numbers == k)))
             for side, chain in zip(pieces, pair, strict=True):
                 side.append(residuals(chain, out))
     index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))

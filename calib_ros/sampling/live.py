@@ -29,9 +29,10 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.errors import CalibrationError
+from calib_ros.identification.configurations import configurations
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import Prior, System, normal_equations
-from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
