@@ -24,8 +24,6 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
 
-CENTRES = 500
-"""Reachable poses about which a cube is grown."""
 FIRST_EDGE, GROWTHS = 0.02, 1.3**0.5 ** np.arange(5)
 """Edge [m] of the first cube, and by how much it grows at a time, finer and finer."""
 CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -56,9 +54,14 @@ class _Cubes(NamedTuple):
 
 
 def iso_9283_poses(
-    design: Design, rng: np.random.Generator, visibility: Visibility | None = None
+    design: Design,
+    rng: np.random.Generator,
+    visibility: Visibility | None = None,
+    centres: int = 500,
 ) -> TestPoses:
     """Return the test poses in the largest cube that the arm reaches, and the device sees.
+
+    Cubes are grown about so many reachable centres.
 
     Raises
     ------
@@ -67,7 +70,7 @@ def iso_9283_poses(
         target is not seen.
 
     """
-    middle = draw_candidates(design, CENTRES, rng, visibility)
+    middle = draw_candidates(design, centres, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)
     edge = FIRST_EDGE
     cubes = _at(design, visibility, _Cubes(design.targets(middle), middle, start), edge)

@@ -31,8 +31,6 @@ STARTS = 6
 """Configurations from which the first pose of a task is solved."""
 KNOWN_POSES = 20_000
 """Random configurations among which they are looked for."""
-REFINEMENTS = 4
-"""Times that the grid is halved about the best placement."""
 
 
 def task_of(poses: FloatArray) -> FloatArray:
@@ -77,6 +75,7 @@ def place(
     region: FloatArray | None = None,
     cells: int = 9,
     turns: int = 1,
+    refinements: int = 4,
 ) -> Placements:
     """Find the placement of a task with the least expected error.
 
@@ -93,10 +92,10 @@ def place(
     region : (2, 3), optional
         Lower and upper corner [m], in the base frame, for the origin of the task's frame; all
         that the arm reaches if None.
-    cells : int
-        Points of the grid along each axis.
-    turns : int
-        Turns about the vertical to try, evenly spread.
+    cells, turns : int
+        Points of the grid along each axis, and turns about the vertical, evenly spread.
+    refinements : int
+        Times that the grid is halved about the best placement.
 
     Raises
     ------
@@ -119,14 +118,12 @@ def place(
     away = np.linalg.norm(grid[:, :3] - grid[reached, :3].mean(axis=0), axis=1)
     centre = int(np.where(reached, away, np.inf).argmin())
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
-    for _ in range(REFINEMENTS):
+    for _ in range(refinements):
         step = 0.5 * step
         near = _around(grid[np.nanargmin(errors)], step, corners)
         more = search.errors(near)
-        grid, errors, joints = (
-            np.concatenate(both)
-            for both in zip((grid, errors, joints), (near, *more), strict=True)
-        )
+        both = zip((grid, errors, joints), (near, *more), strict=True)
+        grid, errors, joints = map(np.concatenate, both)
     best = int(np.nanargmin(errors))
     return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
 

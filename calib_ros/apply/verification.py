@@ -48,9 +48,9 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
-LEAST = 5
+NEEDED = 5
 """Configurations from which a verdict is given, those of a fitted frame not counted."""
-MOST = 10_000
+DECIDING = 10_000
 """Configurations up to which it is said how many would decide."""
 LOST = {'base': 2, 'tool': 1}
 """Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
@@ -61,7 +61,7 @@ UNIT = (1e-3, 1e-3)
 """Sigmas [m, rad] that weigh all samples alike."""
 LISTED = 20
 """Configurations up to which each is told of."""
-MOVED = 0.3
+ONE_MOTION = 0.3
 """Share of the error that is left without one common motion, below which that is suspected."""
 
 
@@ -104,7 +104,7 @@ class Verification(Shown):
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
-        even MOST would not.
+        even DECIDING would not.
     common : float
         Share of the RMS error that is left without one common shift and turn of all positions.
     by_program : bool
@@ -193,7 +193,7 @@ def verify(
     moments = moments_of(comparison.after.position, group)
     lost = sum(LOST[frame] for frame in fitted)
     rms = _rms(moments, lost)
-    numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
+    numbers = np.unique(np.geomspace(len(moments), DECIDING, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     verdict = _decided(tolerance, lower, upper, numbers)
@@ -223,7 +223,7 @@ def _compared(
     return replace(compare(before, after, sets), after=reached), shaped.position
 
 
-def _rms(moments: FloatArray, lost: int, least: int = LEAST) -> float:
+def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     """Return the RMS error [m] of configurations, some of which fitted frames took up."""
     count = len(moments)
     if count - lost < least:
@@ -373,14 +373,14 @@ def remarks(found: Verification) -> list[str]:
             'with the program as it was before (--commanded)'
         )
     if found.verdict == 'UNDECIDED':
-        enough = f'about {found.needed}' if found.needed else f'not even {MOST}'
+        enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} configurations with the same RMS error would decide')
     if found.tolerance is None and found.holds is False:
         lines.append(
             'the calibration does not hold any more: the error is larger than it was then. Was '
             'the tracker, the target or the robot moved?'
         )
-    if found.common < MOVED:
+    if found.common < ONE_MOTION:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
             'the error would be left: was the measuring device moved? If it stands elsewhere on '

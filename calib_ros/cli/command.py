@@ -7,15 +7,13 @@ from __future__ import annotations
 import argparse
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from calib_ros.cli.screen import Screen
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """What a command does: `add` its options to a parser, `run` it and return the exit status.
 
     `examples` are whole commands for the foot of its help, without "calib_ros".

@@ -8,7 +8,7 @@ import argparse
 import json
 from collections.abc import Callable
 
-from calib_ros.cli.options import NOT_ACCEPTED, add_moved, at_least, results
+from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import load_calibration
@@ -25,12 +25,12 @@ def add_previous(parser: argparse.ArgumentParser) -> None:
     add('--previous', metavar='CALIBRATION', help=text)
     text = 'by which lengths wander in a year; angles by twice as many mrad'
     add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
-    add_moved(group)
+    common.add_moved(group)
 
 
 def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], screen: Screen) -> int:
     """Bring the earlier calibration up to date; return the exit status."""
-    with results(options, FILES) as contents:
+    with common.results(options, FILES) as contents:
         found = _found(options, loaded(), screen)
         contents['result.json'] = _document(found)
         if found.accepted:
@@ -39,11 +39,11 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
         screen.data(_document(found))
     else:
         screen.title(found.in_words(), found.accepted)
-    return 0 if found.accepted else NOT_ACCEPTED
+    return 0 if found.accepted else common.NOT_ACCEPTED
 
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
-    at_least(options, growth=0)
+    common.at_least(options, growth=0)
     previous = load_calibration(options.previous, loaded.problem.chain)
     for warning in loaded.warnings:
         screen.warn(warning)

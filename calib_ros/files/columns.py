@@ -71,12 +71,10 @@ class Columns:
         """
         found = self.numbers(names) if values is None else values
         nothing = np.isnan(found)
-        lacking = nothing.any(axis=1)
-        if lacking.any():
-            lacking &= needed | ~nothing.all(axis=1)
-        if lacking.any():
-            row = int(lacking.argmax())
-            cell_number('', self.where(row, names[int(nothing[row].argmax())]))
+        if nothing.any():
+            lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
+            for row in np.flatnonzero(lacking)[:1].tolist():
+                cell_number('', self.where(row, names[int(nothing[row].argmax())]))
         if max(-np.nanmin(found, initial=0.0), np.nanmax(found, initial=0.0)) > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
             cell_number(repr(found[row, k]), self.where(row, names[k]), largest)

@@ -83,21 +83,24 @@ class TextColumns(Columns):
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
         columns = [self.header.index(name) for name in names]
         blank = self._empty[:, columns]
-        some = np.flatnonzero(~blank.all(axis=0))
-        found = np.full(blank.shape, np.nan)
+        lacking = blank.any(axis=0)
+        some = np.flatnonzero(~(lacking & blank.all(axis=0)))
         if not len(some):
-            return found
-        rows = self._filled if blank[:, some].any() else self._rows
+            return np.full(blank.shape, np.nan)
+        rows = self._filled if lacking[some].any() else self._rows
         use = [columns[k] for k in some.tolist()]
         try:
             read = np.loadtxt(rows, delimiter=self._separator, usecols=use, ndmin=2, comments=None)
         except (ValueError, OverflowError):
             return None
+        finite = np.isfinite(read)
+        if not (finite.all() or (finite | blank[:, some]).all()):
+            return None
         if len(some) == len(names):
-            found = read
-        else:
-            found[:, some] = read
-        return found if (np.isfinite(found) | blank).all() else None
+            return read
+        found = np.full(blank.shape, np.nan)
+        found[:, some] = read
+        return found
 
     @cached_property
     def _empty(self) -> NDArray[np.bool_]:
@@ -159,23 +162,29 @@ def regular(
         return None
     if not text.endswith('\n'):
         text += '\n'
-    lines = above + 1 + np.arange(text.count('\n'))
-    if text.startswith('\n') or '\n\n' in text:  # blank lines
-        rows = text.split('\n')[:-1]
+    rows = text.split('\n')[:-1]
+    lines = above + 1 + np.arange(len(rows))
+    if '' in rows:
         lines = lines[[bool(row) for row in rows]]
-        text = '\n'.join([*filter(None, rows), ''])
+        rows = [row for row in rows if row]
+        text = '\n'.join([*rows, ''])
+    flat = np.frombuffer(text.encode(), dtype=np.uint8)
     if not header:
-        first, _, text = text.partition('\n')
-        header, lines = first.split(separator), lines[1:]
+        if not rows:
+            return None
+        flat = flat[len(rows[0].encode()) + 1 :]
+        header, rows, lines = rows[0].split(separator), rows[1:], lines[1:]
     width = len(header)
     if not len(lines) or len(set(header)) < width or width > MOST_ENTRIES:
         return None
-    flat = np.frombuffer(text.encode(), dtype=np.uint8)
-    ends = np.flatnonzero((flat == ord(separator)) | (flat == ord('\n'))).astype(np.int32)
-    if len(ends) != width * len(lines) or not (flat[ends[width - 1 :: width]] == ord('\n')).all():
+    cut = flat == ord(separator)
+    cut |= flat == ord('\n')
+    ends = np.empty(np.count_nonzero(cut) + 1, dtype=np.int32)
+    if len(ends) != width * len(lines) + 1:
         return None
-    ends = np.concatenate([np.array([-1], dtype=np.int32), ends])
-    rows = text[:-1].split('\n')
+    ends[0], ends[1:] = -1, np.flatnonzero(cut)
+    if not (flat[ends[width::width]] == ord('\n')).all():
+        return None
     return TextColumns(path, tuple(header), lines, rows, separator, flat, ends)
 
 

@@ -51,17 +51,10 @@ YEARS = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """An arm that is another one than before.
+    """An arm that is another one than before, from the first night at `time` on.
 
-    Attributes
-    ----------
-    time : datetime
-        Of the first night after it.
-    seen : datetime
-        Of the night in which it was found.
-    reasons : tuple of Explanation
-        What may have changed, the likeliest first: they cannot be told apart.
-
+    It was found in the night `seen`. `reasons` are what may have changed, the likeliest first:
+    they cannot be told apart.
     """
 
     time: datetime

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import special
@@ -69,8 +69,11 @@ LEAST_SIZE = 1e-3
 
 def group_of(chain: Chain, name: str) -> str | None:
     """Return the group of parameters whose errors are of one size; None for frames."""
-    if chain.owns_frame(name):
-        return None
+    return None if chain.owns_frame(name) else _group(name)
+
+
+@lru_cache(maxsize=1024)
+def _group(name: str) -> str:
     if Parameter(name).of_dh:
         return 'length' if Parameter(name).is_length else 'angle'
     group = effects.group_of(name)
@@ -147,6 +150,7 @@ def posterior_of(
     more: Sequence[str] = (),
     doubts: Mapping[str, float] | None = None,
     at_the_fit: Normal | None = None,
+    judging: bool = True,
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
@@ -168,6 +172,8 @@ def posterior_of(
         Parameters that something else than the arm moves as well, with its standard deviation.
     at_the_fit : Normal
         The last normal equations of the fit, if they are known.
+    judging : bool
+        Whether a region is asked for, else nothing is `doubted`.
 
     """
     chain = chain.with_effects(more)
@@ -184,16 +190,16 @@ def posterior_of(
     groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
-    size, near = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    near = evidence.near(size, slope) if judging else ()
     stds = evidence.stds(size)
     priors = {name: std for name, std in zip(every, stds.tolist(), strict=False) if std < np.inf}
     arm = np.s_[: len(every)]
     mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
     solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
-    doubted = [(w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved]
-    own, sizes = offsets[arm], evidence.named(size)
-    square = root @ root.T
-    return Posterior(chain, every, own, mean - own, square, priors, sizes, tuple(doubted))
+    doubted = tuple((w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved)
+    shift, sizes = mean - offsets[arm], evidence.named(size)
+    return Posterior(chain, every, offsets[arm], shift, root @ root.T, priors, sizes, doubted)
 
 
 def _lengths(chain: Chain, system: System) -> dict[str, float]:
@@ -277,10 +283,8 @@ class _Evidence:
         self._own = np.array([group in ('length', 'angle') for group in groups])
         self._tails = np.ones(len(groups))
 
-    def told(
-        self, considered: set[str | None]
-    ) -> tuple[FloatArray, list[tuple[float, FloatArray]]]:
-        """Return the logarithm of the size of each group (G,), and others near by with weights.
+    def told(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
+        """Return the logarithm of the size of each group (G,), and the curvature (G,) there.
 
         Effects that are only considered are of no size where the data would show the usual ones,
         and do not show any.
@@ -309,9 +313,9 @@ class _Evidence:
                 here, without, usual = self._of(tried).tolist()
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
-        return size, self._near(size, 2.0 * np.maximum(told, 0.0) + width)
+        return size, 2.0 * np.maximum(told, 0.0) + width
 
-    def _near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
+    def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
         """Return sizes that may as well be, with their weights, by the curvature (G,) there.
 
         One group differs at a time, up and down, by as much as makes means right to the second

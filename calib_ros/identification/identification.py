@@ -253,7 +253,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > MANY:
         start = minimise(start, frames, robust.system.spread(MANY)).chain
-    before = minimise(start, frames, robust.system)
+    before = minimise(start, frames, robust.system, tolerance=1e-5)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)

@@ -235,12 +235,16 @@ def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> Flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Shown):
-    """The chain at the minimum of the weighted squares, and the last normal equations there."""
+    """The chain at the minimum of the weighted squares, and the last normal equations there.
+
+    `left` is how far the last step moved the predictions (RMS, as `STEP_TOLERANCE`).
+    """
 
     chain: Chain
     normal: Normal
     iterations: int
     converged: bool
+    left: float = 0.0
 
 
 def minimise(
@@ -276,7 +280,7 @@ def minimise(
             step = _solve(normal.matrix, normal.gradient, damping)
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
-            return Fit(chain, normal, iteration, True)
+            return Fit(chain, normal, iteration, True, left)
         stalled += 1
         if best.cost < (1.0 - LEAST_FALL) * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
@@ -316,11 +320,11 @@ def without_each(
     rest = parts.sum(axis=0) + extra.T @ extra - parts
     for k, normal in enumerate(rest):
         step = _solve(normal[:-1, :-1], normal[:-1, -1])
+        near = chain.with_offsets(dict(zip(names, step, strict=True)))
         if np.abs(step[curved]).max(initial=0.0) > SMALL_STEP:
             few = system.select([numbers != k for numbers in folds])
-            yield minimise(chain, names, few, tolerance=1e-3).chain
-        else:
-            yield chain.with_offsets(dict(zip(names, step, strict=True)))
+            near = minimise(near, names, few, tolerance=1e-3).chain
+        yield near
 
 
 def _solve(matrix: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:

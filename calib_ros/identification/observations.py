@@ -174,9 +174,11 @@ class Observations(Shown):
         heights = np.zeros(len(joints))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
-    def select(self, mask: NDArray[np.generic]) -> Observations:
-        """Return the pairs chosen by a mask or by indices."""
-        chosen = replace(self, **{name: array[mask] for name, array in self._arrays().items()})
+    def select(self, mask: NDArray[np.generic] | slice) -> Observations:
+        """Return the pairs chosen by a mask, by indices or a slice; they have been checked."""
+        chosen = object.__new__(Observations)
+        vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
+        vars(chosen).update({name: array[mask] for name, array in self._arrays().items()})
         if 'configurations' in vars(self):  # takes longer to find than all the rest
             _, vars(chosen)['configurations'] = np.unique(
                 self.configurations[mask], return_inverse=True
@@ -185,7 +187,8 @@ class Observations(Shown):
 
     def spread(self, most: int = POSES) -> Observations:
         """Return every so many pairs, at most so many."""
-        return self.select(np.arange(0, len(self), 1 + len(self) // most))
+        step = 1 + len(self) // most
+        return self if step == 1 else self.select(np.arange(0, len(self), step))
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
         """Return the poses the other way round: a camera on the flange sees a fixed target.

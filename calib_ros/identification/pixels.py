@@ -37,10 +37,10 @@ BOUNDED = 3.0
 class _Images:
     """Some images, linearised.
 
-    `columns` (6 + K + 1, 2, C) are the weighted derivatives of all points by twist and lens, the
-    residual last; `begins` (b,) and `owner` (C,) tell the first point of each image and the image
-    of each point, both counted from the block's first; `twist`
-    (P, 6, b) is what parameters do to the pose of each image; `lens` the rows of the K parameters
+    `columns` (6 + K + 1, 2, C) are the derivatives of all points by twist and lens, the residual
+    last, times robust weights; `begins` (b,) and `owner` (C,) tell the first point of each image
+    and the image of each point, both counted from the block's first; `twist` (P, 6, b) is what
+    parameters do to the pose of each image; `lens` the rows of the K parameters
     of the lens among the P.
     """
 
@@ -99,7 +99,7 @@ class PixelSamples(Samples):
         size = len(names)
         found = np.zeros((count, 2, size + 1, size + 1))
         for block in self._linearised(chain, names):
-            inner = products_of(block.columns, block.begins)
+            inner = products_of(block.columns, block.begins) / self.sigmas[0] ** 2
             outer = (inner[:, :, :6] @ block.twist.transpose(2, 1, 0)).transpose(2, 1, 0)
             own = np.array([*block.lens, size])
             for k, (matrix, _) in enumerate(found):
@@ -123,7 +123,8 @@ class PixelSamples(Samples):
                 unit = np.zeros((2, len(block.owner)))
                 unit[k] = self.sigmas[0]
                 shifts[block.part, k] = block.seen.at_the_board(unit)
-            yield (block.rows(block.columns, block.twist[:, :, block.owner]),)
+            rows = block.rows(block.columns, block.twist[:, :, block.owner])
+            yield (rows / self.sigmas[0],)
         self._shifts = shifts
 
     def sums(
@@ -134,7 +135,7 @@ class PixelSamples(Samples):
             index = groups[block.part][block.begins]
             begins = np.flatnonzero(np.diff(index, prepend=-1))
             rows = block.rows(np.add.reduceat(block.columns, block.begins, axis=2), block.twist)
-            yield index[begins], (np.add.reduceat(rows, begins, axis=2),)
+            yield index[begins], (np.add.reduceat(rows, begins, axis=2) / self.sigmas[0],)
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
         """Return what weighted residuals (rows,) are at the board, (N, 3) [m].
@@ -189,7 +190,8 @@ class PixelSamples(Samples):
             seen.by_twist(columns[:6])
             lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
             columns[-1] = self._pixels[:, part] - seen.pixels
-            columns *= (1.0 if self.weights is None else self.weights[part]) / self.sigmas[0]
+            if self.weights is not None:
+                columns *= self.weights[part]
             twist = np.zeros((len(names), 6, len(images)))
             twist[:, :3] = shift[:-1]
             twist[: model.rotations, 3:] = turn[:-1]

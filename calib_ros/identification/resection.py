@@ -79,7 +79,8 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
     index = observations.images
     rows = np.empty((6, 2, len(index)))
     _seen(lens, poses, index, observations.points.T).by_twist(rows)
-    return np.linalg.inv(products_of(rows, np.flatnonzero(np.diff(index, prepend=-1))))
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    return np.asarray(np.linalg.inv(products_of(rows, begins)))
 
 
 def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatArray) -> View:
@@ -156,12 +157,12 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
     near = rays - centre[index]
     size = np.sqrt(np.add.reduceat((near**2).sum(axis=1), begins)[:, np.newaxis] / count)
     near = near / size[index]
-    point = np.column_stack([plane / scale, np.ones(len(plane))])
-    rows = np.zeros((len(plane), 2, 9))
-    rows[:, 0, :3] = rows[:, 1, 3:6] = point
-    rows[:, :, 6:] = -near[:, :, np.newaxis] * point[:, np.newaxis]
-    normal = np.add.reduceat(np.einsum('nkp,nkr->npr', rows, rows).reshape(-1, 81), begins)
-    _, vectors = np.linalg.eigh(normal.reshape(-1, 9, 9))
+    point = np.ones((3, len(plane)))
+    point[:2] = plane.T / scale
+    rows = np.zeros((9, 2, len(plane)))
+    rows[:3, 0] = rows[3:6, 1] = point
+    rows[6:] = -near.T * point[:, np.newaxis]
+    _, vectors = np.linalg.eigh(products_of(rows, begins))
     matrix = vectors[:, :, 0].reshape(-1, 3, 3)
     back = np.zeros((len(begins), 3, 3))
     back[:, 0, 0] = back[:, 1, 1] = size[:, 0]

@@ -102,10 +102,10 @@ class _Stops:
             first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < APART / 2)
             first, second = first[good], second[good]
-        links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
-        both = csr_array(links + links.T)
-        both.data[:] = 1.0
-        return both
+        ends = (np.append(first, second), np.append(second, first))
+        links = csr_array((np.ones(2 * len(first)), ends), shape=(count, count))
+        links.data[:] = 1.0
+        return links
 
     def kernel(self, kind: str, length: float) -> FloatArray:
         """Return (n, n): covariance of the sums over each stop's samples, per root of count."""

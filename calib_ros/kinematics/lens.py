@@ -90,40 +90,44 @@ class Lens:
         self, points: FloatArray, pixels: FloatArray, kinds: Sequence[str], out: FloatArray
     ) -> None:
         """Put the derivatives (K, 2, B) of the pixels of points by parameters of the lens."""
-        inverse = 1.0 / np.maximum(points[2], NEAREST)
-        x, y = points[0] * inverse, points[1] * inverse
-        square = x * x + y * y
-        both = 2.0 * x * y
-        powers = {'k1': square, 'k2': square * square, 'k3': square * square * square}
-        for kind, (u, v) in zip(kinds, out, strict=True):
-            if kind in powers:
-                u[:], v[:] = self.fx * x * powers[kind], self.fy * y * powers[kind]
-            elif kind == 'p1':
-                u[:], v[:] = self.fx * both, self.fy * (square + 2.0 * y * y)
+        if not kinds:
+            return
+        plane = points[:2] / np.maximum(points[2], NEAREST)
+        across, along = plane * plane
+        square = across + along
+        focal = np.array([[self.fx], [self.fy]])
+        both = 2.0 * focal * plane[0] * plane[1]
+        rows = dict(zip(kinds, out, strict=True))
+        radial = focal * plane
+        for kind in ('k1', 'k2', 'k3'):
+            radial *= square
+            if kind in rows:
+                rows[kind][:] = radial
+        for kind, row in rows.items():
+            if kind == 'p1':
+                row[0], row[1] = both[0], self.fy * (square + 2.0 * along)
             elif kind == 'p2':
-                u[:], v[:] = self.fx * (square + 2.0 * x * x), self.fy * both
-            elif kind == 'fx':
-                u[:], v[:] = (pixels[0] - self.cx) / self.fx, 0.0
-            elif kind == 'fy':
-                u[:], v[:] = 0.0, (pixels[1] - self.cy) / self.fy
-            else:
-                u[:], v[:] = kind == 'cx', kind == 'cy'
+                row[0], row[1] = self.fx * (square + 2.0 * across), both[1]
+            elif kind in ('fx', 'cx'):
+                row[0], row[1] = (pixels[0] - self.cx) / self.fx if kind == 'fx' else 1.0, 0.0
+            elif kind in ('fy', 'cy'):
+                row[0], row[1] = 0.0, (pixels[1] - self.cy) / self.fy if kind == 'fy' else 1.0
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Return (N, 2) the points at depth 1 of pixels (N, 2), by Newton steps."""
-        centre, focal = np.array([self.cx, self.cy]), np.array([self.fx, self.fy])
-        found = (pixels - centre) / focal
+        target = np.ascontiguousarray(pixels.T)
+        points = np.ones((3, len(pixels)))
+        points[0], points[1] = (target[0] - self.cx) / self.fx, (target[1] - self.cy) / self.fy
         for _ in range(20):
-            points = np.concatenate([found, np.ones((len(found), 1))], axis=1).T
-            seen, by_point = self.project(points)
-            matrices = by_point[:, :2].transpose(2, 0, 1)
-            turned = np.linalg.det(matrices) <= 0.0  # beyond the edge of the polynomial
-            matrices[turned] = np.diag(focal)
-            step = np.linalg.solve(matrices, (pixels - seen.T)[..., np.newaxis])[..., 0]
-            found = found + np.where(turned[:, np.newaxis], 0.0, step)
+            seen, ((a, b, _), (c, d, _)) = self.project(points)
+            size = a * d - b * c
+            turned = size <= 0.0  # beyond the edge of the polynomial
+            u, v = (target - seen) / np.where(turned, 1.0, size)
+            step = np.where(turned, 0.0, [d * u - b * v, a * v - c * u])
+            points[:2] += step
             if np.abs(step).max(initial=0.0) < 1e-12:
                 break
-        return np.asarray(found)
+        return np.asarray(points[:2].T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,13 +21,12 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import BLOCK
 from calib_ros.settings import Settings
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted only; in the figures; in the figures at a fitted configuration."""
 WHEN = ('before', 'after')
-BLOCK = 50_000
-"""Rows of a table that are in memory as numbers at once."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,8 +32,6 @@ from calib_ros.report.sections import (
     row_of,
 )
 
-LISTED = 50
-"""Outliers that have a row of their own table."""
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -181,7 +179,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         said=(f'In figures: {words.noise_in_words(result)}.', *words.chance_in_words(result)),
     )
     if result.outliers:
-        yield _outliers(result, poses)
+        yield _outliers(poses)
     yield from _offsets(problem, result)
     yield _parameters(result)
     yield _correlations(result)
@@ -213,12 +211,12 @@ def _effects(result: Identification) -> Section:
     )
 
 
-def _outliers(result: Identification, poses: Poses) -> Section:
+def _outliers(poses: Poses, most: int = 50) -> Section:
     """Return the outliers of the fit, the largest first, by line or stamp."""
     rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
     rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
-    more = f' The {LISTED} largest are shown.' if len(rows) > LISTED else ''
+    more = f' The {most} largest are shown.' if len(rows) > most else ''
     return Section(
         'outliers',
         f'Outliers: {len(rows)} poses carry no or little weight',
@@ -229,7 +227,7 @@ def _outliers(result: Identification, poses: Poses) -> Section:
         head=('where', 'pose', 'size [usual errors]', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
-            for k in rows[:LISTED].tolist()
+            for k in rows[:most].tolist()
         ),
     )
 

@@ -26,7 +26,7 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 
-MOST_OUTLIERS = 5
+NAMED = 5
 """Outliers that an answer names."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
@@ -91,10 +91,10 @@ def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, in
     largest = sorted(outliers, key=lambda each: -each.size)
     words = [
         f'sample {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
-        for each in largest[:MOST_OUTLIERS]
+        for each in largest[:NAMED]
     ]
-    if len(largest) > MOST_OUTLIERS:
-        words.append(f'and {len(largest) - MOST_OUTLIERS} more')
+    if len(largest) > NAMED:
+        words.append(f'and {len(largest) - NAMED} more')
     return ', '.join(words)
 
 

@@ -31,7 +31,7 @@ from calib_ros.settings import Settings
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
-ADVANCE_NS = 500_000_000
+ADVANCE_NS = round(5e9 * WINDOW)
 """Time of the newest joint sample between two rounds of taking samples."""
 
 

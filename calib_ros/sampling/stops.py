@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 
-SPIKE = 6.0
-"""A single measurement further from the median [noise] is left out of the mean."""
-MOST_SPIKES = 0.3
-SETTLED = 4.0
-"""Distance [noise] to the later half within which a measurement is taken to have settled."""
 MOST_SPREAD = 2.0
 """Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
+SETTLED = 2.0 * MOST_SPREAD
+"""Distance [noise] to the later half within which a measurement is taken to have settled."""
+SPIKE = 3.0 * MOST_SPREAD
+"""A single measurement further from the median [noise] is left out of the mean."""
+MOST_SPIKES = 0.3
 FEW = 4
 """With fewer measurements nothing can be said about their spread."""
 

@@ -16,7 +16,7 @@ from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, meas
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.leastsquares import stacked
+from calib_ros.identification.leastsquares import System, products_of, stacked
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.pixels import PixelSamples
 from calib_ros.identification.resection import board_poses, resect
@@ -82,23 +82,22 @@ def test_fifteen_images_tell_a_gain_from_a_drift(on_flange):
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
-def test_few_rows_an_image_have_the_same_normal_matrix(on_flange):
+def test_products_are_those_of_the_rows(on_flange):
     true, seen = scene(1, on_flange, 5)
-    seen = seen.select(np.arange(len(seen)) % 7 != 0)
+    seen = seen.select((np.arange(len(seen)) % 7 != 0) & (np.arange(len(seen)) < 3 * 24 + 2))
     names = true.parameter_names
-    samples = PixelSamples(seen, SIGMA)
-    rows = stacked([samples.rows_of(true, names)])
-    found = np.zeros((len(names) + 1,) * 2)
-    count = 0
-    for _, block, _, model in samples.blocks(true, names):
-        flat = block[[*model.order, len(names)]].reshape(len(block), -1)
-        found += flat @ flat.T
-        count += flat.shape[1]
-    assert count == 5 * 16 < len(rows)
-    scale = np.sqrt(np.maximum(np.diag(found), 1.0))
-    np.testing.assert_allclose(
-        found / np.outer(scale, scale), rows.T @ rows / np.outer(scale, scale), atol=1e-9
-    )
+    folds = np.array([0, 1, 1, 0])[seen.images]
+    system = System((PixelSamples(seen, SIGMA),))
+    found = products_of(true, names, system, [folds]).sum(axis=1)
+    rows = system.sets[0].rows_of(true, names)
+    for k, products in enumerate(found):
+        few = stacked([rows[..., folds == k]])
+        scale = np.sqrt(np.maximum((few**2).sum(axis=0), 1.0))
+        both = np.outer(scale, scale)
+        np.testing.assert_allclose(products / both, few.T @ few / both, atol=1e-12)
+    sums = np.concatenate([each for _, (each,) in system.sets[0].sums(true, names, seen.images)])
+    exact = np.add.reduceat(rows, np.flatnonzero(np.diff(seen.images, prepend=-1)), axis=2)
+    np.testing.assert_allclose(sums, exact, atol=1e-9 * np.abs(exact).max())
 
 
 @settings(max_examples=8)
