@@ -8,7 +8,7 @@ other parts. Parts are dealt out twice, one by one and in blocks of what was mea
 succession, and both must agree, because neighbours share errors. Groups of effects are added one
 by one, the best first, as long as the position error on the configurations left out falls by more
 than chance explains, and explain more of the residuals than of the same moved in time
-(`chance.py`), as a drift would be. Then the spectrum of what is left is searched, joint by joint,
+(`drift.py`), as a drift would be. Then the spectrum of what is left is searched, joint by joint,
 for harmonics of gears: the one that explains most is added while it pays as well.
 """
 
