@@ -62,23 +62,9 @@ def whole_folder(
     """Yield a path at which to make a folder; it is put in place when the block has ended.
 
     When the block fails, or the process is killed, there is no folder, or the one from before.
-
-    Parameters
-    ----------
-    path : Path
-        The place of the folder. Missing parents are made.
-    own : sequence of str, optional
-        Glob patterns of what belongs to the folder. What an earlier folder holds besides is
-        kept. By default there must be no earlier one.
-    overwrite : bool
-        Replace what is there of `own`.
-
-    Raises
-    ------
-    InputError
-        When there is something that must not be replaced, or when another process writes the
-        same folder.
-
+    Missing parents are made. `own` are glob patterns of what belongs to the folder, which is only
+    replaced if `overwrite` is True; what an earlier folder holds besides is kept. By default there
+    must be no earlier one, and never another process that writes the same folder.
     """
     place = Path(os.path.realpath(path))
     place.parent.mkdir(parents=True, exist_ok=True)

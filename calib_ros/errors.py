@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import difflib
 import errno
 from collections.abc import Iterable
 
@@ -55,6 +54,8 @@ class UnknownNameError(ConfigError):
     """A name that does not exist; keeps the name and the valid alternatives."""
 
     def __init__(self, what: str, name: str, alternatives: Iterable[str]) -> None:
+        import difflib  # slow to load
+
         self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)

@@ -19,11 +19,7 @@ class CancelledError(CalibrationError):
 class Progress:
     """What a piece of work on another thread is at; called with each stage that begins.
 
-    Parameters
-    ----------
-    what : str
-        What the work does, in a word.
-
+    `what` says in a word what the work does.
     """
 
     def __init__(self, what: str) -> None:

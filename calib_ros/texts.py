@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from calib_ros.values import LONGEST_NAME
 
 LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""
-LARGEST_TABLE = 100_000_000
+LARGEST_TABLE = 10 * LARGEST_TEXT
 """Bytes of a table."""
 MOST_ROWS = LARGEST_TABLE // 500
 """Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""
@@ -130,15 +131,27 @@ def _loader() -> Any:
     return Loader
 
 
+@dataclass
 class _Open:
     """A list or mapping of which the end has not come yet."""
 
-    def __init__(self, anchor: str | None, keyed: bool) -> None:
-        self.anchor = anchor
-        self.nodes, self.height = 1, 0
-        self.keyed = keyed
-        self.keys: set[str] = set()
-        self.at_key = keyed
+    anchor: str | None
+    keyed: bool
+    nodes: int = 1
+    height: int = 0
+    keys: set[str] = field(default_factory=set)
+    ends: int = 0
+
+    def hold(self, nodes: int, height: int, key: str | None) -> str | None:
+        """Take in what ended; return the name of a key that comes twice."""
+        self.nodes += nodes
+        self.height = max(self.height, height + 1)
+        self.ends += 1
+        if not self.keyed or self.ends % 2 == 0 or key in (None, '<<'):
+            return None
+        again = key if key in self.keys else None
+        self.keys.add(str(key))
+        return again
 
 
 def _check(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
@@ -147,37 +160,40 @@ def _check(events: Iterator[Any], where: str, error: type[CalibrationError]) -> 
     anchors: dict[str, tuple[int, int]] = {}
     for event in events:
         kind = type(event).__name__
+        size, anchor, key = (0, 0), None, None
         if kind in ('SequenceStartEvent', 'MappingStartEvent'):
             above.append(_Open(event.anchor, kind == 'MappingStartEvent'))
-            nodes, height = 0, 0
         elif kind == 'ScalarEvent':
-            nodes, height = 1 + len(event.value) // 20, 0
-            if event.anchor:
-                anchors[event.anchor] = (nodes, height)
+            size, anchor, key = (1 + len(event.value) // 20, 0), event.anchor, event.value
         elif kind == 'AliasEvent':
             if event.anchor not in anchors:
                 raise error(f'{where}: alias "{event.anchor}" stands for nothing before it')
-            nodes, height = anchors[event.anchor]
+            size = anchors[event.anchor]
         elif kind in ('SequenceEndEvent', 'MappingEndEvent'):
             ended = above.pop()
-            nodes, height = ended.nodes, ended.height
-            if ended.anchor:
-                anchors[ended.anchor] = (nodes, height)
+            size, anchor = (ended.nodes, ended.height), ended.anchor
         else:
             anchors.clear()
-            continue
-        if len(above) + height > DEEPEST:
-            raise error(f'{where} is nested deeper than {DEEPEST} levels')
-        if not nodes or not above:
-            continue
-        parent = above[-1]
-        parent.nodes += nodes
-        parent.height = max(parent.height, height + 1)
-        if parent.nodes > MOST_NODES:
-            raise error(f'{where} has more than {MOST_NODES} values')
-        if parent.at_key and kind == 'ScalarEvent' and event.value != '<<':
-            if event.value in parent.keys:
-                raise error(f'{where}: key "{event.value}" comes twice')
-            parent.keys.add(event.value)
-        if parent.keyed:
-            parent.at_key = not parent.at_key
+        if anchor:
+            anchors[anchor] = size
+        _take(above, size, key, where, error)
+
+
+def _take(
+    above: list[_Open],
+    size: tuple[int, int],
+    key: str | None,
+    where: str,
+    error: type[CalibrationError],
+) -> None:
+    """Let the innermost open list or mapping hold so many nodes, of such a height."""
+    nodes, height = size
+    if len(above) + height > DEEPEST:
+        raise error(f'{where} is nested deeper than {DEEPEST} levels')
+    if not nodes or not above:
+        return
+    again = above[-1].hold(nodes, height, key)
+    if above[-1].nodes > MOST_NODES:
+        raise error(f'{where} has more than {MOST_NODES} values')
+    if again is not None:
+        raise error(f'{where}: key "{again}" comes twice')

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
@@ -20,8 +20,8 @@ LARGEST = 1e6
 none."""
 LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
-LONGEST_NAME = 200
-"""Characters of a name, a number or an expression."""
+LONGEST_NAME = LONGEST // 2
+"""Characters of a name, a number or an expression: a message has room for it and more."""
 
 
 def parse_number(

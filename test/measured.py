@@ -38,7 +38,7 @@ def rows_of(observations, held_out=TEST):
 
 def write_csv(path, rows):
     with path.open('w', newline='') as file:
-        writer = csv.DictWriter(file, rows[0].keys())
+        writer = csv.DictWriter(file, dict.fromkeys(name for row in rows for name in row))
         writer.writeheader()
         writer.writerows(rows)
     return path

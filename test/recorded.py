@@ -75,14 +75,14 @@ def pose_with_covariance(stamp_ns, covariance):
     return kind(header(stamp_ns), with_covariance)
 
 
-def odometry(stamp_ns, covariance=None, child='base_link'):
+def odometry(stamp_ns, covariance=None, child='base_link', where=()):
     covariance = np.zeros(36) if covariance is None else np.array(covariance, dtype=float).ravel()
     nothing = TYPES['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
     twist = TYPES['geometry_msgs/msg/Twist'](nothing, nothing)
     return TYPES['nav_msgs/msg/Odometry'](
         header(stamp_ns),
         child,
-        TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(), covariance),
+        TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(*where), covariance),
         TYPES['geometry_msgs/msg/TwistWithCovariance'](twist, np.zeros(36)),
     )
 

@@ -397,5 +397,13 @@ def topics(recording, **more):
     return {'joint_states': joints, 'measured_pose': poses, **more}
 
 
+def part(recording, first, last):
+    """Return the messages of a time [s] by topic."""
+    return {
+        topic: [m for m in messages if first <= (stamp_ns(m) - START) * 1e-9 < last]
+        for topic, messages in topics(recording).items()
+    }
+
+
 def values_of(message):
     return {item.key: item.value for item in message.status[0].values}

@@ -5,6 +5,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -38,15 +39,18 @@ ONLY = {
 }
 
 
-def imports(module):
+@cache
+def imports(path):
     """Return the names that a module imports, inside functions as well.
 
     Imports for type checking alone do not count.
     """
     found = set()
-    waiting = [ast.parse(MODULES[module].read_text())]
+    waiting = [ast.parse(path.read_text())]
     while waiting:
         node = waiting.pop()
+        if isinstance(node, ast.expr):
+            continue
         if isinstance(node, ast.If) and getattr(node.test, 'id', '') == 'TYPE_CHECKING':
             continue
         waiting += ast.iter_child_nodes(node)
@@ -74,7 +78,7 @@ def test_every_folder_has_its_place():
 @pytest.mark.parametrize('module', MODULES)
 def test_modules_import_only_from_the_folders_before(module):
     folder = module.rpartition('.')[0]
-    for name in imports(module):
+    for name in imports(MODULES[module]):
         package = name.partition('.')[0]
         assert module.startswith(ONLY.get(package, ('',))), f'{module} imports {package}'
         other = inner(name)
@@ -86,7 +90,10 @@ def test_modules_import_only_from_the_folders_before(module):
 
 
 def test_no_two_modules_import_each_other():
-    graph = {module: {inner(name) for name in imports(module)} - {None} for module in MODULES}
+    graph = {
+        module: {inner(name) for name in imports(path)} - {None}
+        for module, path in MODULES.items()
+    }
     TopologicalSorter(graph).prepare()
 
 
@@ -98,3 +105,13 @@ def test_the_core_needs_neither_ros_nor_yaml_nor_matplotlib():
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in blocked)]
     lines += [f'import calib_ros.{name}' for name in core]
     subprocess.run([sys.executable, '-c', '\n'.join(lines)], check=True)
+
+
+def test_the_overview_of_the_commands_loads_nothing_slow():
+    heavy = ['numpy', 'scipy', 'yaml', 'rich', 'argcomplete', 'difflib']
+    heavy += [f'calib_ros.{folder}' for folder in LEVEL if folder != 'cli']
+    lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in heavy)]
+    lines += ['from calib_ros.cli.main import main', 'main(["--help"])']
+    ran = subprocess.run([sys.executable, '-c', '\n'.join(lines)], capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (0, '')
+    assert 'calib_ros identify' in ran.stdout

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The package as colcon builds it, and what its files promise each other."""
 
-import ast
 import json
 import os
 import re
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from test_architecture import MODULES, imports
 
 import calib_ros
 from calib_ros.ros.arguments import BESIDE_SETTINGS, PARAMETERS
@@ -81,15 +81,11 @@ def test_package_xml_names_everything_that_is_imported():
     keys |= {
         name: f'python3-{name}' for name in ('jinja2', 'matplotlib', 'numpy', 'plotly', 'scipy')
     }
-    sources = [*(ROOT / 'calib_ros').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
-    for source in sources:
-        for node in ast.walk(ast.parse(source.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [node.module] if isinstance(node, ast.ImportFrom) else []
-            for name in names:
-                top = name.partition('.')[0]
-                if top not in sys.stdlib_module_names and top != 'calib_ros':
-                    assert keys.get(top, top) in declared, f'{source.name} imports {top}'
+    for source in [*MODULES.values(), *(ROOT / 'launch').glob('*.py')]:
+        for name in imports(source):
+            top = name.partition('.')[0]
+            if top not in sys.stdlib_module_names and top != 'calib_ros':
+                assert keys.get(top, top) in declared, f'{source.name} imports {top}'
 
 
 def test_rosdep_finds_everything_on_ubuntu():

@@ -29,7 +29,7 @@ from calib_ros.kinematics.se3 import FloatArray
 
 SLOPES = (0.5, 2.0)
 """References k: shifts of one and of four standard deviations show soonest."""
-STEPS = 200
+STATES = 200
 """Of the Markov chain; more change the run length by less than a hundredth (test_chart.py)."""
 
 
@@ -102,12 +102,12 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) 
 
 def run_length(slope: float, height: float) -> float:
     """Return after how many normal values a one-sided CUSUM exceeds a height, on average."""
-    width = 2.0 * height / (2 * STEPS - 1)
-    middles = width * np.arange(STEPS)
+    width = 2.0 * height / (2 * STATES - 1)
+    middles = width * np.arange(STATES)
     upper = middles[np.newaxis] - middles[:, np.newaxis] + 0.5 * width + slope
     stays = special.ndtr(upper)
     stays[:, 1:] -= special.ndtr(upper[:, 1:] - width)
-    return float(np.linalg.solve(np.eye(STEPS) - stays, np.ones(STEPS))[0])
+    return float(np.linalg.solve(np.eye(STATES) - stays, np.ones(STATES))[0])
 
 
 @cache

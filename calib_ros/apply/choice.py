@@ -17,6 +17,7 @@ choice by `d` is where exchanges start.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -25,7 +26,7 @@ from scipy import linalg
 
 from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.identification.observations import STILL
+from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import FloatArray
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
@@ -33,7 +34,7 @@ CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
 Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """Returns the worth (N,) of candidates from information (P, P) and their rows (N, m, P)."""
 
-ROUNDING = 1e-9
+RIDGE = 1e-9
 """Information about everything, in that of an average candidate, that keeps M invertible; and the
 least relative gain of an exchange, so that exchanges come to an end."""
 
@@ -95,7 +96,7 @@ class _Pick:
 
     def __init__(self, space: Candidates, apart: float) -> None:
         self._joints, self._rows = space.joints, space.rows
-        self._start = space.known + ROUNDING * np.eye(len(space.known))
+        self._start = space.known + RIDGE * np.eye(len(space.known))
         self._apart = apart
         self._near: list[NDArray[np.bool_]] = []
         self._blocked = np.zeros(len(space.rows), dtype=np.intp)
@@ -134,7 +135,7 @@ class _Pick:
             self.information = self.information - information_of(self._rows[old])
             worth = np.where(self._blocked > 0, -np.inf, score(self.information, self._rows))
             new = int(worth.argmax())
-            if worth[new] - worth[old] > ROUNDING * abs(worth[old]):
+            if worth[new] - worth[old] > RIDGE * abs(worth[old]):
                 changed = True
             else:
                 new = old
@@ -148,12 +149,11 @@ def _score(space: Candidates, criterion: Criterion, task: FloatArray | None) -> 
         raise UnknownNameError('criterion', criterion, CRITERIA)
     if criterion == 'd':
         return _by_determinant
-    if criterion == 'task':
-        if task is None:
-            raise ConfigError('the criterion "task" needs the poses of a task')
-        wanted = space.of_task(task)
-        return lambda information, rows: _by_task(information, rows, wanted)
-    return lambda information, rows: _by_index(information, rows, criterion, space.factor)
+    if criterion != 'task':
+        return partial(_by_index, criterion=criterion, factor=space.factor)
+    if task is None:
+        raise ConfigError('the criterion "task" needs the poses of a task')
+    return partial(_by_task, wanted=space.of_task(task))
 
 
 def _by_determinant(information: FloatArray, rows: FloatArray) -> FloatArray:
@@ -178,13 +178,13 @@ def _by_index(
     total = factor.T @ information @ factor + np.swapaxes(back, 1, 2) @ back
     singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
     smallest, largest = singular[:, 0], singular[:, -1]
-    if criterion == 'o2':
-        return np.asarray(smallest / largest)
-    if criterion == 'o3':
-        return np.asarray(smallest)
-    if criterion == 'o4':
-        return np.asarray(smallest**2 / largest)
-    return np.asarray(1.0 / np.sum(1.0 / singular, axis=1))
+    found = {
+        'o2': smallest / largest,
+        'o3': smallest,
+        'o4': smallest**2 / largest,
+        'o5': 1.0 / np.sum(1.0 / singular, axis=1),
+    }
+    return np.asarray(found[criterion])
 
 
 def _root(information: FloatArray) -> FloatArray:
@@ -208,7 +208,7 @@ def efficiency(
     (Kiefer and Wolfowitz 1960) bounds what the candidates with the steepest slopes would bring.
     """
     space = Candidates(design, candidates)
-    ridge = ROUNDING * np.eye(len(space.known))
+    ridge = RIDGE * np.eye(len(space.known))
     root = _root(space.known + information_of(space.rows[chosen]) + ridge)
     slope = root @ root.T
     if task is not None:

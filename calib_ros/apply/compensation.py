@@ -31,9 +31,7 @@ from calib_ros.shown import Shown
 
 EXACT, COMPROMISE = 1e-6, 0.02
 """Orientation errors [rad] tolerated of arms that can reach every orientation, and of others.
-By the former [rad or m] a command may lie beyond a limit: that is rounding."""
-CHANGE_FLOOR = 1e-5
-"""Changes of the correction that are never a jump, in units of the largest correction."""
+By the former [rad or m] a command may lie beyond a limit, or a correction change at any time."""
 POSITIVE = (
     *('largest_turn', 'largest_shift', 'largest_position_error', 'largest_orientation_error'),
     *('orientation_weight', 'largest_change'),
@@ -282,9 +280,9 @@ def too_fast(
     compensator: Compensator, changes: FloatArray, moves: FloatArray
 ) -> list[tuple[int, int]]:
     """Return sample and joint where a correction changes (N, n) too much for its moves (N, n)."""
-    shares = changes / compensator.largest
+    shares = (changes - EXACT) / compensator.largest
     allowed = compensator.largest_change * (moves / compensator.largest).max(axis=1)
-    rows = np.flatnonzero(shares.max(axis=1) > allowed + CHANGE_FLOOR)
+    rows = np.flatnonzero(shares.max(axis=1) > allowed)
     return [(k, int(shares[k].argmax())) for k in rows.tolist()]
 
 

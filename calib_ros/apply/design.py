@@ -106,9 +106,13 @@ class Design(Shown):
             tool=kind.tool,
         )
 
+    def jacobian(self, joints: FloatArray) -> FloatArray:
+        """Return the Jacobian (N, 6, P) [m, rad] of poses at (N, n)."""
+        return ErrorModel(self.chain, self.names, self.base, self.tool).jacobian(joints)
+
     def rows(self, joints: FloatArray) -> FloatArray:
         """Return the rows (N, 6 or 3, P) of information, in sigma, of poses at (N, n)."""
-        jacobian = ErrorModel(self.chain, self.names, self.base, self.tool).jacobian(joints)
+        jacobian = self.jacobian(joints)
         jacobian[:, :3] /= self.sigma_position
         if self.sigma_orientation is None:
             return jacobian[:, :3]
@@ -148,9 +152,8 @@ class Candidates:
 
     def of_task(self, task: FloatArray) -> FloatArray:
         """Return V (P, P) [m^2]: tr V C is the mean squared position error at (T, n)."""
-        design = self.design
-        jacobian = ErrorModel(design.chain, design.names, design.base, design.tool).jacobian(task)
-        return information_of(times(jacobian[:, :3], self._inverse)) / len(task)
+        rows = self.design.jacobian(task)[:, :3]
+        return information_of(times(rows, self._inverse)) / len(task)
 
 
 def accuracy(design: Design, joints: FloatArray, task: FloatArray) -> FloatArray:
@@ -174,11 +177,9 @@ def predicted(design: Design, task: FloatArray) -> float:
     known = triangular(design.known)
     if independent(known, design.names) != design.names:
         return float('inf')
-    model = ErrorModel(design.chain, design.names, design.base, design.tool)
-    rows = model.jacobian(task)[:, :3].reshape(-1, len(design.names))
-    return float(
-        np.linalg.norm(linalg.solve_triangular(known, rows.T, trans='T')) / len(task) ** 0.5
-    )
+    rows = design.jacobian(task)[:, :3].reshape(-1, len(design.names))
+    length = np.linalg.norm(linalg.solve_triangular(known, rows.T, trans='T'))
+    return float(length / np.sqrt(len(task)))
 
 
 def times(rows: FloatArray, matrix: FloatArray) -> FloatArray:

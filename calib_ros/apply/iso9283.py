@@ -12,7 +12,8 @@ The cube grows about many reachable poses at once; where its eight corners are r
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,6 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
 
-CENTRES = 500
-"""Reachable poses about which a cube is grown."""
 FIRST_EDGE, GROWTHS = 0.02, 1.3**0.5 ** np.arange(5)
 """Edge [m] of the first cube, and by how much it grows at a time, finer and finer."""
 CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -42,32 +41,27 @@ class TestPoses:
     edge: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Cubes:
-    """Cubes of one edge about reachable centres (M, 4, 4), with the joint values at the corners.
+class _Cubes(NamedTuple):
+    """Cubes about reachable centres (M, 4, 4), with the joint values (M, n) and (M, 8, n)."""
 
-    `middle` (M, n) are those of the centres, `corners` (M, 8, n) those of the corners.
-    """
-
-    edge: float
     centres: FloatArray
     middle: FloatArray
     corners: FloatArray
 
-    def select(self, index: NDArray[np.intp]) -> _Cubes:
+    def select(self, index: NDArray[np.generic]) -> _Cubes:
         """Return some of the cubes."""
-        return replace(
-            self,
-            centres=self.centres[index],
-            middle=self.middle[index],
-            corners=self.corners[index],
-        )
+        return _Cubes(*(each[index] for each in self))
 
 
 def iso_9283_poses(
-    design: Design, rng: np.random.Generator, visibility: Visibility | None = None
+    design: Design,
+    rng: np.random.Generator,
+    visibility: Visibility | None = None,
+    centres: int = 500,
 ) -> TestPoses:
     """Return the test poses in the largest cube that the arm reaches, and the device sees.
+
+    Cubes are grown about so many reachable centres.
 
     Raises
     ------
@@ -76,9 +70,13 @@ def iso_9283_poses(
         target is not seen.
 
     """
-    middle = draw_candidates(design, CENTRES, rng, visibility)
+    middle = draw_candidates(design, centres, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)
-    cubes = _grown(design, visibility, _Cubes(0.0, design.targets(middle), middle, start))
+    edge = FIRST_EDGE
+    cubes = _at(design, visibility, _Cubes(design.targets(middle), middle, start), edge)
+    for factor in GROWTHS:
+        while len((grown := _at(design, visibility, cubes, edge * factor)).centres):
+            cubes, edge = grown, edge * factor
     if not len(cubes.centres):
         raise InputError(
             'the arm keeps one orientation in no cube of its workspace: choose test poses '
@@ -86,27 +84,17 @@ def iso_9283_poses(
         )
     travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
     best = cubes.select(travel.argmin()[np.newaxis])
-    wanted = _poses(design, best.centres, 0.8 * best.edge)[0, PLANE]
+    wanted = _poses(design, best.centres, 0.8 * edge)[0, PLANE]
     found = inverse.solve(design.chain, wanted, best.corners[0, PLANE], design.base, design.tool)
     if not found.converged.all():
         raise InputError(
             'the arm does not reach the inside of the cube that it reaches: try --seed'
         )
-    return TestPoses(np.concatenate([best.middle, found.joints]), best.edge)
-
-
-def _grown(design: Design, visibility: Visibility | None, cubes: _Cubes) -> _Cubes:
-    """Return the cubes that can be grown furthest."""
-    cubes = _at(design, visibility, cubes, FIRST_EDGE)
-    for factor in GROWTHS:
-        grown = cubes
-        while len(grown.centres):
-            cubes, grown = grown, _at(design, visibility, grown, grown.edge * factor)
-    return cubes
+    return TestPoses(np.concatenate([best.middle, found.joints]), edge)
 
 
 def _at(design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float) -> _Cubes:
-    """Return those cubes that have another edge, too."""
+    """Return those cubes that may have this edge [m]."""
     count, _, joints = cubes.corners.shape
     wanted = _poses(design, cubes.centres, edge).reshape(-1, 4, 4)
     start = cubes.corners.reshape(-1, joints)
@@ -117,8 +105,7 @@ def _at(design: Design, visibility: Visibility | None, cubes: _Cubes, edge: floa
     whole = reached.reshape(count, 8).all(axis=1)
     middle = se3.invert(design.chain.frame(design.base).matrix) @ cubes.centres
     whole &= np.abs(middle[:, :2, 3]).max(axis=1) > 0.5 * edge
-    grown = replace(cubes, edge=edge, corners=found.joints.reshape(count, 8, joints))
-    return grown.select(np.flatnonzero(whole))
+    return cubes._replace(corners=found.joints.reshape(count, 8, joints)).select(whole)
 
 
 def _poses(design: Design, centres: FloatArray, edge: float) -> FloatArray:

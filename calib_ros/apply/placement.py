@@ -31,8 +31,6 @@ STARTS = 6
 """Configurations from which the first pose of a task is solved."""
 KNOWN_POSES = 20_000
 """Random configurations among which they are looked for."""
-REFINEMENTS = 4
-"""Times that the grid is halved about the best placement."""
 
 
 def task_of(poses: FloatArray) -> FloatArray:
@@ -77,6 +75,7 @@ def place(
     region: FloatArray | None = None,
     cells: int = 9,
     turns: int = 1,
+    refinements: int = 4,
 ) -> Placements:
     """Find the placement of a task with the least expected error.
 
@@ -93,10 +92,10 @@ def place(
     region : (2, 3), optional
         Lower and upper corner [m], in the base frame, for the origin of the task's frame; all
         that the arm reaches if None.
-    cells : int
-        Points of the grid along each axis.
-    turns : int
-        Turns about the vertical to try, evenly spread.
+    cells, turns : int
+        Points of the grid along each axis, and turns about the vertical, evenly spread.
+    refinements : int
+        Times that the grid is halved about the best placement.
 
     Raises
     ------
@@ -106,7 +105,9 @@ def place(
     """
     search = _Search(arm, task, aim, model)
     corners = search.within(region)
-    grid = _grid(corners, cells, turns)
+    axes = [np.linspace(low, high, cells) for low, high in corners.T]
+    axes.append(2.0 * np.pi * np.arange(turns) / turns)
+    grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 4)
     errors, joints = search.errors(grid)
     reached = ~np.isnan(errors)
     if not reached.any():
@@ -114,31 +115,17 @@ def place(
             f'the arm reaches all {len(task)} poses of the task at none of {len(grid)} '
             'placements: check the unit (m), the orientation and the region, or use more cells'
         )
-    centre = _central(grid[:, :3], reached)
+    away = np.linalg.norm(grid[:, :3] - grid[reached, :3].mean(axis=0), axis=1)
+    centre = int(np.where(reached, away, np.inf).argmin())
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
-    for _ in range(REFINEMENTS):
+    for _ in range(refinements):
         step = 0.5 * step
         near = _around(grid[np.nanargmin(errors)], step, corners)
         more = search.errors(near)
-        grid, errors, joints = (
-            np.concatenate(both)
-            for both in zip((grid, errors, joints), (near, *more), strict=True)
-        )
+        both = zip((grid, errors, joints), (near, *more), strict=True)
+        grid, errors, joints = map(np.concatenate, both)
     best = int(np.nanargmin(errors))
     return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
-
-
-def _grid(corners: FloatArray, cells: int, turns: int) -> FloatArray:
-    """Return placements (M, 4), evenly spread between corners (2, 3)."""
-    axes = [np.linspace(low, high, cells) for low, high in corners.T]
-    angles = 2.0 * np.pi * np.arange(turns) / turns
-    return np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
-
-
-def _central(positions: FloatArray, reached: NDArray[np.bool_]) -> int:
-    """Return which of positions (M, 3) is nearest to the middle of those that are reached (M,)."""
-    distance = np.linalg.norm(positions - positions[reached].mean(axis=0), axis=1)
-    return int(np.where(reached, distance, np.inf).argmin())
 
 
 def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:
@@ -175,16 +162,14 @@ class _Search:
 
     def errors(self, placements: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n)."""
-        turns = np.zeros((len(placements), 3))
-        turns[:, 2] = placements[:, 3]
+        turns = placements[:, 3:] * [0.0, 0.0, 1.0]
         frames = se3.transform(se3.exp_rotation(turns), placements[:, :3])
         poses = frames[:, np.newaxis] @ self._task
         joints, reached = self._follow(poses)
         errors = np.full((len(placements), STARTS), np.nan)
         expected = self._arm.expected(joints[reached].reshape(-1, joints.shape[-1]), self._model)
         expected = expected.reshape(-1, len(self._task))
-        over = expected.mean(axis=1) if self._aim == 'mean' else expected.max(axis=1)
-        errors[reached] = over
+        errors[reached] = (np.mean if self._aim == 'mean' else np.max)(expected, axis=1)
         best = np.where(np.isnan(errors), np.inf, errors).argmin(axis=1)
         index = np.arange(len(placements))
         return errors[index, best], joints[index, best]

@@ -14,14 +14,9 @@ from calib_ros.apply.candidates import travel_times, visit_order
 from calib_ros.apply.choice import Criterion, choose, efficiency
 from calib_ros.apply.design import Design, accuracy, predicted
 from calib_ros.errors import InputError
-from calib_ros.identification.observations import STILL
+from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame
-
-RANDOM_DRAWS = 25
-"""Random choices that a plan is compared with."""
-FIRST_COUNT = 25
-"""Poses with which the search for the number that is needed begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,18 +106,20 @@ def plan(
     criterion: Criterion = 'd',
     apart: float = STILL,
     velocities: FloatArray | None = None,
+    draws: int = 25,
 ) -> Plan:
-    """Plan a number of measurements; `choose` and `visit_order` say what the arguments mean."""
+    """Plan a number of measurements, and compare them with so many random draws.
+
+    `choose` and `visit_order` say what the other arguments mean.
+    """
     excited = design.determined_by(candidates)
     chosen = choose(excited, candidates, count, criterion, task, apart)
     joints = candidates[chosen]
     speeds = np.ones(joints.shape[1]) if velocities is None else velocities
     visit = visit_order(joints, speeds)
     rng = np.random.default_rng(0)
-    draws = [
-        accuracy(excited, candidates[rng.permutation(len(candidates))[:count]], task)
-        for _ in range(RANDOM_DRAWS)
-    ]
+    orders = [rng.permutation(len(candidates))[:count] for _ in range(draws)]
+    at_random = [accuracy(excited, candidates[order], task) for order in orders]
     predictions = accuracy(excited, joints, task)
     bound = None
     if criterion in ('d', 'task') and np.isfinite(predictions[-1]):
@@ -133,7 +130,7 @@ def plan(
         visit,
         float(np.diagonal(moves, 1).sum()),
         predictions,
-        np.median(draws, axis=0),
+        np.median(at_random, axis=0),
         bound,
         tuple(name for name in design.names if name not in excited.names),
     )
@@ -162,7 +159,7 @@ def poses_needed(
             f'all {len(candidates)} candidates together predict {1e3 * best:.4f} mm, '
             f'{1e3 * wanted:g} mm are wanted: give more candidates or a better measurement'
         )
-    count = FIRST_COUNT
+    count = len(excited.names)  # poses determine several parameters each
     while True:
         count = min(count, len(candidates))
         chosen = choose(excited, candidates, count, criterion, task, apart)

@@ -72,10 +72,11 @@ def compensate_program(compensator: Compensator, program: Program) -> tuple[Prog
     given = program.accelerations
     curve = np.zeros_like(program.velocities) if given is None else given
     speeds = program.velocities[:, columns]
-    velocities, accelerations = _derivatives(
-        compensator, result, speeds, curve[:, columns], approach
-    )
-    result = refused(result, _held(result))
+    rates = (speeds, curve[:, columns])
+    velocities, accelerations = _derivatives(compensator, result, *rates, approach)
+    held = result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1)
+    reason = 'a joint is held at its limit, where its velocity is not defined'
+    result = refused(result, [Refusal(k, reason) for k in np.flatnonzero(held).tolist()])
     result = refused(result, _swings(compensator, result, speeds, velocities - speeds))
     gaps = np.where(np.isnan(result.joints), np.nan, 0.0)
     return (
@@ -94,13 +95,6 @@ def approaches(positions: FloatArray) -> FloatArray:
     moves = np.sign(np.diff(positions, axis=0, prepend=positions[:1]))
     last = np.where(moves != 0.0, np.arange(len(moves))[:, np.newaxis], 0)
     return np.asarray(np.take_along_axis(moves, np.maximum.accumulate(last, axis=0), axis=0))
-
-
-def _held(result: Compensation) -> list[Refusal]:
-    """Return the samples with a joint at its limit that are not refused yet."""
-    held = np.flatnonzero(result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1))
-    reason = 'a joint is held at its limit, where its velocity is not defined'
-    return [Refusal(sample, reason) for sample in held.tolist()]
 
 
 def _swings(

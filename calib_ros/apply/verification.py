@@ -34,10 +34,11 @@ from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.configurations import configurations
 from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
-from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
@@ -47,9 +48,9 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
-LEAST = 5
+NEEDED = 5
 """Configurations from which a verdict is given, those of a fitted frame not counted."""
-MOST = 10_000
+DECIDING = 10_000
 """Configurations up to which it is said how many would decide."""
 LOST = {'base': 2, 'tool': 1}
 """Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
@@ -60,7 +61,7 @@ UNIT = (1e-3, 1e-3)
 """Sigmas [m, rad] that weigh all samples alike."""
 LISTED = 20
 """Configurations up to which each is told of."""
-MOVED = 0.3
+ONE_MOTION = 0.3
 """Share of the error that is left without one common motion, below which that is suspected."""
 
 
@@ -103,7 +104,7 @@ class Verification(Shown):
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
-        even MOST would not.
+        even DECIDING would not.
     common : float
         Share of the RMS error that is left without one common shift and turn of all positions.
     by_program : bool
@@ -192,7 +193,7 @@ def verify(
     moments = moments_of(comparison.after.position, group)
     lost = sum(LOST[frame] for frame in fitted)
     rms = _rms(moments, lost)
-    numbers = np.unique(np.geomspace(len(moments), MOST, 200).astype(int))
+    numbers = np.unique(np.geomspace(len(moments), DECIDING, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     verdict = _decided(tolerance, lower, upper, numbers)
@@ -222,7 +223,7 @@ def _compared(
     return replace(compare(before, after, sets), after=reached), shaped.position
 
 
-def _rms(moments: FloatArray, lost: int, least: int = LEAST) -> float:
+def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     """Return the RMS error [m] of configurations, some of which fitted frames took up."""
     count = len(moments)
     if count - lost < least:
@@ -292,23 +293,21 @@ def _in_new_frames(
     names = [name for each in sets for name in parameters_of(each.tool)[:3]]
     if new_base:
         names = [name for each in sets for name in parameters_of(each.base)] + names
-    unoriented = [replace(each, oriented=np.zeros(len(each), bool)) for each in sets]
-    system = System(tuple(Samples(replace(each, covariance=None), *UNIT) for each in unoriented))
+    none = [np.zeros(len(each), dtype=bool) for each in sets]
+    plain = [replace(s, oriented=n, covariance=None) for s, n in zip(sets, none, strict=True)]
+    system = System(tuple(Samples(each, *UNIT) for each in plain))
     names = list(dict.fromkeys(names))
     known = excited(triangular_factor(chain, names, system), names)
     chain = minimise(chain, known, system).chain
     for tool in dict.fromkeys(each.tool for each in sets):
-        turns = []
-        for each in sets:
-            if each.tool == tool and each.oriented.any():
-                now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]
-                measured = each.rotations[each.oriented]
-                turns.append(np.einsum('nji,njk->ik', now[:, :3, :3], measured))
-        if turns:
+        turns = np.zeros((3, 3))
+        for each in (each for each in sets if each.tool == tool):
+            now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]
+            turns += np.einsum('nji,njk->ik', now[:, :3, :3], each.rotations[each.oriented])
+        if turns.any():
             frame = chain.frame(tool)
-            matrix = frame.matrix.copy()
-            matrix[:3, :3] = matrix[:3, :3] @ se3.nearest_rotation(np.sum(turns, axis=0))
-            chain = chain.with_frame(tool, replace(frame, matrix=matrix))
+            turn = se3.transform(se3.nearest_rotation(turns), np.zeros(3))
+            chain = chain.with_frame(tool, replace(frame, matrix=frame.matrix @ turn))
     return chain
 
 
@@ -374,14 +373,14 @@ def remarks(found: Verification) -> list[str]:
             'with the program as it was before (--commanded)'
         )
     if found.verdict == 'UNDECIDED':
-        enough = f'about {found.needed}' if found.needed else f'not even {MOST}'
+        enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} configurations with the same RMS error would decide')
     if found.tolerance is None and found.holds is False:
         lines.append(
             'the calibration does not hold any more: the error is larger than it was then. Was '
             'the tracker, the target or the robot moved?'
         )
-    if found.common < MOVED:
+    if found.common < ONE_MOTION:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
             'the error would be left: was the measuring device moved? If it stands elsewhere on '

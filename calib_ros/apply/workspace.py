@@ -14,9 +14,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
-LEAST_SHARE = 0.005
-"""Share of all poses that a region must hold to be named."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey(Shown):
@@ -63,8 +60,8 @@ def survey(arm: Calibration, count: int, rng: np.random.Generator) -> Survey:
     """Survey the errors at random configurations within the joint limits."""
     joints = arm.chain.random_joints(count, rng)
     removed, turned = arm.removed(joints)
-    positions = in_base(arm.chain, joints)[:, :3, 3]
-    return Survey(joints, positions, removed, turned, arm.sigma(joints), arm.remaining(joints))
+    positions, sigma = in_base(arm.chain, joints)[:, :3, 3], arm.sigma(joints)
+    return Survey(joints, positions, removed, turned, sigma, np.hypot(sigma, arm.residual or 0.0))
 
 
 def in_base(chain: Chain, joints: FloatArray) -> FloatArray:
@@ -85,13 +82,9 @@ class Spread:
     @classmethod
     def of(cls, errors: FloatArray) -> Spread:
         """Return the figures of errors (N,)."""
-        return cls(
-            float(np.sqrt(np.mean(errors**2))),
-            float(errors.mean()),
-            float(np.median(errors)),
-            float(np.quantile(errors, 0.95)),
-            float(errors.max()),
-        )
+        median, high = np.quantile(errors, [0.5, 0.95])
+        found = (np.sqrt(np.mean(errors**2)), errors.mean(), median, high, errors.max())
+        return cls(*map(float, found))
 
 
 @dataclass(frozen=True)
@@ -114,10 +107,11 @@ RADII = ('close in', 'half way out', 'far out')
 HEIGHTS = ('low', 'at middle height', 'high')
 
 
-def regions(positions: FloatArray, errors: FloatArray) -> tuple[Sector, ...]:
+def regions(positions: FloatArray, errors: FloatArray, least: float = 0.005) -> tuple[Sector, ...]:
     """Return the regions of positions (N, 3) [m], that of the largest RMS error (N,) first.
 
     Radius and height are parted so that each third holds as many poses; azimuth in quadrants.
+    Regions with less than the `least` share of all poses are left out.
     """
     radius, height = np.hypot(positions[:, 0], positions[:, 1]), positions[:, 2]
     azimuth = np.arctan2(positions[:, 1], positions[:, 0])
@@ -130,7 +124,7 @@ def regions(positions: FloatArray, errors: FloatArray) -> tuple[Sector, ...]:
     found = []
     for ring, level, side in np.ndindex(3, 3, 4):
         inside = (rings == ring) & (levels == level) & (sides == side)
-        if inside.sum() < max(1, LEAST_SHARE * len(positions)):
+        if inside.sum() < max(1, least * len(positions)):
             continue
         middle = 0.5 * np.pi * side
         found.append(

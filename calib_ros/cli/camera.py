@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.atomic import write_file
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import add_out, at_least, refuse_existing
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
@@ -31,7 +31,7 @@ def _add_board(parser: argparse.ArgumentParser) -> None:
     add('--square', type=float, required=True, metavar='M', help='from one to the next')
     add('--marker', type=float, required=True, metavar='M', help='side of a marker')
     add('--dictionary', default='DICT_5X5_250', metavar='NAME', help='DICT_APRILTAG_36h11, ...')
-    add_out(group, 'PDF; its YAML is put beside it', 'FILE', needed=True)
+    common.add_out(group, 'PDF; its YAML is put beside it', 'FILE', needed=True)
 
 
 def _add_images(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +41,7 @@ def _add_images(parser: argparse.ArgumentParser) -> None:
     add('--board', type=Path, required=True, metavar='FILE', help='YAML of the board')
     add('--topic', default='', metavar='NAME', help='of the images in a bag, if there are several')
     add('--fewest', type=int, default=6, metavar='N', help='corners that an image must show')
-    add_out(group, 'table: image, corner, u, v', 'FILE', needed=True)
+    common.add_out(group, 'table: image, corner, u, v', 'FILE', needed=True)
 
 
 def _board(options: argparse.Namespace, screen: Screen) -> int:
@@ -67,7 +67,7 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     words = f'{board.type} {board.columns} x {board.rows}, {board.dictionary}; must measure '
     words += f'{width:.2f} x {height:.2f} mm: print in true size (100 %)'
     described = options.out.with_suffix('.yaml')
-    refuse_existing(options, described)
+    common.refuse_existing(options, described)
     write_file(options.out, board_pdf(np.array(rows), board.size, words), overwrite=options.force)
     write_file(described, dump_yaml(content), overwrite=options.force)
     printed = f'{width:.2f} x {height:.2f} mm'
@@ -76,8 +76,8 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _images(options: argparse.Namespace, screen: Screen) -> int:
-    refuse_existing(options, options.out)
-    at_least(options, fewest=1)
+    common.refuse_existing(options, options.out)
+    common.at_least(options, fewest=1)
     board = read_board(options.board)
     with screen.work('looking for corners') as work:
         found = detect(_pictures(options, work), board, options.fewest, screen.say)

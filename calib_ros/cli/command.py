@@ -7,26 +7,16 @@ from __future__ import annotations
 import argparse
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from calib_ros.cli.screen import Screen
 
 
-@dataclass(frozen=True)
-class Command:
-    """What a command does.
+class Command(NamedTuple):
+    """What a command does: `add` its options to a parser, `run` it and return the exit status.
 
-    Attributes
-    ----------
-    add : callable
-        Adds its options to a parser.
-    run : callable
-        Does it, with the options and the screen, and returns the exit status.
-    examples : tuple of str
-        Whole commands for the foot of its help, without "calib_ros".
-
+    `examples` are whole commands for the foot of its help, without "calib_ros".
     """
 
     add: Callable[[argparse.ArgumentParser], None]

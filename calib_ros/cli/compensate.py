@@ -10,15 +10,9 @@ from pathlib import Path
 from calib_ros.apply.compensation import POSITIVE, Compensator, in_words
 from calib_ros.apply.program import compensate_program
 from calib_ros.atomic import write_file
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import (
-    NOT_ACCEPTED,
-    add_calibration,
-    add_chain,
-    add_out,
-    refuse_existing,
-)
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.trajectories import read_program
@@ -28,24 +22,14 @@ from calib_ros.kinematics.chain_file import load_chain
 
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to correct')
-    group.add_argument(
-        'program',
-        type=Path,
-        metavar='PROGRAM',
-        help='.csv with q1 ... qn, or .yaml with a JointTrajectory',
-    )
-    add_chain(group)
-    add_calibration(group)
-    add_out(group, 'the corrected program', 'FILE', needed=True)
+    text = '.csv with q1 ... qn, or .yaml with a JointTrajectory'
+    group.add_argument('program', type=Path, metavar='PROGRAM', help=text)
+    common.add_chain(group)
+    common.add_calibration(group)
+    common.add_out(group, 'the corrected program', 'FILE', needed=True)
     add = parser.add_argument_group('limits').add_argument
-    add(
-        '--tool',
-        nargs=3,
-        type=float,
-        default=Compensator.tool,
-        metavar=('X', 'Y', 'Z'),
-        help='point in the flange frame whose position counts [m]',
-    )
+    text, axes = 'point in the flange frame whose position counts [m]', ('X', 'Y', 'Z')
+    add('--tool', nargs=3, type=float, default=Compensator.tool, metavar=axes, help=text)
     for name, text in (
         ('largest_turn', 'largest correction of a revolute joint [rad]'),
         ('largest_shift', 'largest correction of a prismatic joint [m]'),
@@ -68,7 +52,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
-    refuse_existing(options, options.out)
+    common.refuse_existing(options, options.out)
     if options.out.exists() and options.out.samefile(options.program):
         raise InputError(
             '--out is the program itself: keep it, a program compensated twice is wrong'
@@ -84,7 +68,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
         for refusal in result.refusals:
             screen.warn(refusal.reason, source.places[refusal.sample])
-        return NOT_ACCEPTED
+        return common.NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')
     words, warning = arm.knowledge(result.joints, result.orientation_before)

@@ -10,21 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.atomic import write_file
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import (
-    OF_BAGS,
-    add_chain,
-    add_layout,
-    add_out,
-    add_settings,
-    add_storage,
-    foreign_of,
-    refuse_existing,
-    sessions_of,
-    settings_of,
-)
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.foreign import Foreign, as_csv
@@ -38,18 +27,18 @@ from calib_ros.kinematics.chain_file import load_chain
 def _add_import(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to convert')
     group.add_argument('table', type=Path, metavar='TABLE', help='CSV, text in columns, or .xlsx')
-    add_chain(group, needed=False)
-    add_out(group, 'CSV to write', 'FILE', needed=True)
-    add_layout(parser)
+    common.add_chain(group, needed=False)
+    common.add_out(group, 'CSV to write', 'FILE', needed=True)
+    common.add_layout(parser)
 
 
 def _add_csv2bag(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to convert')
     group.add_argument('csv', type=Path, metavar='TABLE', help='the table')
     group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
-    add_chain(group)
+    common.add_chain(group)
     group.add_argument('--session', metavar='NAME', help='session of the table to use')
-    add_storage(group)
+    common.add_storage(group)
 
 
 def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
@@ -57,15 +46,15 @@ def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
     group.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file')
     group.add_argument('csv', type=Path, metavar='TABLE', help='CSV to write')
     group.add_argument('--force', action='store_true', help='replace what is there already')
-    add_chain(group)
-    add_settings(parser, OF_BAGS)
+    common.add_chain(group)
+    common.add_settings(parser, common.OF_BAGS)
 
 
 def _import(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.table, 'import', 'table')
-    refuse_existing(options, options.out)
+    common.refuse_existing(options, options.out)
     chain = None if options.chain is None else load_chain(options.chain)
-    foreign = foreign_of(options, chain) or Foreign(Layout(), chain)
+    foreign = common.foreign_of(options, chain) or Foreign(Layout(), chain)
     with screen.work(f'converting {options.table.name}'):
         columns, notes = foreign.convert(options.table)
         check_table(columns)
@@ -80,7 +69,7 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
-    table = read_table(options.csv, len(chain.joints), sessions_of(options))
+    table = read_table(options.csv, len(chain.joints), common.sessions_of(options))
     if len(table.fitted) != 1 or table.fitted[0].distances is not None or table.pairs:
         raise InputError('a bag holds poses or positions of one session and one target')
     (fitted,) = table.fitted
@@ -101,9 +90,9 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
 
 def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.bag, 'bag2csv', 'bag')
-    refuse_existing(options, options.csv)
+    common.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
-    session, read = replayed(options.bag, chain, settings_of(options), screen)
+    session, read = replayed(options.bag, chain, common.settings_of(options), screen)
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:

@@ -7,8 +7,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import add_chain, add_out, results
 from calib_ros.cli.screen import Screen
 from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
 from calib_ros.files.vendors import VENDOR_FILES, vendor_files
@@ -22,26 +22,16 @@ def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to export')
     add = group.add_argument
     add('calibration', type=Path, metavar='CALIBRATION', help='calibration.yaml of identify --out')
-    add_chain(group)
-    add_out(group, 'all forms', needed=True)
-    add(
-        '--measured',
-        type=Path,
-        metavar='FILE',
-        help='table with q1 ... qn where tables that cannot be exact are to be best; if not '
-        'given, the whole joint range',
-    )
+    common.add_chain(group)
+    common.add_out(group, 'all forms', needed=True)
+    text = 'table with q1 ... qn where tables that cannot be exact are to be best; if not given, '
+    add('--measured', type=Path, metavar='FILE', help=f'{text}the whole joint range')
     add = parser.add_argument_group('for URDF and drivers').add_argument
     add('--urdf', type=Path, metavar='FILE', help='nominal URDF of the robot, to correct as well')
     add('--base-link', metavar='LINK', help='of the URDF: where the arm starts')
     add('--tip-link', metavar='LINK', help='of the URDF: where the arm ends')
-    add(
-        '--ur-hash',
-        default='',
-        metavar='calib_...',
-        help='checksum that the driver of Universal Robots prints at its start, for '
-        'ur_kinematics.yaml',
-    )
+    text = 'checksum that the driver of Universal Robots prints at its start, for '
+    add('--ur-hash', default='', metavar='calib_...', help=f'{text}ur_kinematics.yaml')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -61,7 +51,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     elif Path(options.chain).suffix in URDF_SUFFIXES:
         urdf = read_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
-    with results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
+    with common.results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
         contents |= {each.name: each.content for each in found}
     for each in found:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'

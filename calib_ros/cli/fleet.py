@@ -9,8 +9,8 @@ import time
 from pathlib import Path
 
 from calib_ros.atomic import write_file
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import INCOMPLETE, NOT_ACCEPTED, at_least
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
@@ -31,13 +31,8 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
     add('--workers', type=int, default=0, metavar='N', help='processes here; default: one a core')
     add('--memory', default='2GiB', metavar='SIZE', help='of each of these, at most')
     group = parser.add_argument_group('alarms')
-    group.add_argument(
-        '--years',
-        type=float,
-        default=YEARS,
-        metavar='N',
-        help='between two false alarms of a robot that is measured every night',
-    )
+    text = 'between two false alarms of a robot that is measured every night'
+    group.add_argument('--years', type=float, default=YEARS, metavar='N', help=text)
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
@@ -48,7 +43,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
 
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')
-    at_least(options, workers=0)
+    common.at_least(options, workers=0)
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)
@@ -78,8 +73,8 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     if options.out is not None:
         screen.say(f'wrote {options.out}: open {options.out / "index.html"}')
     if number['fine'] + number['unreadable'] < len(found):
-        return NOT_ACCEPTED
-    return INCOMPLETE if number['unreadable'] else 0
+        return common.NOT_ACCEPTED
+    return common.INCOMPLETE if number['unreadable'] else 0
 
 
 def _add_history(parser: argparse.ArgumentParser) -> None:

@@ -9,24 +9,11 @@ import json
 import math
 from pathlib import Path
 
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
 from calib_ros.cli.detections import detected
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import (
-    NOT_ACCEPTED,
-    add_chain,
-    add_history,
-    add_identity,
-    add_layout,
-    add_out,
-    add_settings,
-    filing_of,
-    history_of,
-    origin_of,
-    results,
-    settings_of,
-)
 from calib_ros.cli.recalibrate import add_previous, recalibrated
 from calib_ros.cli.results import (
     RESULT_FILES,
@@ -59,67 +46,49 @@ OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to read')
     add = group.add_argument
-    add(
-        'measured',
-        nargs='?',
-        type=Path,
-        metavar='MEASURED',
-        help='a table of measured poses, or a bag: folder, .mcap or .db3',
-    )
+    text = 'a table of measured poses, or a bag: folder, .mcap or .db3'
+    add('measured', nargs='?', type=Path, metavar='MEASURED', help=text)
     add('--csv', type=Path, metavar='FILE', help='the same for a table of any name')
-    add_chain(group)
+    common.add_chain(group)
     add('--session', metavar='NAME', help='session of the table; several joined by commas')
-    add(
-        '--eye-in-hand',
-        action='store_true',
-        help='the poses are those of a fixed target in a camera on the flange',
-    )
-    add(
-        '--largest-loss',
-        type=float,
-        default=LARGEST_LOSS,
-        metavar='SHARE',
-        help='of the messages of a bag, beyond which the result is not accepted; 1: any',
-    )
-    add(
-        '--socket-distance',
-        type=float,
-        metavar='M',
-        help='between two sockets of a place, 0.05 if not given',
-    )
-    add(
-        '--sigma-touch',
-        type=float,
-        metavar='M',
-        help='of heights over touched planes, 1e-4 if not given',
+    text = 'the poses are those of a fixed target in a camera on the flange'
+    add('--eye-in-hand', action='store_true', help=text)
+    loss = 'of the messages of a bag, beyond which the result is not accepted; 1: any'
+    common.add_each(
+        group,
+        float,
+        ('--largest-loss', 'SHARE', LARGEST_LOSS, loss),
+        ('--socket-distance', 'M', None, 'between two sockets of a place, 0.05 if not given'),
+        ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
     )
     group = parser.add_argument_group('what to write')
-    add_out(group, 'calibration, result and report')
-    add_history(group)
+    common.add_out(group, 'calibration, result and report')
+    common.add_history(group)
     group.add_argument('--json', action='store_true', help='print the result as JSON')
     group.add_argument(
         '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
     )
     _add_detections(parser)
-    add_settings(parser)
-    add_layout(parser)
-    add_identity(parser, pdf=True)
+    common.add_settings(parser)
+    common.add_layout(parser)
+    common.add_identity(parser, pdf=True)
     add_previous(parser)
 
 
 def _add_detections(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group('what a camera saw (docs/images.md)').add_argument
-    add('--detections', type=Path, metavar='FILE', help='corners of a board, by calib_ros images')
-    add('--board', type=Path, metavar='FILE', help='YAML of that board')
-    add(
-        '--places',
-        type=Path,
-        metavar='FILE',
-        help='table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
-        'qx qy qz qw of the flange',
+    group = parser.add_argument_group('what a camera saw (docs/images.md)')
+    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
+    common.add_each(
+        group,
+        Path,
+        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
+        ('--board', 'FILE', None, 'YAML of that board'),
+        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
+        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
     )
-    add('--intrinsics', type=Path, metavar='FILE', help='camera_info, by camera_calibration')
-    add('--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given')
+    group.add_argument(
+        '--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given'
+    )
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -129,15 +98,15 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     if options.previous is not None:
         return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
-    history = history_of(options)
-    with results(options, (*RESULT_FILES, 'report.pdf')) as contents:
+    history = common.history_of(options)
+    with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.tolerance, options.pdf)
     if history is not None:
-        problem, measured = found.loaded.problem, options.csv or options.measured
-        judged, used = (*problem.sets, *problem.judging), options.detections or measured
-        about = filing_of(options, problem.chain, judged, used, options.largest_loss)
+        problem, measured = found.loaded.problem, options.csv or options.detections
+        sets, measured = (*problem.sets, *problem.judging), measured or options.measured
+        about = common.filing_of(options, problem.chain, sets, measured, options.largest_loss)
         history.file(row_of(found.result, about, found.warnings))
     for warning in (*found.warnings, *words.remarks(found.result)):
         screen.warn(warning)
@@ -145,7 +114,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))
     else:
         show(found, screen, options.out)
-    return 0 if found.result.accepted else NOT_ACCEPTED
+    return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 
 def _source(options: argparse.Namespace) -> str:
@@ -167,7 +136,7 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     """Return what there is to identify in a table or a bag, and the settings."""
     source = _source(options)
     chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
-    settings = settings_of(options)
+    settings = common.settings_of(options)
     if options.detections is not None:
         loaded = detected(options, chain, settings, screen)
     elif source == 'table':
@@ -186,7 +155,7 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     loaded, settings = _loaded(options, screen)
     configuration = words.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
-    return identified(loaded, settings, screen, origin_of(options, read, configuration))
+    return identified(loaded, settings, screen, common.origin_of(options, read, configuration))
 
 
 COMMANDS = {

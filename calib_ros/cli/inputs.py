@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from calib_ros.cli.options import foreign_of, sessions_of
+from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.files import loading
 from calib_ros.files.bags import Replayed
@@ -34,6 +34,8 @@ def table(
     eye_in_hand: bool = False,
 ) -> Table:
     """Return a table of measurements, laid out as the options say."""
-    foreign = foreign_of(options, chain)
+    foreign = common.foreign_of(options, chain)
     with screen.work(f'reading {path.name}'):
-        return loading.table(path, chain, settings, sessions_of(options), eye_in_hand, foreign)
+        return loading.table(
+            path, chain, settings, common.sessions_of(options), eye_in_hand, foreign
+        )

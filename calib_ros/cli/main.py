@@ -15,7 +15,6 @@ import os
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 # Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
@@ -23,7 +22,6 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
 from calib_ros.cli.command import GROUPS, TEXTS, load
-from calib_ros.cli.kinds import proposal
 from calib_ros.cli.screen import WIDTH, Screen
 from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
 
@@ -79,6 +77,10 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
         print(f'calib_ros {__version__}')
         raise SystemExit(0)
     if name not in TEXTS:
+        from pathlib import Path  # what the overview does not need is slow to load
+
+        from calib_ros.cli.kinds import proposal
+
         words = proposal(Path(name))
         if words is None:
             words = str(UnknownNameError('command', name, TEXTS))

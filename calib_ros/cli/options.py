@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from datetime import datetime, timezone
@@ -61,6 +61,12 @@ OF_BAGS = (
 """Settings by which samples are made of a bag."""
 
 
+def add_each(parser: Group, kind: Callable[[str], Any], *rows: tuple[str, str, Any, str]) -> None:
+    """Add options of one type: name, placeholder, default and help of each."""
+    for name, metavar, default, text in rows:
+        parser.add_argument(name, type=kind, metavar=metavar, default=default, help=text)
+
+
 def add_chain(parser: Group, default: str | None = None, needed: bool = True) -> None:
     """Add the option that names the nominal robot."""
     action = parser.add_argument(
@@ -101,13 +107,8 @@ def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> 
 
 def add_calibration(parser: Group) -> None:
     """Add the option that names a calibration."""
-    parser.add_argument(
-        '--calibration',
-        type=Path,
-        required=True,
-        metavar='RESULT',
-        help='folder of identify --out, or calibration.yaml alone',
-    )
+    text = 'folder of identify --out, or calibration.yaml alone'
+    parser.add_argument('--calibration', type=Path, required=True, metavar='RESULT', help=text)
 
 
 def add_out(
@@ -239,11 +240,8 @@ def add_moved(parser: Group) -> None:
 
 def add_history(parser: Group) -> None:
     """Add the option that says where a result is filed besides."""
-    parser.add_argument(
-        '--history',
-        metavar='DIR',
-        help='file the result there as well, by --serial',
-    )
+    text = 'file the result there as well, by --serial'
+    parser.add_argument('--history', metavar='DIR', help=text)
 
 
 def history_of(options: argparse.Namespace) -> History | None:

@@ -17,18 +17,8 @@ from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_file
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import (
-    add_chain,
-    add_identity,
-    add_out,
-    add_settings,
-    at_least,
-    origin_of,
-    page_of,
-    refuse_existing,
-    settings_of,
-)
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import joints_csv, read_joints
@@ -40,50 +30,35 @@ from calib_ros.report.maps import plan_report
 
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what is wanted')
-    add_chain(group)
+    common.add_chain(group)
     add = group.add_argument
     add('--poses', type=int, metavar='N', help='how many; 25, or what --accuracy needs')
     add('--accuracy', type=float, metavar='MM', help='wanted RMS position error at the task poses')
     add('--iso9283', action='store_true', help='the five test poses of ISO 9283 instead')
     add('--task', type=Path, metavar='FILE', help='CSV q1..qn; random poses if not given')
     add('--taken', type=Path, metavar='FILE', help='CSV q1..qn of poses measured already')
-    add_out(group, 'CSV q1..qn to write, and its report beside it', 'FILE')
+    common.add_out(group, 'CSV q1..qn to write, and its report beside it', 'FILE')
     add = parser.add_argument_group('poses to choose from').add_argument
     add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
     add('--draw', type=int, default=2000, metavar='N', help='random candidates without a file')
     add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
-    add(
-        '--apart',
-        type=float,
-        default=1e-3,
-        metavar='X',
-        help='least move of a joint between poses [rad, m]',
-    )
-    add(
-        '--velocity',
-        type=float,
-        nargs='+',
-        default=[1.0],
-        metavar='V',
-        help='of the joints [rad/s, m/s]',
-    )
+    text = 'least move of a joint between poses [rad, m]'
+    add('--apart', type=float, default=1e-3, metavar='X', help=text)
+    text = 'of the joints [rad/s, m/s]'
+    add('--velocity', type=float, nargs='+', default=[1.0], metavar='V', help=text)
     add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
     add = parser.add_argument_group('what the device sees').add_argument
     add('--measured', choices=('pose', 'position'), default='pose', help='at each pose')
     add('--box', type=float, nargs=6, metavar='M', help='measurable region: lower, upper corner')
     add('--tracker', type=float, nargs=3, metavar='M', help='where the device stands')
-    add(
-        '--axis',
-        type=float,
-        nargs=3,
-        default=[0.0, 0.0, 1.0],
-        metavar='X',
-        help='of the target, to face it',
-    )
+    forward, text = [0.0, 0.0, 1.0], 'of the target, to face it'
+    add('--axis', type=float, nargs=3, default=forward, metavar='X', help=text)
     add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
     add('--world', action='store_true', help='box and tracker are in the world, not in the base')
-    add_settings(parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed'))
-    add_identity(parser)
+    common.add_settings(
+        parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed')
+    )
+    common.add_identity(parser)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -92,7 +67,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     rng = np.random.default_rng(options.seed)
     nowhere = np.zeros((1, len(chain.joints)))
     imagined = measure(chain, nowhere, rng, oriented=options.measured == 'pose')
-    design = Design.of(Problem(chain, imagined, **settings_of(options).for_problem()))
+    design = Design.of(Problem(chain, imagined, **common.settings_of(options).for_problem()))
     visibility = Visibility(
         None if options.box is None else np.reshape(options.box, (2, 3)),
         None if options.tracker is None else np.array(options.tracker),
@@ -115,11 +90,11 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             design.chain,
             joints,
             words,
-            origin_of(options, (options.candidates, options.task, options.taken)),
+            common.origin_of(options, (options.candidates, options.task, options.taken)),
             plan,
             options.accuracy,
         )
-        pages = page_of(report, screen, page.name)
+        pages = common.page_of(report, screen, page.name)
         write_file(options.out, joints_csv(joints), overwrite=options.force)
         for text in pages.values():
             write_file(page, text, overwrite=options.force)
@@ -176,13 +151,13 @@ def _check(options: argparse.Namespace) -> None:
     for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
         if options.iso9283 and getattr(options, name) is not None:
             raise InputError(f'--{name} is of no use with --iso9283')
-    at_least(options, poses=1, draw=1, seed=0, apart=0)
+    common.at_least(options, poses=1, draw=1, seed=0, apart=0)
     if options.accuracy is not None and not options.accuracy > 0.0:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')
     if not all(value > 0.0 for value in options.velocity):
         raise InputError('each --velocity must be positive')
     if options.out is not None:
-        refuse_existing(options, options.out, _page_beside(options.out))
+        common.refuse_existing(options, options.out, _page_beside(options.out))
 
 
 def _page_beside(path: Path) -> Path:

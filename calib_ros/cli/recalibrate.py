@@ -8,7 +8,7 @@ import argparse
 import json
 from collections.abc import Callable
 
-from calib_ros.cli.options import NOT_ACCEPTED, add_moved, at_least, results
+from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import load_calibration
@@ -21,24 +21,16 @@ def add_previous(parser: argparse.ArgumentParser) -> None:
     """Add the options of an earlier calibration."""
     group = parser.add_argument_group('an earlier calibration (docs/history.md)')
     add = group.add_argument
-    add(
-        '--previous',
-        metavar='CALIBRATION',
-        help='bring this one up to date by a few poses, and say what has changed since',
-    )
-    add(
-        '--growth',
-        type=float,
-        default=1e3 * GROWTH,
-        metavar='MM',
-        help='by which lengths wander in a year; angles by twice as many mrad',
-    )
-    add_moved(group)
+    text = 'bring this one up to date by a few poses, and say what has changed since'
+    add('--previous', metavar='CALIBRATION', help=text)
+    text = 'by which lengths wander in a year; angles by twice as many mrad'
+    add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
+    common.add_moved(group)
 
 
 def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], screen: Screen) -> int:
     """Bring the earlier calibration up to date; return the exit status."""
-    with results(options, FILES) as contents:
+    with common.results(options, FILES) as contents:
         found = _found(options, loaded(), screen)
         contents['result.json'] = _document(found)
         if found.accepted:
@@ -47,11 +39,11 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
         screen.data(_document(found))
     else:
         screen.title(found.in_words(), found.accepted)
-    return 0 if found.accepted else NOT_ACCEPTED
+    return 0 if found.accepted else common.NOT_ACCEPTED
 
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
-    at_least(options, growth=0)
+    common.at_least(options, growth=0)
     previous = load_calibration(options.previous, loaded.problem.chain)
     for warning in loaded.warnings:
         screen.warn(warning)

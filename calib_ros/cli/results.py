@@ -65,8 +65,11 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     screen.table(_rows(result))
     for each in advice(result.refusals):
         screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
-    for note in words.notes(result) if result.accepted else ():
-        screen.bullet(note)
+    if result.accepted:
+        for note in words.notes(result):
+            screen.bullet(note)
+    elif result.noise.position > 1.0 and not result.noise.consistent:
+        screen.bullet(words.scatter_in_words(result.noise))
     for line in words.cameras_in_words(result):
         screen.bullet(line)
     if out is None:

@@ -25,10 +25,6 @@ from calib_ros.kinematics.chain_file import (
 )
 
 
-def _add_robots(parser: argparse.ArgumentParser) -> None:
-    del parser
-
-
 def _robots(options: argparse.Namespace, screen: Screen) -> int:
     del options
     lines = [f'{"--chain":21}{"joints":>6}  {"DH table":10}{"length":>8}']
@@ -77,7 +73,7 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
 
 
 COMMANDS = {
-    'robots': Command(_add_robots, _robots, ('robots',)),
+    'robots': Command(lambda parser: None, _robots, ('robots',)),
     'chain': Command(
         _add_chain, _chain, ('chain ur10e', 'chain robot.urdf --tip-link tool0 --out robot.yaml')
     ),

@@ -27,14 +27,7 @@ STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 
 class Screen:
-    """Where a command says what it does.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing but data, warnings and errors.
-
-    """
+    """Where a command says what it does; when `quiet`, nothing but data, warnings and errors."""
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet

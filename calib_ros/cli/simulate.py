@@ -11,16 +11,9 @@ import numpy as np
 
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed
-from calib_ros.cli.options import (
-    NOT_ACCEPTED,
-    add_chain,
-    add_out,
-    add_storage,
-    at_least,
-    origin_of,
-)
 from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import of_bag
@@ -34,14 +27,14 @@ from calib_ros.settings import Settings
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to simulate')
     group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
-    add_chain(group)
+    common.add_chain(group)
     _add_simulation(group)
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to simulate')
-    add_chain(group, 'ur10e')
-    add_out(group, 'what it writes', default=Path('demo'))
+    common.add_chain(group, 'ur10e')
+    common.add_out(group, 'what it writes', default=Path('demo'))
     _add_simulation(group)
 
 
@@ -49,7 +42,7 @@ def _add_simulation(parser: argparse._ArgumentGroup) -> None:
     add = parser.add_argument
     add('--poses', type=int, default=60, metavar='N', help='configurations to measure')
     add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    add_storage(parser)
+    common.add_storage(parser)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -72,7 +65,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         loaded = of_bag(*replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors from it')
         configuration = words.configuration_yaml(options.chain, settings)
-        origin = origin_of(options, [bag], configuration)
+        origin = common.origin_of(options, [bag], configuration)
         found = identified(loaded, settings, screen, origin)
         screen.say('4. writing the report')
         write_files(folder, result_files(found, screen, options.out))
@@ -80,12 +73,12 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
     screen.say('identified offsets against the true ones [mm, mrad]:')
     screen.say(against)
     show(found, screen, options.out)
-    return 0 if found.result.accepted else NOT_ACCEPTED
+    return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 
 def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
     """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
-    at_least(options, poses=1, seed=0)
+    common.at_least(options, poses=1, seed=0)
     rng, cell = np.random.default_rng(options.seed), Cell()
     true = faulty(chain, cell, rng)
     configurations = chain.random_joints(options.poses, rng)

@@ -9,28 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import (
-    NOT_ACCEPTED,
-    OF_BAGS,
-    Contents,
-    add_calibration,
-    add_chain,
-    add_history,
-    add_identity,
-    add_layout,
-    add_moved,
-    add_out,
-    add_settings,
-    filing_of,
-    history_of,
-    origin_of,
-    page_of,
-    results,
-    settings_of,
-)
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.rows import verified
@@ -55,50 +37,40 @@ TITLES = {
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to judge')
     add = group.add_argument
-    add(
-        'measured',
-        type=Path,
-        metavar='MEASURED',
-        help='new measurements: a bag, or a table with q1..qn as reported, x y z ...',
-    )
-    add_chain(group)
-    add_calibration(group)
-    add(
-        '--commanded',
-        type=Path,
-        metavar='FILE',
-        help='the program before its correction, q1..qn: judge against the poses that it means',
-    )
+    text = 'new measurements: a bag, or a table with q1..qn as reported, x y z ...'
+    add('measured', type=Path, metavar='MEASURED', help=text)
+    common.add_chain(group)
+    common.add_calibration(group)
+    text = 'the program before its correction, q1..qn: judge against the poses that it means'
+    add('--commanded', type=Path, metavar='FILE', help=text)
     add('--session', metavar='NAME', help='session of the table')
-    add_moved(group)
+    common.add_moved(group)
     group = parser.add_argument_group('how to judge')
-    group.add_argument(
-        '--tolerance',
-        type=float,
-        metavar='MM',
-        help='wanted RMS position error; if not given, errors only, without a verdict',
+    wanted = 'wanted RMS position error; if not given, errors only, without a verdict'
+    common.add_each(
+        group,
+        float,
+        ('--tolerance', 'MM', None, wanted),
+        ('--confidence', 'SHARE', 0.95, 'of the verdict'),
     )
-    group.add_argument(
-        '--confidence', type=float, default=0.95, metavar='SHARE', help='of the verdict'
-    )
-    add_out(group, 'the report and the residuals')
-    add_history(group)
-    add_settings(parser, OF_BAGS)
-    add_layout(parser)
-    add_identity(parser, pdf=True)
+    common.add_out(group, 'the report and the residuals')
+    common.add_history(group)
+    common.add_settings(parser, common.OF_BAGS)
+    common.add_layout(parser)
+    common.add_identity(parser, pdf=True)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    with results(options, VERIFICATION_FILES) as contents:
+    with common.results(options, VERIFICATION_FILES) as contents:
         status = _verified(options, screen, contents)
     if options.out is not None:
         screen.say(f'wrote {options.out}')
     return status
 
 
-def _verified(options: argparse.Namespace, screen: Screen, contents: Contents) -> int:
+def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
-    history = history_of(options)
+    history = common.history_of(options)
     nominal = load_chain(options.chain)
     arm = load_calibration(options.calibration, nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
@@ -118,21 +90,23 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: Contents) -
     if history is not None:
         judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
         hashed = table_hash(arm.chain)
-        about = filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
+        about = common.filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)
     show(found, screen)
-    status = 0 if found.verdict in ('PASS', 'JUDGED') else NOT_ACCEPTED
+    status = 0 if found.verdict in ('PASS', 'JUDGED') else common.NOT_ACCEPTED
     if options.out is None:
         return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report'):
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
-        report = verification_report(arm.chain, found, poses, origin_of(options, read), warnings)
+        report = verification_report(
+            arm.chain, found, poses, common.origin_of(options, read), warnings
+        )
         contents['residuals.csv'] = poses.table()
         contents['verification.txt'] = f'{in_words(found)}\n'
-        contents |= page_of(report, screen, pdf=options.pdf)
+        contents |= common.page_of(report, screen, pdf=options.pdf)
     return status
 
 
@@ -170,7 +144,7 @@ def _sets(
     options: argparse.Namespace, nominal: Chain, screen: Screen
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
     """Return all that was measured, warnings, and whether stamps are the lines of a table."""
-    settings = settings_of(options)
+    settings = common.settings_of(options)
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
         found = table(options, options.measured, nominal, settings, screen)
         return (*found.fitted, *found.held_out), found.warnings, found.by_line

@@ -12,17 +12,8 @@ import numpy as np
 from calib_ros.apply import placement, workspace
 from calib_ros.apply.placement import AIMS, task_of
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
-from calib_ros.cli.options import (
-    Contents,
-    add_chain,
-    add_identity,
-    add_out,
-    at_least,
-    origin_of,
-    page_of,
-    results,
-)
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
@@ -44,14 +35,10 @@ PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
 def _add(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to map')
     add = group.add_argument
-    add(
-        'result',
-        type=Path,
-        metavar='RESULT',
-        help='folder of identify --out, or a calibrated chain file alone',
-    )
-    add_chain(group)
-    add_out(group, 'tables, words and figures', needed=True)
+    text = 'folder of identify --out, or a calibrated chain file alone'
+    add('result', type=Path, metavar='RESULT', help=text)
+    common.add_chain(group)
+    common.add_out(group, 'tables, words and figures', needed=True)
     add('--poses', type=int, default=20_000, metavar='N', help='random poses of the survey')
     add('--model', choices=MODELS, default='corrected', help='by which the arm is commanded')
     add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
@@ -62,18 +49,18 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add('--region', type=float, nargs=6, metavar='M', help='for the task, lower, upper corner')
     add('--cells', type=int, default=9, metavar='N', help='placements along each axis')
     add('--turns', type=int, default=1, metavar='N', help='turns about the vertical to try')
-    add_identity(parser)
+    common.add_identity(parser)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    at_least(options, poses=100, cells=1, turns=1, seed=0)
-    with results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
+    common.at_least(options, poses=100, cells=1, turns=1, seed=0)
+    with common.results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
     screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
     return 0
 
 
-def _files(options: argparse.Namespace, screen: Screen) -> Contents:
+def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
     """Map, place, print what comes out, and return the files of it."""
     from calib_ros.report import plots
 
@@ -82,7 +69,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> Contents:
     task = _task(options, arm, rng)
     with screen.work('mapping errors over the workspace'):
         survey = workspace.survey(arm, options.poses, rng)
-        contents: Contents = {
+        contents: common.Contents = {
             'workspace.csv': csv_of(('x', 'y', 'z', 'error', 'sigma'), survey.cloud),
             'workspace.png': plots.workspace_png(survey),
         }
@@ -101,11 +88,11 @@ def _files(options: argparse.Namespace, screen: Screen) -> Contents:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    origin = origin_of(options, (calibration_file(options.result),))
+    origin = common.origin_of(options, (calibration_file(options.result),))
     with screen.work('writing the report'):
         report = workspace_report(arm, survey, origin, found)
         contents['workspace.md'] = markdown(report, {})
-        return contents | page_of(report, screen)
+        return contents | common.page_of(report, screen)
 
 
 def _show(survey: Survey, screen: Screen) -> None:

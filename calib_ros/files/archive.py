@@ -23,19 +23,10 @@ CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
 
 
 class Archive:
-    """Files ROBOT_TIME of one robot.
+    """Files ROBOT_TIME of one robot in a folder, which is made if there is none.
 
-    Parameters
-    ----------
-    folder : Path
-        It is made if there is none.
-    robot : str
-        Name of the robot, with its serial number if there are several.
-    joints : int
-        Number of joints.
-    configuration : callable
-        Returns the configuration to write beside a journal.
-
+    The robot's name has its serial number if there are several. `configuration` returns what to
+    write beside a journal.
     """
 
     def __init__(

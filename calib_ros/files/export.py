@@ -70,23 +70,11 @@ def exports(
     joints: FloatArray | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> tuple[Export, ...]:
-    """Return a corrected chain in all forms.
+    """Return a corrected chain in all forms, for a controller that has the nominal one.
 
-    Parameters
-    ----------
-    chain, nominal : Chain
-        The corrected chain and the one that the controller has.
-    joints : (N, n), optional
-        Where tables that cannot be exact should be best [rad or m]; all over the joint range by
-        default.
-    origin : mapping, optional
-        Where the numbers come from, for the record.
-
-    Raises
-    ------
-    ExportError
-        When a file, read back, differs from the chain.
-
+    Tables that cannot be exact are best at some `joints` (N, n) [rad or m], by default all over
+    the joint range. `origin` says where the numbers come from, for the record. A file that, read
+    back, differs from the chain is refused.
     """
     q = anywhere(chain)
     arm = replace(chain, effects=())

@@ -24,13 +24,7 @@ from calib_ros.sampling.sample import Sample
 class Journal:
     """An open journal, which only grows and which no other process can open meanwhile.
 
-    Parameters
-    ----------
-    path : Path
-        The file; it is made if there is none, else rows are added.
-    joints : int
-        Number of joints.
-
+    The file is made if there is none, else rows are added.
     """
 
     def __init__(self, path: Path, joints: int) -> None:

@@ -59,19 +59,10 @@ class Sheet:
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
-    """Read a table.
+    """Read a table of which a layout is known.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    layout : Layout
-        What is known of it.
-    names : sequence of str
-        Columns by which the header is found: the first line that has all of them.
-    known : sequence of str
-        Where `names` holds none but numbers of columns: names by which to know a header.
-
+    The header is the first line that has all columns of some `names`; where these are numbers of
+    columns only, the first with some of the names `known`.
     """
     notes: list[str] = []
     if path.suffix.lower() in SHEETS:
@@ -111,7 +102,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
             rows = _cells(path, text, separator)
             first = next(k for k, (line, _) in enumerate(rows) if line >= start)
     if columns is None:
-        columns = _ragged(path, rows[first:], decimal)
+        columns = _ragged(path, rows[first:], len(header), decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
 
@@ -283,11 +274,13 @@ def _is_number(cell: str, decimal: str) -> bool:
     return True
 
 
-def _ragged(path: Path, rows: Sequence[tuple[int, Sequence[str]]], decimal: str) -> MadeColumns:
+def _ragged(
+    path: Path, rows: Sequence[tuple[int, Sequence[str]]], width: int, decimal: str
+) -> MadeColumns:
     """Return the columns of rows that may end early or have cells in quotes."""
-    cells = zip_longest(*(row for _, row in rows), fillvalue='')
+    cells = zip_longest(*(row for _, row in rows), [''] * width, fillvalue='')
     words = {
-        f'#{k}': [cell.replace(',', '.') if decimal == ',' else cell for cell in column]
+        f'#{k}': [cell.replace(',', '.') if decimal == ',' else cell for cell in column[:-1]]
         for k, column in enumerate(cells, start=1)
     }
     return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)

@@ -45,7 +45,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.problems import with_lenses
 from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses, socket_pairs
 from calib_ros.shown import Shown
-from calib_ros.texts import LARGEST_TABLE, decoded, read_bytes
+from calib_ros.texts import LARGEST_TABLE, csv_text, decoded, read_bytes
 
 Sets = tuple[Observations, ...]
 
@@ -285,8 +285,7 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
     names = columns(joints)
     rows = [cells(sample) for sample in samples]
     used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
-    lines = [','.join(row[k] for k in used) for row in (names, *rows)]
-    return '\n'.join(lines) + '\n'
+    return csv_text([row[k] for k in used] for row in (names, *rows))
 
 
 def _read(path: Path, journal: Sequence[str]) -> tuple[str, tuple[str, ...]]:

@@ -118,21 +118,10 @@ def vendor_files(
 ) -> tuple[Export, ...]:
     """Return a corrected chain as the files of the vendor that its joints are named by, if any.
 
-    Parameters
-    ----------
-    chain, nominal : Chain
-        The corrected chain and the one that it was identified from.
-    origin : mapping, optional
-        Where the numbers come from, for the record.
-    urdf : str, optional
-        The nominal URDF, whose frames are kept.
-    links : mapping, optional
-        `base_link` and `tip_link` between which the URDF has the chain.
-    checksum : str, optional
-        For Universal Robots: the checksum of the robot's factory calibration, by which its driver
-        tells whether a file belongs to the robot. A hash of the numbers by default, which the
-        driver reports as a mismatch, and goes on.
-
+    `origin` is for the record. Frames are those of the nominal `urdf`, if given, which has the
+    chain between `links` (`base_link`, `tip_link`). `checksum` is that of the factory calibration
+    of a robot of Universal Robots, by which its driver tells whether a file belongs to the robot:
+    a hash of the numbers by default, which the driver reports as a mismatch, and goes on.
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(

@@ -7,7 +7,6 @@ Joint values are in q1 ... qn [rad or m], poses in x y z [m] and qx qy qz qw.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import limits
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import csv_text
 
 POSE = (*POSITION, *QUATERNION)
 
@@ -72,8 +72,5 @@ def joints_csv(joints: FloatArray) -> str:
 
 def csv_of(columns: Sequence[str], values: FloatArray) -> str:
     """Return the CSV text of values (N, C); NaN is left empty."""
-    rows = (
-        ','.join('' if math.isnan(value) else f'{value:.9f}' for value in row)
-        for row in values.tolist()
-    )
-    return '\n'.join([','.join(columns), *rows]) + '\n'
+    cells = (['' if x != x else f'{x:.9f}' for x in row] for row in values.tolist())
+    return csv_text([columns, *cells])

@@ -84,24 +84,9 @@ def run(
 ) -> Run:
     """Identify all that is new, file it, and write the page of each robot's newest result.
 
-    Parameters
-    ----------
-    robots : sequence of Robot
-        Those of the plant.
-    history : History
-        Where results are looked up and filed.
-    cluster : Cluster
-        It is not asked for where nothing is to be done.
-    out : Path, optional
-        Folder of the report; without it there are no pages.
-    told : callable
-        Called with words, and the share that is done.
-
-    Raises
-    ------
-    LostError
-        When the cluster cannot be reached any more.
-
+    The cluster is not asked for where nothing is to be done. `out` is the folder of the report;
+    without it there are no pages. `told` is called with words, and the share that is done. When
+    the cluster cannot be reached any more a LostError is raised.
     """
     found = Run()
     with ExitStack() as stack:

@@ -32,14 +32,14 @@ from scipy import special
 
 from calib_ros.files.rows import Row
 from calib_ros.identification.changes import (
-    DOUBT,
     Columns,
     Explanation,
     Told,
     explanations,
+    likely,
     reason_in_words,
 )
-from calib_ros.identification.region import KNOWN
+from calib_ros.identification.levels import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -51,17 +51,10 @@ YEARS = 100.0
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """An arm that is another one than before.
+    """An arm that is another one than before, from the first night at `time` on.
 
-    Attributes
-    ----------
-    time : datetime
-        Of the first night after it.
-    seen : datetime
-        Of the night in which it was found.
-    reasons : tuple of Explanation
-        What may have changed, the likeliest first: they cannot be told apart.
-
+    It was found in the night `seen`. `reasons` are what may have changed, the likeliest first:
+    they cannot be told apart.
     """
 
     time: datetime
@@ -129,8 +122,7 @@ def watch(rows: Sequence[Row], years: float = YEARS) -> Watched:
         first, known_up_to = k + 1 - LAGS[lag], k + 1
         columns = Columns(alike[k].corrected(), data.names)
         found = explanations(data.told(tests, lag, k), columns, float(data.freedom[k]))
-        reasons = tuple(each for each in found if each.share > DOUBT) or found[:1]
-        changes.append(Change(alike[first].time, alike[k].time, reasons))
+        changes.append(Change(alike[first].time, alike[k].time, likely(found)))
     nights = tuple(
         Night(row, dict(zip(data.joints, values, strict=True)))
         for row, values in zip(alike, strengths.tolist(), strict=True)

@@ -26,14 +26,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from calib_ros.identification.levels import CERTAIN, CONFIDENT
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
-from calib_ros.identification.validation import CONFIDENCE, Comparison, ParameterRow, log_gain
+from calib_ros.identification.validation import Comparison, ParameterRow, log_gain
 
-CERTAIN = 0.99
-"""Confidence to claim that the error with outliers got worse."""
 WORSE = 0.01
 """Growth of that error that counts, of the RMS; less is how metres happen to lie."""
 MOST_OUTLIERS = 0.35
@@ -59,7 +58,7 @@ def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
     failed = [*_of_the_fit(problem, found)]
     validation = found.validation
     if validation is None:
-        text = 'there are too few configurations to judge the result on any held out'
+        text = 'too few configurations to leave some out of the fit and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
@@ -120,7 +119,7 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
             f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
             f'before, {after.rms_mm:.3f} mm after)',
         )
-    elif found.chance is not None and found.chance > 1.0 - CONFIDENCE:
+    elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
             'the gain may be that of a drift, as of the tracker: moved in time against the joint '

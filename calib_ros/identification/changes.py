@@ -18,7 +18,7 @@ has as many degrees of freedom as z. A change is claimed where chance, over all 
 were tried, reaches the gain in FALSE of the cases at most (Bonferroni). How the explanations
 compare is told by their evidence with z ~ N(0, S), S the size of changes: those of several
 parameters pay for them (Occam's razor; MacKay 1992). Explanations whose share of the evidence is
-above DOUBT cannot be told apart from the best.
+above 1 - CONFIDENT cannot be told apart from the best.
 """
 
 from __future__ import annotations
@@ -30,8 +30,11 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
-from calib_ros.identification.region import KNOWN
+from calib_ros.identification.evidence import SPREAD
+from calib_ros.identification.levels import CONFIDENT, chance_of
+from calib_ros.identification.observations import POSES
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
@@ -39,23 +42,15 @@ from calib_ros.shown import Shown
 
 FALSE = 0.005
 """Probability of claiming a change of an arm that has not changed."""
-DOUBT = 0.05
-"""Share of the evidence from which on an explanation cannot be ruled out."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
 way costs half a unit of the evidence's logarithm."""
-WIDE = 10.0
-"""Sizes of a change that leave its estimate to the data."""
 MOST = 3
 """Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
 """Kinds in the order in which they are named where two of a joint do the same."""
 GAUGE = 1e-6
 """Share of the motion by a parameter that others leave if it is a gauge freedom beside them."""
-POSES = 100
-"""Random poses that stand for the joint range."""
-REACH = 0.3
-"""Length [m] of motion that counts as much as one radian."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,9 +187,8 @@ def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple
         gain, values, covariance = told.explained(matrix)
         inner = matrix.T @ told.information @ matrix
         rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
-        single = special.fdtrc(rank, min(freedom, KNOWN), max(gain, 0.0) / rank)
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        chance = min(1.0, len(sets) * float(single))
+        chance = min(1.0, len(sets) * chance_of(gain, rank, freedom))
         found.append(Explanation(owner, names, gain, chance, share, values, sigma))
     return tuple(sorted(found, key=lambda each: -each.share))
 
@@ -205,9 +199,12 @@ def reasons_of(told: Told, columns: Columns, freedom: float) -> tuple[Explanatio
     None where chance explains it as well.
     """
     found = explanations(told, columns, freedom)
-    if not found or min(each.chance for each in found) > FALSE:
-        return ()
-    return tuple(each for each in found if each.share > DOUBT) or found[:1]
+    return likely(found) if min((each.chance for each in found), default=1.0) <= FALSE else ()
+
+
+def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
+    """Return the best of some explanations, and those that cannot be told apart from it."""
+    return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or tuple(found[:1])
 
 
 class Columns:
@@ -254,7 +251,7 @@ class Columns:
         """Return the covariance (P, P) of changes whose sizes are left to the data."""
         parts = []
         for reason in reasons:
-            sizes = [WIDE * SIZES.get(name.unit, 1.0) for name in reason.names]
+            sizes = [SPREAD * SIZES.get(name.unit, 1.0) for name in reason.names]
             parts.append(self.of(reason.names) * np.array(sizes))
         square = np.hstack(parts)
         return np.asarray(square @ square.T)
@@ -279,7 +276,7 @@ def gauged(
     frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
     columns = list(dict.fromkeys([*frames, *names, *others]))
     rows = ErrorModel(chain, columns).jacobian(q, rng.choice([-1.0, 1.0], q.shape))
-    rows[:, 3:] *= REACH
+    rows[:, 3:] *= LEVER
     flat = rows.reshape(-1, len(columns))
     index = {name: k for k, name in enumerate(columns)}
     fitted = list(dict.fromkeys([*frames, *names]))

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import linalg, special
+from scipy import linalg
 
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration
@@ -29,7 +29,6 @@ from calib_ros.identification.changes import (
     FALSE,
     GAUGE,
     MOST,
-    REACH,
     Columns,
     Explanation,
     Told,
@@ -41,21 +40,15 @@ from calib_ros.identification.changes import (
 from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.region import KNOWN
+from calib_ros.identification.levels import CONFIDENT, chance_of
+from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
-
-POSES = 200
-"""Random poses at which two arms are held against each other."""
-ROWS = 6
-"""Parameters that are shown."""
-DRAWS = 2000
-"""Draws of a difference for the limit of predictions."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,8 +127,8 @@ class Difference(Shown):
         }
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """Return the parameters that differ by the most sigmas, in words."""
-        order = np.argsort(-np.abs(self.change) / self.sigma)[:ROWS]
+        """Return the six parameters that differ by the most sigmas, in words."""
+        order = np.argsort(-np.abs(self.change) / self.sigma)[:6]
         return tuple(
             (
                 self.names[k],
@@ -188,7 +181,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
     predicted = _predicted(chain, names)
-    draws = np.random.default_rng(0).multivariate_normal(change, square, DRAWS, method='eigh')
+    draws = np.random.default_rng(0).multivariate_normal(change, square, 10 * POSES, method='eigh')
     squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)
     return Difference(
         names,
@@ -197,7 +190,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         chance,
         beyond,
         float(np.sqrt(change @ predicted @ change)),
-        float(np.sqrt(np.quantile(squares, 0.95))),
+        float(np.sqrt(np.quantile(squares, CONFIDENT))),
         left,
         tuple(changed),
         _chance(told, freedom, sum(len(each[0].names) for each in changed)),
@@ -222,7 +215,7 @@ def _in_parameters_of(
     poses = other.forward(joints)
     seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     start = replace(chain, base=other.base, tool=other.tool)
-    fit = minimise(start, [*frames, *names], System((Samples(seen, 1e-4, 1e-4 / REACH),)))
+    fit = minimise(start, [*frames, *names], System((Samples(seen, 1e-4, 1e-4 / LEVER),)))
     left = fit.chain.forward(joints)[:, :3, 3] - poses[:, :3, 3]
     change = np.array([fit.chain.offset(name, chain) for name in names])
     return names, chain, change, float(np.sqrt((left**2).sum(axis=1).mean()))
@@ -253,8 +246,7 @@ def _told(names: tuple[Parameter, ...], change: FloatArray, square: FloatArray) 
 def _chance(told: Told, freedom: float, explained: int = 0) -> float:
     """Return the probability of so large a change of all parameters but some by noise."""
     rank = max(1, len(told.names) - explained)
-    squares = max(0.0, told.explained(np.eye(len(told.names)))[0])
-    return float(special.fdtrc(rank, min(freedom, KNOWN), squares / rank))
+    return chance_of(told.explained(np.eye(len(told.names)))[0], rank, freedom)
 
 
 def _predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.leastsquares import System
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
@@ -38,8 +39,6 @@ SLOW = 3
 """Cosines that are taken out of a series at most; no more than one for ten stops."""
 SHIFTS = 400
 """Shifts that are tried at most; the first of them is none."""
-CONSTANT = 1e-9
-"""Share of a column below which what is left without its slowest part is rounding."""
 SINGULAR = 1e-10
 """Eigenvalue of scaled normal equations from which a direction counts."""
 
@@ -112,7 +111,8 @@ class Shifts:
                 whole = np.linalg.norm(series, axis=(1, 2))
                 slow = slow_cosines(len(begins))
                 series -= series @ slow.T @ slow
-                series *= (np.linalg.norm(series, axis=(1, 2)) > CONSTANT * whole)[:, None, None]
+                rounding = np.linalg.norm(series, axis=(1, 2)) <= RANK_TOLERANCE * whole
+                series[rounding] = 0.0
                 products[-1] += self._sampled(_correlated(series, circle))
                 parts.append(series.reshape(len(series), -1))
             rows.append(np.concatenate(parts, axis=1))

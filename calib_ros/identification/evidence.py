@@ -31,13 +31,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from calib_ros.identification.leastsquares import Normal, System, normal_equations
+from calib_ros.identification.leastsquares import ROUNDS, Normal, System, normal_equations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -52,8 +52,6 @@ SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation)."""
 TAILS = 3.0
 """Degrees of freedom of the prior."""
-SURE = 2.0
-"""Standard deviations by which an offset that stands out is larger at first."""
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, whether they are fitted or not."""
 SHOWN, REFUTED = 1.35, 3.0
@@ -62,18 +60,20 @@ which those of usual size are refuted."""
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
 MOST = 2000
-"""Samples from which the sizes are told; of more, every so many are taken."""
+"""Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
-ROUNDS = 60
 LEAST = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
 
 def group_of(chain: Chain, name: str) -> str | None:
     """Return the group of parameters whose errors are of one size; None for frames."""
-    if chain.owns_frame(name):
-        return None
+    return None if chain.owns_frame(name) else _group(name)
+
+
+@lru_cache(maxsize=1024)
+def _group(name: str) -> str:
     if Parameter(name).of_dh:
         return 'length' if Parameter(name).is_length else 'angle'
     group = effects.group_of(name)
@@ -150,6 +150,7 @@ def posterior_of(
     more: Sequence[str] = (),
     doubts: Mapping[str, float] | None = None,
     at_the_fit: Normal | None = None,
+    judging: bool = True,
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
@@ -171,6 +172,8 @@ def posterior_of(
         Parameters that something else than the arm moves as well, with its standard deviation.
     at_the_fit : Normal
         The last normal equations of the fit, if they are known.
+    judging : bool
+        Whether a region is asked for, else nothing is `doubted`.
 
     """
     chain = chain.with_effects(more)
@@ -187,16 +190,16 @@ def posterior_of(
     groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
     evidence = _Evidence(matrix, vector, given, groups)
-    size, near = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    near = evidence.near(size, slope) if judging else ()
     stds = evidence.stds(size)
     priors = {name: std for name, std in zip(every, stds.tolist(), strict=False) if std < np.inf}
     arm = np.s_[: len(every)]
     mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
     solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
-    doubted = [(w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved]
-    own, sizes = offsets[arm], evidence.named(size)
-    square = root @ root.T
-    return Posterior(chain, every, own, mean - own, square, priors, sizes, tuple(doubted))
+    doubted = tuple((w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved)
+    shift, sizes = mean - offsets[arm], evidence.named(size)
+    return Posterior(chain, every, offsets[arm], shift, root @ root.T, priors, sizes, doubted)
 
 
 def _lengths(chain: Chain, system: System) -> dict[str, float]:
@@ -280,10 +283,8 @@ class _Evidence:
         self._own = np.array([group in ('length', 'angle') for group in groups])
         self._tails = np.ones(len(groups))
 
-    def told(
-        self, considered: set[str | None]
-    ) -> tuple[FloatArray, list[tuple[float, FloatArray]]]:
-        """Return the logarithm of the size of each group (G,), and others near by with weights.
+    def told(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
+        """Return the logarithm of the size of each group (G,), and the curvature (G,) there.
 
         Effects that are only considered are of no size where the data would show the usual ones,
         and do not show any.
@@ -292,7 +293,7 @@ class _Evidence:
         if self._own.sum() == self._member.sum():
             free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
             mean, root = _solved(self._matrix, self._vector, free)
-            surely = np.maximum(np.abs(mean) - SURE * np.sqrt((root**2).sum(axis=1)), 0.0)
+            surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt((root**2).sum(axis=1)), 0.0)
             self._lengthen(surely**2, 1.0, size)
         for _ in range(ROUNDS):
             weight = self._weight(size)
@@ -312,9 +313,9 @@ class _Evidence:
                 here, without, usual = self._of(tried).tolist()
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
-        return size, self._near(size, 2.0 * np.maximum(told, 0.0) + width)
+        return size, 2.0 * np.maximum(told, 0.0) + width
 
-    def _near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
+    def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
         """Return sizes that may as well be, with their weights, by the curvature (G,) there.
 
         One group differs at a time, up and down, by as much as makes means right to the second

@@ -77,13 +77,17 @@ class Fitted:
         return self.robust.system
 
     def posterior(
-        self, noise: float, more: Sequence[str] = (), doubts: Mapping[str, float] | None = None
+        self,
+        noise: float,
+        more: Sequence[str] = (),
+        doubts: Mapping[str, float] | None = None,
+        judging: bool = True,
     ) -> Posterior:
         """Return what the data of the fit tell, with `more` effects considered."""
         model, given, names = self.problem.model, self.problem.given, self.names
         known = None if more else self.robust.fit.normal
         return posterior_of(
-            self.chain, model, names, self.system, noise, given, more, doubts, known
+            self.chain, model, names, self.system, noise, given, more, doubts, known, judging
         )
 
 
@@ -140,7 +144,7 @@ def _fit_all(
         problem = guarded
         fitted = _fit(problem, rough, names, simpler)
     size = _told_by(fitted.noise, simpler)
-    told = fitted.posterior(size)
+    told = fitted.posterior(size, judging=False)
     if not _matter(problem, names, told):
         return fitted
     priors = {

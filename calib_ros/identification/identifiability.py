@@ -14,8 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg
+from scipy.linalg import lapack
 
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
@@ -49,6 +51,8 @@ def independent(
     least = np.where(
         [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
     ) * np.linalg.norm(factor, axis=0)
+    if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
+        return tuple(names)  # the diagonal is what is left of each
     basis = np.zeros(factor.shape)
     kept: list[str] = []
     for name, column, short in zip(names, factor.T, least.tolist(), strict=True):
@@ -136,33 +140,20 @@ def structurally_independent(
     return independent(factor, names)
 
 
-MEETING = 1e-10
-"""Distance [m] from which two places are one."""
-MEETING_STEPS = 100
-
-
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
     """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first, of planes the height in the middle; the others are led there by damped
-    Gauss-Newton steps. Those few that do not arrive, stretched, are left out.
+    It is that of the first, of planes the height in the middle. Those few that do not arrive,
+    stretched, are left out.
     """
-    free = [2] if kind.plane else [0, 1, 2]
-    driven = [j.driven for j in chain.joints]
-    model = ErrorModel(chain, driven, kind.base, kind.tool)
-    signs = np.array([joint.sign for joint in chain.joints], dtype=float)
-    places = chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3]
-    wanted = np.array([0.0, 0.0, np.median(places[:, 2])]) if kind.plane else places[0]
-    for _ in range(MEETING_STEPS):
-        left = (wanted - chain.forward(joints, base=kind.base, tool=kind.tool)[:, :3, 3])[:, free]
-        met = np.abs(left).max(axis=1) < MEETING
-        if met.all():
-            break
-        jacobian = model.jacobian(joints)[:, free] * signs
-        square = jacobian @ jacobian.transpose(0, 2, 1) + 1e-6 * np.eye(len(free))
-        step = np.linalg.solve(square, left[..., np.newaxis])
-        joints = joints + (jacobian.transpose(0, 2, 1) @ step)[..., 0]
-    return joints[met], wanted
+    places = chain.forward(joints, base=kind.base, tool=kind.tool)
+    place = places[0, :3, 3].copy()
+    if kind.plane:
+        place[:] = 0.0, 0.0, np.median(places[:, 2, 3])
+    places[:, :3, 3] = place
+    part = slice(2, 3) if kind.plane else slice(3)
+    found = solve(chain, places, joints, kind.base, kind.tool, part)
+    return found.joints[found.converged], place
 
 
 def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:
@@ -173,7 +164,10 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     equation weighted by its true variance (in units of the one assumed).
     """
     scale = 1.0 / np.linalg.norm(factor, axis=0)
-    inverse = scale[:, np.newaxis] * linalg.solve_triangular(factor * scale, np.eye(len(factor)))
+    inverse, failed = lapack.dtrtri(factor * scale)
+    if failed:
+        raise np.linalg.LinAlgError('singular factor')
+    inverse *= scale[:, np.newaxis]
     if middle is None:
         return np.asarray(inverse @ inverse.T)
     sizes, directions = np.linalg.eigh(inverse.T @ middle @ inverse)

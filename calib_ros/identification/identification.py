@@ -19,6 +19,7 @@ from scipy import special
 
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.acceptance import Findings, refusals, remarks
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior, considered
 from calib_ros.identification.fitting import (
@@ -29,12 +30,12 @@ from calib_ros.identification.fitting import (
     parameter_rows,
 )
 from calib_ros.identification.leastsquares import Fit, System, minimise, normal_equations
+from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.misfits import arms_own
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import distinct
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
-from calib_ros.identification.region import KNOWN, Region, region_of
+from calib_ros.identification.region import Region, region_of
 from calib_ros.identification.robust import MANY, OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import Step, find_step
@@ -252,7 +253,7 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > MANY:
         start = minimise(start, frames, robust.system.spread(MANY)).chain
-    before = minimise(start, frames, robust.system)
+    before = minimise(start, frames, robust.system, tolerance=1e-5)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)

@@ -37,6 +37,8 @@ MOST_ITERATIONS = 1000
 STALLED = 50
 """Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
 LEAST_FALL = 1e-3
+ROUNDS = 60
+"""Steps to a fixed point, which ends in far fewer unless it goes in circles."""
 DAMPED, UNDAMPED = 1e-6, 1e-12
 """Damping, of columns of unit length, with which it begins and below which it ends."""
 WELL_CONDITIONED = 1e9
@@ -233,12 +235,16 @@ def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> Flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Shown):
-    """The chain at the minimum of the weighted squares, and the last normal equations there."""
+    """The chain at the minimum of the weighted squares, and the last normal equations there.
+
+    `left` is how far the last step moved the predictions (RMS, as `STEP_TOLERANCE`).
+    """
 
     chain: Chain
     normal: Normal
     iterations: int
     converged: bool
+    left: float = 0.0
 
 
 def minimise(
@@ -274,7 +280,7 @@ def minimise(
             step = _solve(normal.matrix, normal.gradient, damping)
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
-            return Fit(chain, normal, iteration, True)
+            return Fit(chain, normal, iteration, True, left)
         stalled += 1
         if best.cost < (1.0 - LEAST_FALL) * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)

@@ -17,17 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from calib_ros.identification.configurations import STILL, stops
 from calib_ros.identification.drift import chance
-from calib_ros.identification.observations import STILL, stops
+from calib_ros.identification.levels import CERTAIN, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust
-from calib_ros.identification.steps import BY_CHANCE
 from calib_ros.kinematics.se3 import FloatArray
 
 LEFT = 0.1
 """Share of a joint's range that is left without outliers, up to which only they move it."""
-TOGETHER = 0.01
-"""Probability below which several targets are not off at the same stops."""
 FEWEST, LEAST_STOPS = 4, 50
 """Outliers and stops from which on they are compared with the values of joints."""
 ADVICE = (
@@ -49,11 +47,11 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
         if all_of_it > 10.0 * STILL and part < LEFT * all_of_it:
             return f'{name} moves only in samples that were taken for gross errors: {ADVICE}'
     shared, by_chance = _shared(problem, robust)
-    if shared > 1 and by_chance < TOGETHER:
+    if shared > 1 and by_chance < 1.0 - CERTAIN:
         return f'at {shared} stops all targets were taken for gross errors: {ADVICE}'
     order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
     joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
-    if by_chance < BY_CHANCE:
+    if by_chance < 1.0 - SURE:
         return f'samples that were taken for gross errors go with the values of {joint}: {ADVICE}'
     return None
 

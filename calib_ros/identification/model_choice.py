@@ -27,6 +27,7 @@ from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
+from calib_ros.identification.levels import CERTAIN, SURE
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import log_gain
@@ -35,16 +36,12 @@ from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
-PAYS = 0.999
-"""One-sided confidence that the gain of a group or harmonic must have."""
-CHANCE = 0.01
-"""Probability from which a gain may be that of a drift (see `chance.py`)."""
 LEAST_GAIN = 0.005
 """Least decrease of the RMS error that is worth a group or a harmonic."""
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
-MOST_HARMONICS = 24
 SUBSET = 3000
+"""Samples by which effects are compared; of more, every so many are taken."""
 
 
 def _unheard(stage: str) -> None:
@@ -115,7 +112,7 @@ def choose_effects(
         verdicts[group] = best
         chosen += groups[group]
     found = list(verdicts.values())
-    for _ in range(MOST_HARMONICS):
+    for _ in HARMONICS:
         harmonic = model.strongest_harmonic(chosen, progress)
         if harmonic is None:
             break
@@ -203,11 +200,11 @@ class _Linear:
         found, pays = [], True
         for dealing in range(len(self._folds)):
             before, after = (self._left_out(n, dealing) for n in (chosen, [*chosen, *new]))
-            gain, limit = log_gain(before, after, self._groups, PAYS)
+            gain, limit = log_gain(before, after, self._groups, SURE)
             pays = pays and gain > max(limit, LEAST_GAIN)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
         if pays and self._shifts is not None:
-            pays = chance(self._shares(chosen, [new])[0]) < CHANCE
+            pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return Verdict(what, found[0], found[1], bool(pays))
 
     def strongest_harmonic(
@@ -221,7 +218,7 @@ class _Linear:
         if self._shifts is None or not pairs:
             return None
         shares = self._shares(chosen, pairs, progress)
-        if chance(shares.max(axis=0)) >= CHANCE:
+        if chance(shares.max(axis=0)) >= 1.0 - CERTAIN:
             return None
         return list(pairs[int(np.argmax(shares[:, 0]))])
 

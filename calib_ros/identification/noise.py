@@ -13,14 +13,11 @@ from scipy import special
 from calib_ros.identification import identifiability
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.leastsquares import Fit, System
+from calib_ros.identification.levels import SURE
+from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.shared_errors import shared_errors
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-
-SHARED = 1.2
-"""Ratio from which the errors of one configuration's pairs are taken to be correlated."""
-SIGMA_TEST = 0.999
-"""Confidence at which the chi-squared test of the sigmas given lets them pass."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ def noise_of(
     freedom = counts - taken
     known = freedom > 1e-9
     variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
-    beyond = 0.5 * (1.0 - SIGMA_TEST)
+    beyond = 0.5 * (1.0 - SURE)
     low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
     neighbours = shared_errors(fit, names, system)
@@ -79,7 +76,7 @@ def noise_of(
         neighbours.found,
     )
     together = joint_sums / np.maximum(sums, 1e-300)
-    sizes = np.where(together > SHARED, together, 1.0) * (1.0 if consistent else variances)
+    sizes = np.where(together > SUSPICIOUS, together, 1.0) * (1.0 if consistent else variances)
     middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
     extra, _ = system.extra_rows(fit.chain, names)
     if system.prior is not None:

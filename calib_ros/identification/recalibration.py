@@ -18,7 +18,6 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 import calib_ros
 from calib_ros.errors import InputError
@@ -34,6 +33,7 @@ from calib_ros.identification.changes import (
     reasons_document,
     reasons_of,
 )
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.leastsquares import (
     System,
@@ -41,11 +41,11 @@ from calib_ros.identification.leastsquares import (
     normal_equations,
     products_of,
 )
-from calib_ros.identification.observations import Observations, distinct, numbered
+from calib_ros.identification.levels import chance_of
+from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document
-from calib_ros.identification.region import KNOWN
 from calib_ros.identification.validation import ErrorFigures, left_out
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -58,12 +58,8 @@ GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
 PER_METRE = SIZES['rad'] / SIZES['m']
 """Angles [rad] grow by so much more than lengths [m]."""
-FREE = 10.0
-"""Size [m, rad] that is as good as any."""
 MOST_FOLDS = 20
 """Parts into which the new poses are dealt to judge each by the others."""
-ROUNDS = 4
-"""Linearisations; of changes by millimetres the second moves nothing any more."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -170,7 +166,7 @@ def recalibrate(
         free = [k for k, name in enumerate(arm.names) if name in names]
         square = arm.square.copy()
         square[free], square[:, free] = 0.0, 0.0
-        square[free, free] = FREE**2
+        square[free, free] = 100.0  # m^2, rad^2: anywhere
         arm = replace(arm, chain=minimise(arm.chain, names, system).chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
@@ -222,7 +218,7 @@ class _Found:
     def unexplained(self, square: FloatArray, rows: int, freedom: float) -> float:
         """Return the probability of squares as large as those that are left."""
         left = self.squares - float(self.told.vector @ self.told.mean(square)[0])
-        return float(special.fdtrc(rows, min(freedom, KNOWN), max(left, 0.0) / rows))
+        return chance_of(left, rows, freedom)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +242,7 @@ class _Arm:
     def solved(self, system: System) -> _Found:
         """Return the mean change given the new poses, relinearised until it stands still."""
         change = np.zeros(len(self.names))
-        for _ in range(ROUNDS):
+        for _ in range(4):  # of changes by millimetres the second moves nothing any more
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
             normal = normal_equations(chain, self.names, system)
             told = Told(self.names, normal.matrix, normal.gradient + normal.matrix @ change)

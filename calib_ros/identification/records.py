@@ -15,7 +15,7 @@ from calib_ros.errors import ConfigError
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
@@ -26,10 +26,6 @@ from calib_ros.values import parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, whether a camera on the flange measured, whether it is a socket; device or target."""
-SAME = 1e-9
-"""Numbers [m, rad] of two nominal chains that differ by less are the same."""
-FRAME_POSES = 300
-"""Poses to which the frames of the nominal arm are fitted."""
 
 
 def packed(square: FloatArray) -> list[str]:
@@ -133,7 +129,7 @@ def check_nominal(
     for name, row in (_rows(known, nominal, where) if told else {}).items():
         for kind, value in row.items():
             wanted = nominal.value(f'{name}.{kind}')
-            if abs(value - wanted) > SAME:
+            if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits are written
                 raise ConfigError(
                     f'{where} was identified from another nominal chain, with {name}.{kind} '
                     f'{value:.9g} and not {wanted:.9g}: give that one, or identify again'
@@ -184,7 +180,7 @@ def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: st
     known = _known(record, where)
     if {'base', 'tool'} & set(known):
         return replace(nominal, **parse_frames(known, f'{where}: calibration.nominal'))
-    joints = nominal.random_joints(FRAME_POSES, np.random.default_rng(0))
+    joints = nominal.random_joints(POSES, np.random.default_rng(0))
     poses = chain.forward(joints)
     wanted = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     start = replace(

@@ -28,7 +28,8 @@ from scipy import special
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.levels import KNOWN
+from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.records import packed, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
@@ -39,13 +40,7 @@ from calib_ros.shown import Shown
 
 RISK = 0.02
 """Probability at which a calibration may make the arm worse over the poses of a shell."""
-DRAWN = 200
-"""Random configurations that stand for the range of the joints."""
-MEASURED = 100
-"""Measured configurations that stand for all of them."""
-KNOWN = 1e9
-"""Degrees of freedom that are as good as infinite."""
-SHELL = 10
+SHELL = POSES // 20
 """Random configurations of a shell."""
 
 
@@ -173,8 +168,8 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
     ends = sets[0]
-    measured = np.concatenate([each.spread(MEASURED).joints for each in sets])
-    drawn = posterior.chain.random_joints(DRAWN, np.random.default_rng(0))
+    measured = np.concatenate([each.spread(POSES // 2).joints for each in sets])
+    drawn = posterior.chain.random_joints(POSES, np.random.default_rng(0))
     judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
     near, far = np.split(judge.sigma, [len(measured)])
     limit = float(near.max())

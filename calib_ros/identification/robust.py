@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import UnknownNameError
-from calib_ros.identification.leastsquares import Fit, System, minimise
+from calib_ros.identification.leastsquares import ROUNDS, STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -44,9 +44,9 @@ OUTLIER = 6.0
 """Distance beyond which a sample is named as an outlier."""
 MANY = 20_000
 """Samples that tell which of them are gross errors, a sample in ten thousand aside."""
-REWEIGHTINGS = 40
 SUSPICIOUS = 1.2
-"""RMS residual [sigma] from which gross errors may hide in it."""
+"""Ratio of residuals to those expected from which gross errors, or errors that the samples of a
+configuration share, may hide in them."""
 SHRUNK = 0.5
 """Ratio of half of the residuals from which a fit is another one, not a detail of the first."""
 NOISE_FREE = 1e-6
@@ -85,7 +85,7 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
     """
     if system.count > MANY:
         few = thorough_fit(chain, names, system.spread(MANY), loss)
-        found = reweighted(few.fit.chain, names, system, loss)
+        found = reweighted(few.fit.chain, names, system, loss, tolerance=0.1)
         return replace(found, iterations=few.iterations + found.iterations)
     first = robust_fit(chain, names, system, loss)
     suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
@@ -110,7 +110,7 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
     if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # led away from a good start
         fit = replace(fit, chain=chain)
         distances = distances_of(chain, names, system)
-    for _ in range(REWEIGHTINGS):
+    for _ in range(ROUNDS):
         before = distances
         bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
         fit = minimise(fit.chain, names, bounded, iterations=2)
@@ -130,8 +130,11 @@ def reweighted(
     system: System,
     loss: str,
     simpler: Sequence[FloatArray] | None = None,
+    tolerance: float = 1e-3,
 ) -> Robust:
     """Fit with the weights of a loss from a start that is good enough to tell gross errors.
+
+    Up to a `tolerance` before these stand still.
 
     With the distances (N,) of all samples by a `simpler` model, samples that it explains are no
     gross errors: a richer model has to explain them as well.
@@ -147,7 +150,7 @@ def reweighted(
     iterations = 0
     settled = False
     weights = [np.ones(0)] * len(system.sets)
-    for _ in range(REWEIGHTINGS):
+    for _ in range(ROUNDS):
         last, weights = weights, [weights_of(d, loss) for d in distances]
         settled = all(
             len(w) == len(b) and np.allclose(w, b, rtol=0, atol=1e-4)
@@ -156,13 +159,15 @@ def reweighted(
         if settled:
             break
         system = system.weighted(weights)
-        fit = minimise(chain, names, system, tolerance=1e-3)
+        fit = minimise(chain, names, system, tolerance)
         chain, iterations = fit.chain, iterations + fit.iterations
         distances = judged(chain)
         if not fit.converged:  # nor will the next one
             break
-    fit = minimise(chain, names, system)
-    return Robust(fit, system, distances, settled, iterations + fit.iterations, loss)
+    if not (settled and fit.left < STEP_TOLERANCE):
+        fit = minimise(chain, names, system)
+        iterations += fit.iterations
+    return Robust(fit, system, distances, settled, iterations, loss)
 
 
 def weights_of(distance: FloatArray, loss: str) -> FloatArray:

@@ -31,23 +31,21 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from calib_ros.identification.configurations import FEWEST
 from calib_ros.identification.leastsquares import Fit, System
-from calib_ros.identification.observations import FEWEST
+from calib_ros.identification.levels import CERTAIN
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
-CONFIDENCE = 0.99
-"""Confidence of all tests together at which neighbours are said to share errors."""
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
 NEAREST = 3
 """Neighbours in joint space of each configuration that are tested."""
 MOST = 400
-"""Stops on which sizes are estimated; of more, every so many runs of RUN are taken."""
-RUN = 20
+"""Stops on which sizes are estimated; of more, every so many runs of a
+twentieth."""
 APART = 1e9
 """Distance of the stops of different sets, which are no neighbours."""
-ROUNDING = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +102,10 @@ class _Stops:
             first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < APART / 2)
             first, second = first[good], second[good]
-        links = csr_array((np.ones(len(first)), (first, second)), shape=(count, count))
-        both = csr_array(links + links.T)
-        both.data[:] = 1.0
-        return both
+        ends = (np.append(first, second), np.append(second, first))
+        links = csr_array((np.ones(2 * len(first)), ends), shape=(count, count))
+        links.data[:] = 1.0
+        return links
 
     def kernel(self, kind: str, length: float) -> FloatArray:
         """Return (n, n): covariance of the sums over each stop's samples, per root of count."""
@@ -120,13 +118,13 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     kinds = tuple(LENGTHS)
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // MOST))
-    few = _gather(fit.chain, names, system, share, RUN)
+    few = _gather(fit.chain, names, system, share, MOST // 20)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < FEWEST:
         return Shared(**correlations, found=(), middles={})
     extra, _ = system.extra_rows(fit.chain, names)
     forms = _Forms(few, extra)
-    limit = special.ndtri(1.0 - (1.0 - CONFIDENCE) / (len(kinds) * len(forms.parts)))
+    limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
     alike: dict[int, list[str]] = {}
     for kind in kinds:
         links = few.links(kind)
@@ -353,7 +351,7 @@ def _successive(
                 decay = float(np.exp(-1.0 / length))
                 so_far = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
                 step = 1
-                while step < so_far.shape[2] and decay**step > ROUNDING**2:
+                while step < so_far.shape[2] and decay**step > ROUNDING:
                     so_far[..., step:] += decay**step * so_far[..., :-step]
                     step *= 2
                 before[k] = so_far[..., -1].copy()

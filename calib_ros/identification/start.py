@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.observations import POSES, Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
 from calib_ros.identification.samples import Samples, residual_arrays
@@ -37,7 +37,6 @@ from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
-SUBSET = 200
 PLANE_AND_TOOL = 14
 """Touches of a plane, one more than unknowns, from which they tell tool and plane at once."""
 DRAWS, DRAWN = 500, 8
@@ -72,7 +71,7 @@ def start_frames(
         alone = replace(observations, base='base', tool='tool')
         if observations.pixels is not None:
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
-            share = -(-(int(alone.images[-1]) + 1) // SUBSET)
+            share = -(-(int(alone.images[-1]) + 1) // POSES)
             alone = board_poses(alone.select(alone.images % share == 0), lens)
         view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
         for key, name in ends.items():
@@ -102,7 +101,7 @@ def _start_one(
         return chain
     if observations.socket:
         return _in_socket(chain, observations)
-    index = np.unique(np.linspace(0, len(observations) - 1, SUBSET).round().astype(int))
+    index = np.unique(np.linspace(0, len(observations) - 1, POSES).round().astype(int))
     subset = observations.select(index)
     system = System((Samples(subset, sigma_position, sigma_orientation),))
     arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)

@@ -26,9 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.identification.drift import inverse_root, slow_cosines
+from calib_ros.identification.configurations import stops
+from calib_ros.identification.drift import SINGULAR, inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
-from calib_ros.identification.observations import stops
+from calib_ros.identification.levels import SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import NOISE_FREE, Robust, weights_of
@@ -36,18 +37,14 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
-MOVED = 0.5
-"""Share of the squares of the residuals from which on a step explains them."""
+EXPLAINED = 0.5
+"""Share of the squares of the residuals from which on something explains them."""
 SUSPECTED = 0.4
 """The same at a stop near by, where not all are looked at first."""
 PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST = 3
 """Stops before and after a step: fewer are gross errors."""
-BY_CHANCE = 1e-3
-"""Probability of so large a share at any place of white residuals; few samples need more."""
-SINGULAR = 1e-8
-"""Eigenvalue of scaled normal equations from which a direction counts."""
 ROWS_NS = 10**15
 """Whole seconds below that are the numbers of rows, in place of stamps."""
 
@@ -131,7 +128,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     if found is None:
         return None
     near = np.abs(places - found.stop) <= np.diff(coarse).max(initial=0)
-    found = scan.best(places[near], MOVED)
+    found = scan.best(places[near], EXPLAINED)
     return None if found is None or scan.drifts(found) else scan.described(found)
 
 
@@ -226,7 +223,7 @@ class _Scan:
             trials = PLACES * len(self._groups)
             chance = trials * special.fdtrc(more, freedom - rank[k], share[k] / more / rest)
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
-            if beyond > least and chance < BY_CHANCE and criterion < lowest:
+            if beyond > least and chance < 1.0 - SURE and criterion < lowest:
                 lowest = criterion
                 change = size[k] * (axes[k] @ (along[k] * inverse[k]))
                 found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))

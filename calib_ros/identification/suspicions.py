@@ -36,6 +36,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.samples import Samples
+from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
@@ -53,13 +54,8 @@ LARGEST_SCALE = 1e-3
 """Growth of an arm by 40 degrees, if all of it is of aluminium."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths that are tried."""
-MANY = 300
-POSES = 24
-"""Poses, spread evenly over those measured, that tell enough: of gravity, of all else."""
 ANOTHER = (2e-3, 5e-3)
 """Least offset [m, rad] of an arm that may be another one than the nominal."""
-EXPLAINED = 0.5
-"""Share of the residual squares that couplings explain, or that gravity must explain more."""
 
 
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
@@ -90,7 +86,7 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
         return 0.0, np.inf, 0.0
     grown = np.array([problem.model.value(n) for n in lengths])
     first = problem.sets[0]
-    joints = first.spread(POSES).joints
+    joints = first.spread().joints
     names = tuple(dict.fromkeys((*result.names, *lengths)))
     rows = ErrorModel(chain, names, first.base, first.tool).jacobian(joints)
     if not first.oriented.any():
@@ -150,7 +146,7 @@ def _sister(problem: Problem, result: Identification) -> str:
     ):
         return ''
     types = [joint.type for joint in problem.chain.joints]
-    joints = problem.sets[0].spread(POSES).joints
+    joints = problem.sets[0].spread().joints
     nominal = _apart(problem.chain, result.chain, joints)
     found = []
     for each in shipped_chains():
@@ -190,8 +186,8 @@ def _gravity(problem: Problem, result: Identification) -> str:
     for k, words in enumerate('xyz'):  # the sign is the coefficients'
         x, y, z = (size * np.eye(3)[k]).tolist()
         chain = replace(straight, gravity=(x, y, z))
-        explained[words] = _explained(problem, chain, rest, bent, MANY)
-    given = _explained(problem, straight, rest, bent, MANY)
+        explained[words] = _explained(problem, chain, rest, bent)
+    given = _explained(problem, straight, rest, bent)
     words, best = max(explained.items(), key=lambda pair: pair[1])
     if not best - given > EXPLAINED * (1.0 - given):
         return ''
@@ -219,10 +215,10 @@ def _coupling(problem: Problem, result: Identification) -> str:
 
 
 def _explained(
-    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str], poses: int = POSES
+    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""
-    few = [each.spread(poses) for each in problem.sets]
+    few = [each.spread() for each in problem.sets]
     rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
     count = len(fitted)
     scale = np.linalg.norm(rows, axis=0)

@@ -22,7 +22,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.leastsquares import System, minimise
+from calib_ros.identification.leastsquares import ROUNDS, System, minimise
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -30,15 +30,13 @@ STARTS = 500
 STEPS = 4
 """Concentration steps from every start; then only the BEST are followed to their end."""
 BEST = 10
-MOST_STEPS = 30
 RELINEARISATIONS = 5
 SUBSET = 300
-"""Samples that are searched, evenly spread over all; the fit that follows takes all."""
-LEAST = 30
-"""Samples of a set that are searched, however many sets there are."""
+"""Samples that are searched, evenly spread over all, of each set a tenth at least; the fit that
+follows takes all."""
 DRAWN = 0.5
 """Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
-RIDGE = 1e-9
+RIDGE = np.sqrt(np.finfo(float).eps)
 """Weight that keeps what a start leaves open where it is, against that of all samples."""
 
 
@@ -60,7 +58,7 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
     masks = masks[np.argsort(sums)[:BEST]]
     half = masks[0]
     for _ in range(RELINEARISATIONS):
-        for _ in range(MOST_STEPS):
+        for _ in range(ROUNDS):
             before = masks
             masks, sums = halves.concentrate(linear.squares(masks))
             if np.array_equal(masks, before):
@@ -86,7 +84,7 @@ def trimmed_sum(chain: Chain, system: System) -> float:
 
 def _thinned(system: System) -> System:
     """Return a part of the samples."""
-    most = max(SUBSET // len(system.sets), LEAST)
+    most = max(SUBSET // len(system.sets), SUBSET // 10)
     return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
 
 

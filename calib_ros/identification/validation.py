@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.leastsquares import System, minimise, without_each
-from calib_ros.identification.observations import Observations, distinct, numbered
+from calib_ros.identification.levels import CONFIDENT, KNOWN
+from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.region import KNOWN
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
@@ -24,8 +25,6 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame
 
-CONFIDENCE = 0.95
-"""One-sided confidence that a gain on held-out poses must have to be claimed."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 
@@ -227,7 +226,7 @@ def _cross_validate(
     )
     folds = _folds(problem, names, count, rows)
     if folds < 2:
-        return None, 'nothing: too few configurations to hold any out'
+        return None, 'nothing: too few configurations to leave any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     chains = zip(
@@ -252,10 +251,15 @@ def left_out(
 
     `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
     """
+    ordered = [
+        each.select(np.argsort(numbers, kind='stable'))
+        for each, numbers in zip(sets, folds, strict=True)
+    ]
     pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
     for k, pair in enumerate(chains):
-        for each, numbers in zip(sets, folds, strict=True):
-            out = each.select(np.flatnonzero(numbers == k))
+        for each, numbers in zip(ordered, folds, strict=True):
+            first = np.count_nonzero(numbers < k)
+            out = each.select(slice(first, first + np.count_nonzero(numbers == k)))
             for side, chain in zip(pieces, pair, strict=True):
                 side.append(residuals(chain, out))
     index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
@@ -361,7 +365,7 @@ def log_gain(
     before: FloatArray,
     after: FloatArray,
     configurations: NDArray[np.intp],
-    confidence: float = CONFIDENCE,
+    confidence: float = CONFIDENT,
 ) -> tuple[float, float]:
     """Return the logarithm of RMS before / RMS after, and how large chance could make it.
 

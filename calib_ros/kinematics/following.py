@@ -29,21 +29,12 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import ITERATIONS, LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, transform
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, transform
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.shown import Shown
 
 Flags = NDArray[np.bool_]
 
-EXACT = 1e-8
-"""Errors [m, rad] below which a pose is reached; steps below which it has converged, in units of
-the largest change."""
-CAUTION = 1e-3
-"""Damping, as a share of the diagonal, after a step that raised the cost."""
-RIDGE = 1e-8
-"""Root of D [m]; against regular singular values, from 1e-4 up, it does not show."""
-NULL_SPACE_RIDGE = 1e-6
-"""The same for arms with more joints than freedoms, whose J^T J is singular everywhere."""
 POSITION_FIRST = 1e-3
 """Metres that a radian counts where not every orientation can be reached: position first."""
 
@@ -126,8 +117,9 @@ class Follower:
         self.complete = freedoms == 6
         self._weight = weight or (LEVER if self.complete else POSITION_FIRST)
         self._first_weight = LEVER if self.complete else self._weight
-        ridge = NULL_SPACE_RIDGE if len(unit) > freedoms else RIDGE
-        self._ridge = ridge**2 * np.eye(len(unit))[:, :, np.newaxis]
+        # where more joints than freedoms make J^T J singular, D stands above its rounding
+        ridge = ROUNDING if len(unit) > freedoms else HALF_THE_DIGITS**2
+        self._ridge = ridge * np.eye(len(unit))[:, :, np.newaxis]
         self._diagonal = np.diag_indices(len(unit))
 
     def solve(
@@ -181,7 +173,9 @@ class Follower:
         x, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
         errors = self._errors(task, x)
         damped = np.zeros_like(converged)
-        rest = np.flatnonzero(~converged | (self.complete & (errors > EXACT).any(axis=1)))
+        rest = np.flatnonzero(
+            ~converged | (self.complete & (errors > HALF_THE_DIGITS).any(axis=1))
+        )
         if rest.size:
             part = task.select(rest)
             stiffness, damped[rest] = self._stiffness(part)
@@ -197,9 +191,9 @@ class Follower:
     ) -> tuple[FloatArray, Flags, int]:
         """Minimise |e|^2 + x^T D x, the cost.
 
-        A step that raises the cost is not taken, and tried again with more damping (Marquardt
-        1963). Samples settle for a cost that does not fall any more if told so; else they are
-        given up when x is longer than 1.
+        A step that raises the cost is not taken, and tried again with more damping, from a
+        thousandth of the diagonal on (Marquardt 1963). Samples settle for a cost that does not
+        fall any more if told so; else they are given up when x is longer than 1.
 
         Returns
         -------
@@ -222,7 +216,7 @@ class Follower:
             step = solve_positive(normal, np.where(task.held | still, 0.0, slope))
             new = x + step
             found[:, active] = new
-            settled = still | (np.abs(step).max(axis=0) <= EXACT)
+            settled = still | (np.abs(step).max(axis=0) <= HALF_THE_DIGITS)
             far = ~(settle | (np.einsum('ib,ib->b', new, new) <= 1.0))
             converged[active[settled & ~far]] = True
             going = np.flatnonzero(~settled & ~far)
@@ -239,7 +233,7 @@ class Follower:
             x = np.where(taken, new, x)
             error = np.where(taken, new_error, error)
             columns = np.where(taken, new_columns, columns)
-            caution = np.where(taken, 0.1 * caution, np.maximum(10.0 * caution, CAUTION))
+            caution = np.where(taken, 0.1 * caution, np.maximum(10.0 * caution, 1e-3))
         else:
             found[:, active] = x
         return found, converged, iterations

@@ -31,8 +31,6 @@ TOLERANCE = 1e-9
 ITERATIONS = 100
 DAMPING = (1e-12, 1e-6, 1e3)
 """Least damping, the first one, and that beyond which no step helps [m^2]."""
-DIFFERENCE = 1e-6
-"""Step [rad or m] for the derivatives of effects: exact to 1e-9 of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +60,7 @@ def solve(
     start: FloatArray,
     base: str = 'base',
     tool: str = 'tool',
+    part: slice = slice(6),
 ) -> Inverse:
     """Return the joint values near a start that bring the target to wanted poses.
 
@@ -75,6 +74,8 @@ def solve(
         Joint values [rad or m] to start from.
     base, tool : str
         Frames at the ends of the chain.
+    part : slice
+        What counts of the position and the rotation in world axes, six in all.
 
     """
     aim = Aim(chain, base, tool)
@@ -83,6 +84,7 @@ def solve(
 
     q = _within(chain, np.array(start, dtype=float).T)
     error, columns = aim.linearise(q, None, positions, axes, LEVER)
+    error, columns = error[part], columns[:, part]
     size = np.linalg.norm(error, axis=0)
     least, first, most = DAMPING
     damping = np.full(len(poses), first)
@@ -91,14 +93,15 @@ def solve(
         (active,) = np.nonzero((size > TOLERANCE) & (damping < most))
         if not active.size:
             break
-        part = columns[:, :, active]
-        normal = np.einsum('ikb,jkb->ijb', part, part)
+        own = columns[:, :, active]
+        normal = np.einsum('ikb,jkb->ijb', own, own)
         normal[diagonal] += damping[active]
-        slope = np.einsum('ikb,kb->ib', part, error[:, active])
+        slope = np.einsum('ikb,kb->ib', own, error[:, active])
         tried = _within(chain, q[:, active] + solve_positive(normal, slope))
         new_error, new_columns = aim.linearise(
             tried, None, positions[:, active], axes[:, :, active], LEVER
         )
+        new_error, new_columns = new_error[part], new_columns[:, part]
         new_size = np.linalg.norm(new_error, axis=0)
         better = new_size < size[active]
         damping[active] *= np.where(better, 0.1, 10.0)
@@ -168,11 +171,11 @@ class Aim:
     def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
         """Return the derivative (n, n, B) of the effective joint values by those reported."""
         here = self._chain.effective(q, approach)
-        slope = np.empty((len(q), *q.shape))
+        slope, step = np.empty((len(q), *q.shape)), 1e-6  # right to 1e-9 of what effects add
         for k in range(len(q)):
             moved = q.copy()
-            moved[k] += DIFFERENCE
-            slope[:, k] = (self._chain.effective(moved, approach) - here) / DIFFERENCE
+            moved[k] += step
+            slope[:, k] = (self._chain.effective(moved, approach) - here) / step
         return slope
 
 

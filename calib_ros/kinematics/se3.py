@@ -18,6 +18,8 @@ from scipy.spatial.transform import Rotation
 FloatArray: TypeAlias = NDArray[np.float64]
 ROUNDING = 1e-12
 """Share of the whole from which on a number is more than rounding."""
+HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))
+"""An error whose square is rounding: after such a Newton step nothing is left."""
 
 
 def transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:

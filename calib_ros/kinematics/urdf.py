@@ -35,13 +35,12 @@ from calib_ros.kinematics.chain import (
     Joint,
     JointType,
 )
+from calib_ros.kinematics.inverse import TOLERANCE
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
 
 DIGITS = 14
 """Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
-EXACT = 1e-9
-"""Largest difference [m or 1] of poses by a corrected chain and by the URDF written from it."""
 MOST_JOINTS = 50
 """Joints of a chain; each is five parameters to fit."""
 FAR = 0.2
@@ -159,7 +158,7 @@ def corrected_urdf(
     edited = with_origins(text, origins)
     found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
     q = arm.random_joints(1000, np.random.default_rng(0))
-    if np.abs(found.forward(q) - arm.forward(q)).max() > EXACT:
+    if np.abs(found.forward(q) - arm.forward(q)).max() > TOLERANCE:
         raise ConfigError(
             f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '
             'that: let the tool frame be fitted instead, or add a fixed joint and a link'

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.texts import LARGEST_TEXT
 from calib_ros.values import LARGEST, parse_name
 
@@ -29,10 +29,6 @@ TYPES = (*MOVING, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
 MOST_LINKS = 10_000
 """Links, and joints, of a URDF."""
-SHORTEST_AXIS = 1e-9
-"""Largest component of a joint's axis that shows no direction."""
-UNCHANGED = 1e-13
-"""A position [m] or rotation that would change by less is left as it is written."""
 
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
 
@@ -212,7 +208,7 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     if kind in MOVING:
         axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
         size = np.abs(axis).max()
-        if size < SHORTEST_AXIS:
+        if size < 1e-9:  # a zero as others round it
             raise ConfigError(f'the axis of {where} has no direction')
         axis = axis / size
         axis = axis / np.linalg.norm(axis)
@@ -339,9 +335,9 @@ def _with_origin(tag: str, origin: FloatArray) -> str:
     """Return the text of an origin's tag with another value; what stays is not touched."""
     element = ET.fromstring(tag if tag.endswith('/>') else tag[:-1] + '/>')
     xyz, rpy = (_numbers(element, key, 'origin', '0 0 0') for key in ('xyz', 'rpy'))
-    if np.abs(origin[:3, :3] - _from_rpy(rpy)).max() > UNCHANGED:
+    if np.abs(origin[:3, :3] - _from_rpy(rpy)).max() > ROUNDING:
         tag = _with_attribute(tag, 'rpy', _to_rpy(origin[:3, :3], rpy))
-    if np.abs(origin[:3, 3] - xyz).max() > UNCHANGED:
+    if np.abs(origin[:3, 3] - xyz).max() > ROUNDING:
         tag = _with_attribute(tag, 'xyz', origin[:3, 3])
     return tag
 

@@ -77,7 +77,8 @@ RULES: dict[Rule, Advice] = {
     Rule.COMMON_SENSE: Advice(
         'This does not look like the right arm',
         'A correction as large as this cannot come from manufacturing or wear. Most often '
-        'the description is that of another arm, or units or columns are mixed up.',
+        'the description is that of another arm, or units or columns are mixed up. Little error '
+        'after it proves nothing: so large a correction makes one arm of another.',
         RIGHT_CHAIN,
     ),
     Rule.LARGEST_ERROR: Advice(
@@ -201,7 +202,7 @@ RULES: dict[Rule, Advice] = {
         ),
     ),
     Rule.MISTAKE: Advice(
-        'Something in the input is not what it seems',
+        'A setting does not match the measurements',
         'As given, the measurements do not fit this arm. With the change that is named they do.',
         ('Check whether it is so. If it is, run again with the option that is named.',),
     ),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The poses as the page shows them: one by one, or above MOST in bins, cells and quantiles."""
+"""The poses as the page shows them: one by one, or above SINGLE in bins, cells and quantiles."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import numbers, unit_of
 from calib_ros.report.poses import FITTED, JUDGED, REPEATED, Poses
 
-MOST = 20_000
+SINGLE = 20_000
 """Poses that are shown one by one; of more so many, evenly spread, give the quantiles."""
-LARGEST = 300
+WORST = 300
 """Poses of the largest errors, and outliers, that are listed of more."""
-BINS = 60
+BANDS = 60
 """Parts of the session, and of each joint's values, whose quantiles are shown."""
 CELLS = 24
 """Cells along the longest edge of the workspace."""
@@ -31,7 +31,7 @@ ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'
 
 def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
     """Return the poses as plain values; errors in mm and mrad, positions in m."""
-    many = len(poses) > MOST
+    many = len(poses) > SINGLE
     rows = _worst(poses) if many else np.arange(len(poses))
     shown = poses.select(rows)
     kinds = [['length', 'position error [mm]']]
@@ -80,8 +80,8 @@ def _packed(values: FloatArray) -> str:
 def _worst(poses: Poses) -> NDArray[np.intp]:
     """Return the rows of the largest errors after, and of the largest outliers, in order."""
     error = np.linalg.norm(poses.after, axis=1)
-    good = np.argsort(np.where(poses.outlier, -1.0, error))[-LARGEST:]
-    gross = np.argsort(np.where(poses.outlier, error, -1.0))[-LARGEST:]
+    good = np.argsort(np.where(poses.outlier, -1.0, error))[-WORST:]
+    gross = np.argsort(np.where(poses.outlier, error, -1.0))[-WORST:]
     return np.union1d(good[~poses.outlier[good]], gross[poses.outlier[gross]])
 
 
@@ -98,7 +98,7 @@ def _values(poses: Poses, kind: str, when: str) -> FloatArray:
 def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     """Return quantiles of each kind of error over the session and over each joint's values."""
     good = np.flatnonzero(~poses.outlier)
-    good = good[:: 1 + len(good) // MOST]
+    good = good[:: 1 + len(good) // SINGLE]
     axes = {'session': good + 1.0}
     for k, joint in enumerate(chain.joints):
         axes[f'joint{k}'] = unit_of(joint)[0] * poses.joints[good, k]
@@ -108,8 +108,8 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     }
     found: dict[str, Any] = {}
     for key, values in axes.items():
-        edges = np.linspace(values.min(), values.max(), BINS + 1)
-        place = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, BINS - 1)
+        edges = np.linspace(values.min(), values.max(), BANDS + 1)
+        place = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, BANDS - 1)
         middle = numbers(0.5 * (edges[1:] + edges[:-1]))
         found[key] = {
             kind: {'x': middle}
@@ -124,7 +124,7 @@ def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
     known = ~np.isnan(values)
     values, place = values[known], place[known]
     ordered = values[np.lexsort((values, place))]
-    count = np.bincount(place, minlength=BINS)
+    count = np.bincount(place, minlength=BANDS)
     first = np.cumsum(count) - count
     ranks = np.round(np.outer(SHARES, np.maximum(count - 1, 0))).astype(int)
     table = np.full(ranks.shape, np.nan)

@@ -21,8 +21,6 @@ Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 QUANTILES = 400
 """Points of a curve that stands for any number of poses."""
-BINS = 36
-"""Parts of a joint's range in which poses are counted."""
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
@@ -170,16 +168,18 @@ def unit_of(joint: Joint) -> tuple[float, str, int]:
     return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
 
 
-def coverage(chain: Chain, joints: FloatArray) -> tuple[Figure, tuple[tuple[str, ...], ...]]:
-    """Return how often joint values (N, n) lie where in the range of each, and a table."""
-    counts = np.zeros((len(chain.joints), BINS))
+def coverage(
+    chain: Chain, joints: FloatArray, parts: int = 36
+) -> tuple[Figure, tuple[tuple[str, ...], ...]]:
+    """Return how often joint values (N, n) lie in each part of a joint's range, and a table."""
+    counts = np.zeros((len(chain.joints), parts))
     labels, rows = [], []
     for k, joint in enumerate(chain.joints):
         factor, unit, digits = unit_of(joint)
         lower, upper = joint.range
         low, high = float(joints[:, k].min()), float(joints[:, k].max())
         lower, upper = min(lower, low), max(upper, high)
-        counts[k] = np.histogram(joints[:, k], BINS, (lower, upper))[0]
+        counts[k] = np.histogram(joints[:, k], parts, (lower, upper))[0]
         ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}'
         labels.append(f'{label(joint.name)}: {ends}')
         used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
@@ -187,7 +187,7 @@ def coverage(chain: Chain, joints: FloatArray) -> tuple[Figure, tuple[tuple[str,
         rows.append((joint.name, ends, used, f'{share:.0f} %'))
     mesh = {
         'type': 'heatmap',
-        'x': numbers(100.0 * (np.arange(BINS) + 0.5) / BINS, 4),
+        'x': numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4),
         'y': labels,
         'z': numbers(np.where(counts > 0, counts, np.nan)),
         **scale_of('poses'),

@@ -20,10 +20,6 @@ from calib_ros.report import figures
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.sections import coverage, identity_of
 
-MOST_POSES = 200
-"""Poses of a plan that have a row."""
-MOST_REGIONS = 6
-
 
 def workspace_report(
     arm: Calibration, found: Survey, origin: Origin, placed: Placements | None = None
@@ -53,12 +49,11 @@ def workspace_report(
         ),
         identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 
-def _worst(found: Survey) -> Iterator[Section]:
+def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
     """Return where most is removed, and where what remains is known least."""
     titles = (
         'Where the most is removed by the calibration',
@@ -66,11 +61,11 @@ def _worst(found: Survey) -> Iterator[Section]:
     )
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
-        shown = sectors if len(sectors) <= MOST_REGIONS else (*sectors[:MOST_REGIONS], sectors[-1])
+        shown = sectors if len(sectors) <= most else (*sectors[:most], sectors[-1])
         yield Section(
             f'regions-{label.split()[0]}',
             title,
-            (f'The {MOST_REGIONS} regions of the largest errors, and that of the least.',),
+            (f'The {most} regions of the largest errors, and that of the least.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
             rows=tuple(
                 (
@@ -159,8 +154,7 @@ def plan_report(
         steps=steps,
         identity=identity_of(chain, origin),
         sections=tuple(sections),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 
@@ -180,10 +174,10 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
     return Section('visit', 'Where the target will be', (about,), figures.space(path), height=560)
 
 
-def _listed(chain: Chain, joints: FloatArray) -> Section:
+def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
     """Return the joint values of poses (K, n)."""
     show = [figures.unit_of(joint) for joint in chain.joints]
-    more = f' The first {MOST_POSES} are shown.' if len(joints) > MOST_POSES else ''
+    more = f' The first {most} are shown.' if len(joints) > most else ''
     return Section(
         'poses',
         'The poses',
@@ -191,6 +185,6 @@ def _listed(chain: Chain, joints: FloatArray) -> Section:
         head=('', *(f'{j.name} [{s[1]}]' for j, s in zip(chain.joints, show, strict=True))),
         rows=tuple(
             (str(k + 1), *(f'{s[0] * q:.{s[2]}f}' for s, q in zip(show, row, strict=True)))
-            for k, row in enumerate(joints[:MOST_POSES].tolist())
+            for k, row in enumerate(joints[:most].tolist())
         ),
     )

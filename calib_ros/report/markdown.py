@@ -30,7 +30,7 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
             head, rest = '|' + '---|' * len(each.head), map(_row, each.rows)
             lines += [_row(each.head), head, *rest, '']
     told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
-    told += [(each.name, f'SHA-256 {each.sha256}') for each in report.inputs]
+    told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
     for title, points in (
         ('What to do next', report.steps),
         ('Please note', report.remarks),

@@ -109,8 +109,7 @@ class Report:
     identity: tuple[tuple[str, str], ...] = ()
     explorer: Mapping[str, Any] | None = None
     sections: tuple[Section, ...] = ()
-    inputs: tuple[Input, ...] = ()
-    settings: str = ''
+    origin: Origin = Origin()
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
 
 

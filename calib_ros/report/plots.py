@@ -26,30 +26,6 @@ INCH, MARGIN = 0.0254, 0.01
 BEFORE_COLOUR, AFTER_COLOUR = '#d95f02', '#1b9e77'
 
 
-def draw_errors(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -> None:
-    """Draw the position error of every pose, before and after, with the RMS as a line."""
-    for name, errors, colour in (
-        ('before', before_mm, BEFORE_COLOUR),
-        ('after', after_mm, AFTER_COLOUR),
-    ):
-        rms = np.sqrt(np.mean(errors**2))
-        axes.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
-        axes.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
-    axes.set(xlabel='pose', ylabel='position error [mm]', xlim=(0, len(before_mm)))
-    axes.set_ylim(bottom=0.0)
-    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
-
-
-def draw_distribution(axes: Axes, before_mm: FloatArray, after_mm: FloatArray) -> None:
-    """Draw the share of poses with at most a given position error, before and after."""
-    for errors, colour in ((before_mm, BEFORE_COLOUR), (after_mm, AFTER_COLOUR)):
-        share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
-        axes.plot(np.sort(errors), share, color=colour, drawstyle='steps-post')
-    axes.set(xlabel='position error [mm]', ylabel='poses with at most this error [%]')
-    axes.set(xlim=(0, None), ylim=(0, 100))
-    axes.grid(alpha=0.3)
-
-
 def before_after_png(result: Identification) -> bytes:
     """Return the figure of position errors before and after, on poses that were not fitted."""
     comparison = result.validation or result.fitted
@@ -57,11 +33,23 @@ def before_after_png(result: Identification) -> bytes:
         1e3 * np.linalg.norm(residuals.position[comparison.judged], axis=1)
         for residuals in (comparison.before, comparison.after)
     )
-    figure = Figure(figsize=(10.0, 3.8), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = _figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    draw_errors(left, before, after)
-    draw_distribution(right, before, after)
+    for name, errors, colour in (
+        ('before', before, BEFORE_COLOUR),
+        ('after', after, AFTER_COLOUR),
+    ):
+        rms = np.sqrt(np.mean(errors**2))
+        left.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
+        left.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
+        share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
+        right.plot(np.sort(errors), share, color=colour, drawstyle='steps-post')
+    left.set(xlabel='pose', ylabel='position error [mm]', xlim=(0, len(before)))
+    left.set_ylim(bottom=0.0)
+    left.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
+    right.set(xlabel='position error [mm]', ylabel='poses with at most this error [%]')
+    right.set(xlim=(0, None), ylim=(0, 100))
+    right.grid(alpha=0.3)
     title = f'{one_line(result.chain.name)}, judged by {result.validated_by}'
     figure.suptitle(title, parse_math=False)
     return _png(figure)
@@ -77,45 +65,13 @@ def draw_histogram(axes: Axes, errors_mm: FloatArray, label: str) -> None:
     axes.legend(frameon=False)
 
 
-def draw_map(
-    axes: Axes,
-    edges: tuple[FloatArray, FloatArray],
-    errors_mm: FloatArray,
-    labels: tuple[str, str],
-) -> None:
-    """Draw errors (rows, columns) over the cells of two coordinates with such edges [m]."""
-    mesh = axes.pcolormesh(*edges, errors_mm.T, cmap='viridis', rasterized=True)
-    axes.figure.colorbar(mesh, ax=axes, label='RMS [mm]')
-    axes.set(xlabel=f'{labels[0]} [m]', ylabel=f'{labels[1]} [m]', aspect='equal')
-
-
-def draw_placements(
-    axes: Axes,
-    positions: FloatArray,
-    errors_mm: FloatArray,
-    marks: tuple[int, int],
-    labels: tuple[str, str],
-) -> None:
-    """Draw the errors (M,) of placements at (M, 2) [m], the least in front; mark two of them."""
-    order = np.argsort(-errors_mm)
-    x, y = positions[order].T
-    dots = axes.scatter(x, y, c=errors_mm[order], s=60, cmap='viridis', rasterized=True)
-    axes.figure.colorbar(dots, ax=axes, label='expected error [mm]')
-    for mark, name, shape in zip(marks, ('best', 'centre'), ('*', 'X'), strict=True):
-        label = f'{name}: {errors_mm[mark]:.3f} mm'
-        axes.plot(*positions[mark], shape, color='red', markersize=11, mec='white', label=label)
-    axes.set(xlabel=f'{labels[0]} [m]', ylabel=f'{labels[1]} [m]', aspect='equal')
-    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)
-
-
 def workspace_png(survey: Survey) -> bytes:
     """Return the figure of a survey: what the calibration removes and, if known, what remains."""
     rows = list(survey.parts.items())[:2]
     x, y, z = survey.positions.T
     low, high = np.quantile(z, [0.4, 0.6])
     level = (low <= z) & (z <= high)
-    figure = Figure(figsize=(13.0, 4.0 * len(rows)), layout='constrained')
-    FigureCanvasAgg(figure)
+    figure = _figure(13.0, 4.0 * len(rows))
     grid = figure.subplots(len(rows), 3, squeeze=False)
     for axes, (label, errors) in zip(grid, rows, strict=True):
         draw_histogram(axes[0], 1e3 * errors, label)
@@ -126,24 +82,33 @@ def workspace_png(survey: Survey) -> bytes:
             (axes[2], (x[level], y[level]), 1e3 * errors[level], ('x', 'y')),
         ):
             first, second, rms = rms_map(*pair, part)
-            draw_map(place, (first, second), rms, labels)
+            mesh = place.pcolormesh(first, second, rms.T, cmap='viridis', rasterized=True)
+            figure.colorbar(mesh, ax=place, label='RMS [mm]')
+            _in_metres(place, *labels)
     return _png(figure)
 
 
 def placements_png(placements: Placements) -> bytes:
     """Return the map of a task's placements from above and from two sides."""
     reached = np.flatnonzero(~np.isnan(placements.errors))
-    marks = (
-        int(np.flatnonzero(reached == placements.best)[0]),
-        int(np.flatnonzero(reached == placements.centre)[0]),
-    )
-    figure = Figure(figsize=(15.0, 4.5), layout='constrained')
-    FigureCanvasAgg(figure)
+    reached = reached[np.argsort(-placements.errors[reached])]  # the least in front
+    errors = 1e3 * placements.errors
+    figure = _figure(15.0, 4.5)
     for axes, pair in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
-        labels = ('xyz'[pair[0]], 'xyz'[pair[1]])
-        positions = placements.positions[reached][:, pair]
-        draw_placements(axes, positions, 1e3 * placements.errors[reached], marks, labels)
+        x, y = placements.positions[:, pair].T
+        colours = {'c': errors[reached], 's': 60, 'cmap': 'viridis', 'rasterized': True}
+        dots = axes.scatter(x[reached], y[reached], **colours)
+        figure.colorbar(dots, ax=axes, label='expected error [mm]')
+        for name, k, shape in (('best', placements.best, '*'), ('centre', placements.centre, 'X')):
+            label, look = f'{name}: {errors[k]:.3f} mm', {'markersize': 11, 'mec': 'white'}
+            axes.plot(x[k], y[k], shape, color='red', label=label, **look)
+        _in_metres(axes, 'xyz'[pair[0]], 'xyz'[pair[1]])
+        axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)
     return _png(figure)
+
+
+def _in_metres(axes: Axes, first: str, second: str) -> None:
+    axes.set(xlabel=f'{first} [m]', ylabel=f'{second} [m]', aspect='equal')
 
 
 def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> bytes:
@@ -169,6 +134,13 @@ def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> 
     return buffer.getvalue()
 
 
+def _figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size [inches]."""
+    figure = Figure(figsize=(width, height), layout='constrained')
+    FigureCanvasAgg(figure)
+    return figure
+
+
 def _png(figure: Figure) -> bytes:
     image = BytesIO()
     figure.savefig(image, format='png', dpi=120)
@@ -185,8 +157,7 @@ def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
         return None
     layout = figure['layout']
     count = layout.get('grid', {}).get('columns', 1)
-    paper = Figure(figsize=(9.0, height / 90.0), layout='constrained')
-    FigureCanvasAgg(paper)
+    paper = _figure(9.0, height / 90.0)
     for end, axes in zip(('', '2'), paper.subplots(1, count, squeeze=False)[0], strict=False):
         for each in data:
             if each.get('xaxis', 'x') == f'x{end}':

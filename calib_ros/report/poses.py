@@ -8,8 +8,9 @@ share. Errors are measured minus predicted, of the judged poses by a fit that di
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,12 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import BLOCK
+from calib_ros.settings import Settings
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted only; in the figures; in the figures at a fitted configuration."""
 WHEN = ('before', 'after')
-BLOCK = 50_000
-"""Rows of a table that are in memory as numbers at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,84 +125,76 @@ class Poses:
         return '\n'.join(parts) + '\n'
 
 
-@dataclass
-class _Parts:
-    """Arrays of the sets, one after the other."""
+def _parts(
+    chain: Chain,
+    sigmas: tuple[float, float],
+    sets: Sequence[Observations],
+    comparison: Comparison,
+    role: NDArray[np.str_],
+    sizes: FloatArray,
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """Yield the arrays of each set, with its residuals as `compare` has them."""
+    first = 0
+    for each in sets:
+        rows = slice(first, first + len(each))
+        base = chain.frame(each.base).matrix
+        turn = base[:3, :3]
+        reached = chain.forward(each.joints, each.approach, each.base, each.tool)
+        along = np.eye(3) if each.distances is not None else turn
+        before, after = comparison.before, comparison.after
+        sigma = np.tile(sigmas, (len(each), 1))
+        if each.covariance is not None:
+            variances = np.diagonal(each.covariances(sigmas), axis1=1, axis2=2)
+            sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
+        yield {
+            'joints': each.joints,
+            'stamps_ns': each.stamps_ns,
+            'position': (reached[:, :3, 3] - base[:3, 3]) @ turn,
+            'before': before.position[rows] @ along,
+            'after': after.position[rows] @ along,
+            'turned_before': before.orientation[rows] @ turn,
+            'turned_after': after.orientation[rows] @ turn,
+            'sigma': sigma,
+            'role': role[rows],
+            'outlier': ~comparison.judged[rows],
+            'size': sizes[rows],
+            'tools': chain.frame(each.tool).matrix[np.newaxis],
+        }
+        first += len(each)
 
-    chain: Chain
-    sigmas: tuple[float, float]
-    arrays: dict[str, list[NDArray[np.generic]]] = field(default_factory=dict)
-    tools: list[FloatArray] = field(default_factory=list)
 
-    def add(
-        self,
-        sets: Sequence[Observations],
-        comparison: Comparison,
-        role: NDArray[np.str_],
-        sizes: FloatArray,
-    ) -> None:
-        """Take sets with their residuals, one after the other, as `compare` has them."""
-        first = 0
-        for each in sets:
-            rows = slice(first, first + len(each))
-            turn = self.chain.frame(each.base).matrix[:3, :3]
-            reached = self.chain.forward(each.joints, each.approach, each.base, each.tool)
-            origin = self.chain.frame(each.base).matrix[:3, 3]
-            along = np.eye(3) if each.distances is not None else turn
-            before, after = comparison.before, comparison.after
-            sigma = np.tile(self.sigmas, (len(each), 1))
-            if each.covariance is not None:
-                variances = np.diagonal(each.covariances(self.sigmas), axis1=1, axis2=2)
-                sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
-            found = {
-                'joints': each.joints,
-                'stamps_ns': each.stamps_ns,
-                'position': (reached[:, :3, 3] - origin) @ turn,
-                'before': before.position[rows] @ along,
-                'after': after.position[rows] @ along,
-                'turned_before': before.orientation[rows] @ turn,
-                'turned_after': after.orientation[rows] @ turn,
-                'sigma': sigma,
-                'role': role[rows],
-                'outlier': ~comparison.judged[rows],
-                'size': sizes[rows],
-                'set': np.full(len(each), len(self.tools)),
-            }
-            self.tools.append(self.chain.frame(each.tool).matrix)
-            for name, array in found.items():
-                self.arrays.setdefault(name, []).append(array)
-            first += len(each)
-
-    def joined(self, lines: bool) -> Poses:
-        """Return all of them in the order of their stamps."""
-        arrays = {name: np.concatenate(parts) for name, parts in self.arrays.items()}
-        order = np.argsort(arrays['stamps_ns'], kind='stable')
-        ordered = {name: array[order] for name, array in arrays.items()}
-        return Poses(**ordered, tools=np.array(self.tools), lines=lines)
+def _joined(parts: Sequence[dict[str, NDArray[Any]]], lines: bool) -> Poses:
+    """Return all parts in the order of their stamps."""
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    tools = arrays.pop('tools')
+    arrays['set'] = np.repeat(np.arange(len(parts)), [len(part['joints']) for part in parts])
+    order = np.argsort(arrays['stamps_ns'], kind='stable')
+    ordered = {name: array[order] for name, array in arrays.items()}
+    return Poses(**ordered, tools=tools, lines=lines)
 
 
 def poses_of(problem: Problem, result: Identification, lines: bool = False) -> Poses:
     """Return all poses of an identification, those to judge on by what did not know them."""
-    parts = _Parts(result.chain, (problem.sigma_position, problem.sigma_orientation))
+    known = (result.chain, (problem.sigma_position, problem.sigma_orientation))
     sizes = np.concatenate(result.distances)
     fitted, judged = result.fitted, result.validation
-    held_out = judged is not None and judged.repeated is not None
-    if judged is None or held_out:
-        role = JUDGED if judged is None else FITTED
-        parts.add(problem.sets, fitted, np.full(len(sizes), role), sizes)
+    if judged is None or judged.repeated is not None:
+        role = np.full(len(sizes), JUDGED if judged is None else FITTED)
+        parts = [*_parts(*known, problem.sets, fitted, role, sizes)]
     else:  # each was left out once
-        parts.add(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)
+        parts = [*_parts(*known, problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
     if judged is not None and judged.repeated is not None:
         unknown = np.full(len(judged.judged), np.nan)
-        parts.add(problem.judging, judged, np.where(judged.repeated, REPEATED, JUDGED), unknown)
-    return parts.joined(lines)
+        role = np.where(judged.repeated, REPEATED, JUDGED)
+        parts += _parts(*known, problem.judging, judged, role, unknown)
+    return _joined(parts, lines)
 
 
 def poses_to_verify(
     chain: Chain, sets: Sequence[Observations], comparison: Comparison, lines: bool = False
 ) -> Poses:
     """Return the poses of new measurements, which all judge."""
-    parts = _Parts(chain, (1e-4, 1e-4 / 0.3))
     count = len(comparison.judged)
-    parts.add(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))
-    return parts.joined(lines)
+    role, sizes = np.full(count, JUDGED), np.full(count, np.nan)
+    sigmas = (Settings.sigma_position, Settings.sigma_orientation)
+    return _joined([*_parts(chain, sigmas, sets, comparison, role, sizes)], lines)

@@ -11,9 +11,9 @@ import numpy as np
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
-from calib_ros.identification.validation import CONFIDENCE
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
 from calib_ros.report.advice import SPREAD, advice
@@ -32,8 +32,6 @@ from calib_ros.report.sections import (
     row_of,
 )
 
-LISTED = 50
-"""Outliers that have a row of their own table."""
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -48,7 +46,7 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
-    limits = limits_of(judged, 1, CONFIDENCE)
+    limits = limits_of(judged, 1, CONFIDENT)
     accuracy = [
         row
         for label, which in (('fitted', result.fitted), ('not fitted', result.validation))
@@ -84,8 +82,7 @@ def identification_report(
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 
@@ -182,7 +179,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         said=(f'In figures: {words.noise_in_words(result)}.', *words.chance_in_words(result)),
     )
     if result.outliers:
-        yield _outliers(result, poses)
+        yield _outliers(poses)
     yield from _offsets(problem, result)
     yield _parameters(result)
     yield _correlations(result)
@@ -214,12 +211,12 @@ def _effects(result: Identification) -> Section:
     )
 
 
-def _outliers(result: Identification, poses: Poses) -> Section:
+def _outliers(poses: Poses, most: int = 50) -> Section:
     """Return the outliers of the fit, the largest first, by line or stamp."""
     rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
     rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
-    more = f' The {LISTED} largest are shown.' if len(rows) > LISTED else ''
+    more = f' The {most} largest are shown.' if len(rows) > most else ''
     return Section(
         'outliers',
         f'Outliers: {len(rows)} poses carry no or little weight',
@@ -230,7 +227,7 @@ def _outliers(result: Identification, poses: Poses) -> Section:
         head=('where', 'pose', 'size [usual errors]', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
-            for k in rows[:LISTED].tolist()
+            for k in rows[:most].tolist()
         ),
     )
 

@@ -13,14 +13,15 @@ import numpy as np
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
 from calib_ros.files.rows import is_time
-from calib_ros.identification.validation import CONFIDENCE, Comparison, ErrorFigures
+from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures
 from calib_ros.report.page import Origin, Section
 from calib_ros.report.poses import Poses
 
-INTERVAL = 0.5 + 0.5 * CONFIDENCE
+INTERVAL = 0.5 + 0.5 * CONFIDENT
 """One-sided confidence of each limit of an interval of 95 %."""
 ISO_9283 = (
     'Terms as in ISO 9283: the position accuracy AP is the distance between the pose commanded '

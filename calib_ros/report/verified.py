@@ -76,8 +76,7 @@ def verification_report(
             distribution(poses),
             coverage(chain, poses.joints, 'How far each joint was moved'),
         ),
-        inputs=origin.inputs,
-        settings=origin.settings,
+        origin=origin,
     )
 
 

@@ -26,7 +26,7 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 
-MOST_OUTLIERS = 5
+NAMED = 5
 """Outliers that an answer names."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
@@ -91,10 +91,10 @@ def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, in
     largest = sorted(outliers, key=lambda each: -each.size)
     words = [
         f'sample {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
-        for each in largest[:MOST_OUTLIERS]
+        for each in largest[:NAMED]
     ]
-    if len(largest) > MOST_OUTLIERS:
-        words.append(f'and {len(largest) - MOST_OUTLIERS} more')
+    if len(largest) > NAMED:
+        words.append(f'and {len(largest) - NAMED} more')
     return ', '.join(words)
 
 
@@ -249,15 +249,20 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 
 def noise_in_words(result: Identification) -> str:
     """Return how large the residuals are against the sigmas given."""
-    noise = result.noise
-    text = f'residuals are {noise.position:.2f} times the sigma of position'
+    return f'{scatter_in_words(result.noise)}; {neighbours_in_words(result.noise)}'
+
+
+def scatter_in_words(noise: Noise) -> str:
+    """Return how much more is left than the device should leave."""
+    text = f'what is left is {noise.position:.2f} times the stated noise in position'
     if noise.orientation is not None:
-        text += f' and {noise.orientation:.2f} times that of orientation'
+        text += f' and {noise.orientation:.2f} times in orientation'
     if noise.consistent:
-        text += ', consistent with the sigmas given (chi-squared test)'
-    else:
-        text += '; the sigmas given are wrong, standard deviations follow the residuals'
-    return f'{text}; {neighbours_in_words(noise)}'
+        return f'{text}, consistent with it (chi-squared test)'
+    return (
+        f'{text}: the measurements are not what --sigma-position and --sigma-orientation say; '
+        'intervals follow what is left'
+    )
 
 
 NEIGHBOURS = {
@@ -283,9 +288,8 @@ def chance_in_words(result: Identification) -> list[str]:
     if result.chance is None:
         return []
     return [
-        'time-shifted residuals are explained just as well in '
-        f'{100.0 * result.chance:.1f} % of cases: the chance that the improvement is only tracker '
-        'drift'
+        'chance that the improvement is only tracker drift: '
+        f'{100.0 * result.chance:.1f} % (time-shifted residuals that are explained just as well)'
     ]
 
 

@@ -34,7 +34,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.files.trajectories import RATES, trajectory_program
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.observations import STILL
+from calib_ros.identification.configurations import STILL
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros

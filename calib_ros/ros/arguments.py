@@ -146,15 +146,8 @@ def usage(program: str) -> argparse.ArgumentParser:
 def ros_arguments(given: Mapping[str, str]) -> list[str]:
     """Return ROS arguments of the node for launch arguments; those that are empty are not passed.
 
-    The parameter file comes first: of a parameter that is set twice, ROS takes the later one.
-
-    Raises
-    ------
-    ConfigError
-        When a value is not of the type of its parameter.
-    InputError
-        When there is no parameter file.
-
+    The parameter file comes first: of a parameter that is set twice, ROS takes the later one. A
+    value that is not of the type of its parameter is a ConfigError.
     """
     words = []
     if given.get('params_file'):
@@ -203,21 +196,8 @@ def typed(command: Sequence[str]) -> list[str]:
 def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str]) -> None:
     """Refuse launch arguments that do not exist: `ros2 launch` takes them and does nothing.
 
-    Parameters
-    ----------
-    command : sequence of str
-        The command line: `ros2 launch PACKAGE FILE name:=value ...`.
-    launch_file : str
-        The name of the launch file; where the command names another one, which includes this,
-        its arguments are not looked at.
-    known : sequence of str
-        The names of arguments that exist.
-
-    Raises
-    ------
-    UnknownNameError
-        When there is one.
-
+    Where the command line names another launch file, which includes this one, its arguments are
+    not looked at.
     """
     names = [Path(word).name for word in command]
     if launch_file not in names:

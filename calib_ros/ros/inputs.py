@@ -30,10 +30,8 @@ from calib_ros.sampling.slices import SILENCE
 
 INPUT_QUEUE = 2000
 """Messages of a topic that may wait while the node is busy; what comes on top is lost."""
-IMAGE_QUEUE = 20
+IMAGE_QUEUE = INPUT_QUEUE // 100
 """Images that may wait: of 30 Hz for as long as the node is ever busy."""
-MOST_LOST = 2**30
-"""Messages that may get lost between two reports of DDS: two weeks of 1 kHz."""
 
 
 @dataclass
@@ -66,7 +64,7 @@ class Hearing:
         """
         more = (total - self.told) % 2**32
         self.told = total
-        if more < MOST_LOST:
+        if more < 2**30:  # two weeks of 1 kHz
             self.lost += more
 
     def look(self, now: float, span: float) -> None:

@@ -13,6 +13,7 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.filer import Filer
 from calib_ros.ros.identifying import Identifying, Snapshot
 from calib_ros.ros.inputs import Inputs, deserialised
-from calib_ros.ros.outputs import Exportable, Keeper, Published
+from calib_ros.ros.outputs import Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.running import run
 from calib_ros.ros.to_ros import LATCHED
@@ -57,7 +58,8 @@ TAKING_PERIOD = 0.1
 """Time [s] between two times at which the messages that have come are taken, all at once: one at
 a time, each in a cold cache, they cost three times as much."""
 DIAGNOSTICS_PERIOD = 1.0
-JOIN_TIMEOUT = 1.0
+JOIN_TIMEOUT = DIAGNOSTICS_PERIOD
+"""Time [s] for which the end waits for what was begun."""
 STATUS_LENGTH = 120
 """Most characters of the status: `ros2 topic echo` cuts texts at 128."""
 
@@ -130,12 +132,13 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self.create_service(kind, name, self._answering(name, callback))
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
             ('~/identify', self._to_identify, self._identifying.run),
-            ('~/export', self._to_export, self._keeper.export),
-            ('~/save', self._to_save, self._on_save),
-            ('~/check', self._to_check, self._on_check),
+            ('~/export', self._keeper.exportable, self._keeper.export),
+            ('~/save', self._keeper.to_save, self._on_save),
+            ('~/check', self.session.recent, self._on_check),
         )
         return [
-            DeferredTrigger(self, name, self._answer, begin, work) for name, begin, work in slow
+            DeferredTrigger(self, name, self._answer, partial(self._up_to_now, begin), work)
+            for name, begin, work in slow
         ]
 
     def announce(self) -> None:
@@ -262,8 +265,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     # Services
 
-    def _to_identify(self) -> Snapshot:
+    def _up_to_now(self, begin: Callable[..., Any], *arguments: Any) -> Any:
+        """Begin what a call asks for, with all that has come before it."""
         self._take_messages()
+        return begin(*arguments)
+
+    def _to_identify(self) -> Snapshot:
         return self._identifying.snapshot(self._inputs.topics, self._given.serial)
 
     def _accept(self, found: Calibration, published: Published, samples: Sequence[Sample]) -> None:
@@ -297,10 +304,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         holds, text = words.verdict(calibration, *figures, self.session.reused())
         return holds, text + self._filer.validated(self.session, figures, holds)
 
-    def _to_check(self) -> tuple[Calibration, Problem]:
-        self._take_messages()
-        return self.session.recent()
-
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
         years = years_since(calibration.record)
@@ -317,10 +320,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session.recording = bool(request.data)
         return True, 'recording' if request.data else 'not recording: messages are not used'
 
-    def _to_save(self) -> Published:
-        self._take_messages()
-        return self._keeper.published
-
     def _on_save(self, published: Published) -> Answer:
         return True, f'saved to {", ".join(map(str, self._keeper.save(published)))}'
 
@@ -329,10 +328,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         if self.session.calibration is not None:
             self._guide.show(self.session.calibration)
         return True, self._identifying.last
-
-    def _to_export(self) -> Exportable:
-        self._take_messages()
-        return self._keeper.exportable()
 
     # Topics out
 
@@ -375,10 +370,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self, name: str, callback: Callable[[Any], Answer]
     ) -> Callable[[Any, Any], Any]:
         def answer(request: Any, response: Any) -> Any:
-            def work() -> Answer:
-                self._take_messages()
-                return callback(request)
-
+            work = partial(self._up_to_now, callback, request)
             response.success, response.message = self._boundary.answer(name, work)
             return response
 

@@ -90,16 +90,8 @@ class Keeper:
             self._calibration.publish(String(data=published.text))
             self._broadcast.publish(calibration.chain, calibration.world_frame)
 
-    @property
-    def published(self) -> Published:
-        """Return the calibration to save.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-
-        """
+    def to_save(self) -> Published:
+        """Return the calibration to save."""
         if not self._published.text:
             raise InputError('there is no accepted calibration to save: call ~/identify first')
         return self._published

@@ -24,12 +24,13 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros.arguments import BESIDE_SETTINGS
+from calib_ros.sampling.slices import SILENCE
 from calib_ros.settings import STARTUP, Settings
 
 QOS = 'qos_overrides.'
 OF_ROS = ('use_sim_time', 'start_type_description_service')
 """Parameters that rclpy itself declares."""
-DESCRIPTION_WAIT = 10.0
+DESCRIPTION_WAIT = 2.0 * SILENCE
 """Time [s] for which the node waits for the robot's description."""
 
 
@@ -70,13 +71,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     """Declare all parameters of the node; return what they were set to, and the names that were.
 
     The node was told to declare what is set by itself, for rclpy tells no other way what that is.
-    Each is declared anew here, with what it is for.
-
-    Raises
-    ------
-    ConfigError
-        When a value cannot be, or a parameter was set that does not exist.
-
+    Each is declared anew here, with what it is for. A value that cannot be is a ConfigError.
     """
     overrides = {
         name: each.value
@@ -98,19 +93,15 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
+    plain = ('chain', 'serial', 'history', 'resume', 'autoload', 'socket_distance')
     given = Given(
-        chain=own['chain'],
         links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
-        serial=own['serial'],
-        history=own['history'],
         data_dir=_path(own['data_dir']),
         allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
-        resume=own['resume'],
-        autoload=own['autoload'],
         candidates=_path(own['candidates']),
         frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
-        socket_distance=own['socket_distance'],
         settings=settings,
+        **{name: own[name] for name in plain},
     )
     return given, [*overrides]
 

@@ -39,16 +39,7 @@ _LAYOUTS: dict[str, tuple[int, int, str, int]] = {
 
 
 def decode(kind: str, blobs: Sequence[bytes]) -> Readings | None:
-    """Return messages of one topic as arrays; None where their layouts differ.
-
-    Parameters
-    ----------
-    kind : str
-        Message type: JointState or a type of measurement.
-    blobs : sequence of bytes
-        Serialised messages, each with its encapsulation.
-
-    """
+    """Return serialised messages of one topic and type as arrays; None where layouts differ."""
     first = blobs[0]
     length = len(first)
     if first[:2] != LITTLE_ENDIAN or set(map(len, blobs)) != {length}:

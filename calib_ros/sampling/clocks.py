@@ -13,14 +13,14 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.collector import ADVANCE_NS, Collector
-from calib_ros.sampling.delay import Delay, find_delay
+from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import JOINTS, Piece, Slice, StreamKey, merged
 from calib_ros.settings import Settings
 
-WATCH_NS = 15_000_000_000
+WATCH_NS = round(5e9 * LEAST_MOTION)
 """Time over which a watch looks."""
 DENSE_NS = 4_000_000
 """Time between two samples that it keeps; nearer ones tell no more."""
@@ -28,7 +28,7 @@ MOST_MOVES = 5
 """Moves of the clocks that are remembered."""
 WATCHED = 5 * WATCH_NS // DENSE_NS
 """Samples that it keeps at most, of several streams."""
-CLOCKS_MOVED = 0.05
+CLOCKS_MOVED = SMOOTHING
 """Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
 LOOK_AGAIN_NS = 4 * ADVANCE_NS
 """Time between two looks for the delay."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.hints import Hint, restless, sparse
-from calib_ros.sampling.making import WIDTH, Maker, Numbered
+from calib_ros.sampling.making import WIDTH, Maker, Matched, Numbered
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, MANY, Slice, StreamKey
@@ -31,7 +31,7 @@ from calib_ros.settings import Settings
 
 WINDOW = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
-ADVANCE_NS = 500_000_000
+ADVANCE_NS = round(5e9 * WINDOW)
 """Time of the newest joint sample between two rounds of taking samples."""
 
 
@@ -286,14 +286,11 @@ class Collector:
             motion = self.track.at(stamps[due])
             self._count_causes(motion.cause)
             good = motion.cause == 0
-            found += self.maker.of_each(
-                key,
-                np.searchsorted(ends, stamps[due][good]),
-                rows.stamps[due][good],
-                rows.values[due][good],
-                motion.rows(good),
-                self.delay_ns,
-            )
+            index = np.flatnonzero(due)[good]
+            numbers, stamps = np.searchsorted(ends, stamps[index]), rows.stamps[index]
+            values, motion = rows.values[index], motion.rows(good)
+            matched = Matched(key, numbers, stamps, values, motion, self.delay_ns)
+            found += self.maker.of_each(matched)
             rows.keep(~due)
         self.maker.add(found)
 
@@ -350,15 +347,9 @@ class Collector:
                 more = len(good) - len(np.unique(numbers[good]))
                 if key.images and more:
                     self.unused['poses: of a stop of which one image is used'] += more
-                found += self.maker.of_stops(
-                    key,
-                    numbers[good],
-                    rows.stamps[good],
-                    rows.values[good],
-                    motion,
-                    self.delay_ns,
-                    self.settings.sigma_position,
-                )
+                numbers, stamps, values = numbers[good], rows.stamps[good], rows.values[good]
+                matched = Matched(key, numbers, stamps, values, motion, self.delay_ns)
+                found += self.maker.of_stops(matched, self.settings.sigma_position)
             rows.release(due)
         self.maker.add(found)
 

@@ -19,11 +19,12 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import FEWEST, Stamps
+from calib_ros.settings import Settings
 
 STEP = 5e-3
 """Time between two values of the speeds [s]."""
-LONGEST = 1.0
-"""Largest delay that is looked for [s]."""
+MOST_DELAY = Settings.lateness
+"""Largest delay that is looked for [s]: as late as measurements may come."""
 LEAST_MOTION = 3.0
 """Time in motion that is needed [s]."""
 CONVINCING = 0.8
@@ -59,7 +60,7 @@ def find_delay(
     stamps: Stamps,
     positions: FloatArray,
     rotations: FloatArray | None,
-    max_gap: float = LONGEST,
+    max_gap: float = MOST_DELAY,
 ) -> Delay | None:
     """Return the delay of measurements (N) against joint samples (M); None where none shows.
 
@@ -70,8 +71,8 @@ def find_delay(
         return None
     start = joint_stamps[0]
     joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
-    begin = max(joint_times[0], times[0] - LONGEST)
-    end = min(joint_times[-1], times[-1] + LONGEST)
+    begin = max(joint_times[0], times[0] - MOST_DELAY)
+    end = min(joint_times[-1], times[-1] + MOST_DELAY)
     if end - begin < LEAST_MOTION:
         return None
     begin = max(begin, end - MOST_TIME)
@@ -90,7 +91,7 @@ def find_delay(
     if moving.sum() * STEP < LEAST_MOTION:
         return None
     second = _speed(times, positions, rotations, rotations is not None)
-    most = round(LONGEST / STEP)
+    most = round(MOST_DELAY / STEP)
     lags = STEP * np.arange(-most, most + 1)
     wide = begin + STEP * np.arange(-most, len(grid) + most)
     known = int(np.sum(wide < second[0][0])), int(np.sum(wide <= second[0][-1]))

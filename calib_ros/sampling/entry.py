@@ -26,16 +26,7 @@ class Part(NamedTuple):
 
 
 class Entry:
-    """Lets in what can be used and counts what cannot, by its cause.
-
-    Parameters
-    ----------
-    names : JointNames
-    frames : FrameNames
-    joint_count : int
-        Joints of the chain.
-
-    """
+    """Lets in what can be used and counts what cannot, by its cause."""
 
     def __init__(self, names: JointNames, frames: FrameNames, joint_count: int) -> None:
         self._names, self._frames, self._joint_count = names, frames, joint_count

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.settings import Settings
 
-MOVED = 1e-3
+MOVED = 2.0 * Settings.still
 """A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
 
 

@@ -12,19 +12,9 @@ from calib_ros.sampling.sample import Sample
 
 
 class Kept:
-    """Samples in the order in which they were taken.
+    """Samples in the order in which they were taken; in the frame `wanted`, if any is.
 
-    Parameters
-    ----------
-    frames : FrameNames
-        In which each device has measured.
-    wanted : str
-        Frame that samples must be in, if any must.
-    dropped : Counter
-        What became of measurements that are not used, by cause.
-    changed : callable
-        Called when samples were left out, with one that was taken back.
-
+    `changed` is called when samples were left out, with one that was taken back.
     """
 
     def __init__(

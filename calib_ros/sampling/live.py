@@ -29,9 +29,10 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.errors import CalibrationError
+from calib_ros.identification.configurations import configurations
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import Prior, System, normal_equations
-from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
@@ -92,14 +93,7 @@ class Estimate:
 
 
 class LiveEstimate:
-    """An information filter over the parameters of a problem, as its samples come.
-
-    Parameters
-    ----------
-    problem_of : callable
-        Makes a problem of samples, as the identification will.
-
-    """
+    """An information filter over the parameters of the problem that samples make."""
 
     def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
         self._problem_of = problem_of

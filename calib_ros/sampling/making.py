@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,17 +31,22 @@ VIBRATING = 'poses: still vibrating, or a spike'
 RESTLESS = 'poses: a stop that spreads more than the noise'
 
 
-class Maker:
-    """Makes samples, no two of one stream with the same stamp.
+class Matched(NamedTuple):
+    """Measurements of one stream, in the order of their stamps, and the motion at these.
 
-    Parameters
-    ----------
-    revolute : (n,) bool
-        True for the joints whose values are angles.
-    capacity : int
-        Samples that are made of one stream at most.
-
+    Numbers (N,) are those of their rounds or stops, values (N, WIDTH) are stamped late by a delay.
     """
+
+    key: StreamKey
+    numbers: NDArray[np.intp]
+    stamps: Stamps
+    values: FloatArray
+    motion: Motion
+    delay_ns: int
+
+
+class Maker:
+    """Makes samples, up to a capacity, and no two of one stream with the same stamp."""
 
     def __init__(self, revolute: NDArray[np.bool_], capacity: int) -> None:
         self._revolute, self._capacity = revolute, capacity
@@ -52,24 +57,15 @@ class Maker:
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()
 
-    def of_each(
-        self,
-        key: StreamKey,
-        numbers: NDArray[np.intp],
-        stamps: Stamps,
-        values: FloatArray,
-        motion: Motion,
-        delay_ns: int,
-    ) -> Iterator[Numbered]:
-        """Yield a sample of each of some measurements: values (N, WIDTH) at stamps (N,).
-
-        Each with the number (N,) of its round.
-        """
+    def of_each(self, found: Matched) -> Iterator[Numbered]:
+        """Yield a sample of each of some measurements."""
+        key, numbers, stamps, values, motion, delay_ns = found
         oriented = ~np.isnan(values[:, QUAT.start])
         rotations = np.tile(np.eye(3), (len(values), 1, 1))
         rotations[oriented] = se3.from_quat(values[oriented, QUAT])
         for k, stamp_ns in enumerate(stamps.tolist()):
-            sample = self._made(
+            yield from self._made(
+                int(numbers[k]),
                 key,
                 stamp_ns,
                 values[k : k + 1],
@@ -81,32 +77,20 @@ class Maker:
                 acceleration=motion.acceleration[k].copy(),
                 delay=1e-9 * delay_ns,
             )
-            if sample is not None:
-                yield int(numbers[k]), sample
 
-    def of_stops(
-        self,
-        key: StreamKey,
-        numbers: NDArray[np.intp],
-        stamps: Stamps,
-        values: FloatArray,
-        motion: Motion,
-        delay_ns: int,
-        sigma: float,
-    ) -> Iterator[Numbered]:
+    def of_stops(self, found: Matched, sigma: float) -> Iterator[Numbered]:
         """Yield a sample of the measurements of each stop, unless these spread too much.
 
-        Values (N, WIDTH) of the stops of some numbers (N,), which scatter by `sigma` [m].
+        They scatter by `sigma` [m].
         """
+        key, numbers, stamps, values, motion, delay_ns = found
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         counts = np.diff(begins, append=len(values))
         joints = motion.joints[begins]
         steps = unwrapped(motion.joints - np.repeat(joints, counts, axis=0), self._revolute)
         if key.images:
             joints = joints + mean_of_each(steps, begins, np.ones(len(steps), dtype=bool))
-            yield from self._of_images(
-                key, numbers, begins, stamps, values, joints, motion.approach, delay_ns
-            )
+            yield from self._of_images(found, begins, joints)
             return
         turned = ~np.isnan(values[:, QUAT]).any(axis=1)
         own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
@@ -131,7 +115,8 @@ class Maker:
                 continue
             if left_out:
                 self.dropped[VIBRATING] += left_out
-            sample = self._made(
+            yield from self._made(
+                number,
                 key,
                 int(times[k]),
                 values[begin : begin + count][used],
@@ -142,36 +127,26 @@ class Maker:
                 delay=1e-9 * delay_ns,
                 spread=float(means.spreads[k]),
             )
-            if sample is not None:
-                yield number, sample
 
     def _of_images(
-        self,
-        key: StreamKey,
-        numbers: NDArray[np.intp],
-        begins: NDArray[np.intp],
-        stamps: Stamps,
-        values: FloatArray,
-        joints: FloatArray,
-        approach: FloatArray,
-        delay_ns: int,
+        self, found: Matched, begins: NDArray[np.intp], joints: FloatArray
     ) -> Iterator[Numbered]:
         """Yield a sample of the images of each stop, of which one will be looked at."""
+        key, numbers, stamps, values, motion, delay_ns = found
         ends = np.append(begins[1:], len(values))
         for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
             middle = (begin + end) // 2
-            sample = self._made(
+            yield from self._made(
+                int(numbers[begin]),
                 key,
                 int(stamps[middle]),
                 values[middle : middle + 1],
                 position=np.full(3, np.nan),
                 joints=joints[k].copy(),
-                approach=approach[begin].copy(),
+                approach=motion.approach[begin].copy(),
                 delay=1e-9 * delay_ns,
                 images=tuple(values[begin:end, 0].astype(int).tolist()),
             )
-            if sample is not None:
-                yield int(numbers[begin]), sample
 
     def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
         """Make a sample of a ball that sits in a socket, at stamps (N,) while the arm stands."""
@@ -187,21 +162,27 @@ class Maker:
         self.fresh.append(sample)
 
     def _made(
-        self, key: StreamKey, stamp_ns: int, rows: FloatArray, position: FloatArray, **more: Any
-    ) -> Sample | None:
-        """Return a sample of measurements (N, WIDTH), unless there is one or no room."""
+        self,
+        number: int,
+        key: StreamKey,
+        stamp_ns: int,
+        rows: FloatArray,
+        position: FloatArray,
+        **more: Any,
+    ) -> Iterator[Numbered]:
+        """Yield a sample of measurements (N, WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
             self.dropped['poses: a sample with this stamp is there already'] += len(rows)
-            return None
+            return
         if len(known) >= self._capacity:
             self.dropped['poses: the memory for samples is full'] += len(rows)
-            return None
+            return
         known.add(stamp_ns)
         covariance = None
         if not np.isnan(rows[:, COVARIANCE]).any():
             covariance = rows[:, COVARIANCE].mean(axis=0).reshape(6, 6)
-        return Sample(
+        sample = Sample(
             stamp_ns=stamp_ns,
             position=None if key.distance else position,
             distance=float(position[0]) if key.distance else None,
@@ -214,6 +195,7 @@ class Maker:
             count=len(rows),
             **more,
         )
+        yield number, sample
 
     def add(self, found: list[Numbered]) -> None:
         """Keep samples for who takes them, in the order of their rounds or stops."""

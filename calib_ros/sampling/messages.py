@@ -84,14 +84,7 @@ DECODERS: dict[str, Callable[[Any], Sequence[float]]] = {
 
 
 def reading(kind: str, message: Any) -> tuple[int, tuple[str, ...], Sequence[float]]:
-    """Return stamp [ns], strings and numbers of a message, as `Readings` hold them.
-
-    Raises
-    ------
-    MessageError
-        When a JointState has not as many names as positions.
-
-    """
+    """Return stamp [ns], strings and numbers of a message, as `Readings` hold them."""
     stamp_ns, frame_id = head_of(message)
     if kind == JOINT_STATE:
         if len(message.name) != len(message.position):

@@ -18,18 +18,14 @@ Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
 
 MOST_NAMES = 50
 """Frames of measurements, and sets of joint names, that are told apart."""
-FEW = 0.1
+MOST_STRAY = 0.1
 """Share of measurements in other frames up to which they are stray ones; more is a mistake."""
 
 
 class JointNames:
     """Finds the joints of a chain in messages that may name others, and only part of them.
 
-    Parameters
-    ----------
-    names : sequence of str
-        How messages name the joints of the chain, in its order.
-
+    `names` are those that messages have for the joints of the chain, in its order.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
@@ -39,14 +35,7 @@ class JointNames:
         """Names that come while some of the chain's joints are never named."""
 
     def layout(self, key: tuple[str, ...]) -> Layout:
-        """Return which joints of the chain messages name, and the columns of their values.
-
-        Raises
-        ------
-        MessageError
-            When it names none of them.
-
-        """
+        """Return which joints of the chain messages name, and the columns of their values."""
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
@@ -79,14 +68,7 @@ class FrameNames:
         self._usual: dict[str, str] = {}
 
     def check(self, device: str, frame_id: str, wanted: str, count: int = 1) -> None:
-        """Note the frame of some measurements.
-
-        Raises
-        ------
-        MessageError
-            When it is not the one `wanted`, if any is, nor the usual one.
-
-        """
+        """Note the frame of some measurements; refuse any but the one `wanted`, or the usual."""
         if wanted and frame_id != wanted:
             raise MessageError(f'in frame "{frame_id}", not in frame_id "{wanted}"')
         if not frame_id.isprintable():  # it shall be a cell of a table
@@ -131,7 +113,7 @@ class FrameNames:
         A few measurements in others do not count.
         """
         for known in self._known.values():
-            if known.total() - max(known.values()) > FEW * known.total():
+            if known.total() - max(known.values()) > MOST_STRAY * known.total():
                 return tuple(sorted(known))
         return ()
 

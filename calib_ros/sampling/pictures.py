@@ -56,11 +56,7 @@ class _Kept(NamedTuple):
 class Pictures:
     """Keeps images, and makes samples of those that are looked at.
 
-    Parameters
-    ----------
-    sigma : callable
-        Returns the standard deviation of a corner [px].
-
+    `sigma` returns the standard deviation of a corner [px].
     """
 
     def __init__(self, sigma: Callable[[], float]) -> None:

@@ -25,13 +25,7 @@ what has not come yet; joint states up to `max_gap` apart belong together."""
 class Road:
     """Keeps messages by slices up to a joint state after which there is something to do.
 
-    Parameters
-    ----------
-    chain : Chain
-    settings : Settings
-    taken : callable
-        Called with the samples made; returns how many there are now.
-
+    `taken` is called with the samples made, and returns how many there are now.
     """
 
     def __init__(

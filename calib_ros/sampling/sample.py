@@ -26,16 +26,7 @@ SOCKETS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Corners of a board as a camera saw them.
-
-    Attributes
-    ----------
-    points : (K, 3)
-        In the frame of the board [m].
-    pixels : (K, 2)
-    lens : Lens
-
-    """
+    """Corners of a board as a camera saw them: points (K, 3) [m] of its frame at pixels (K, 2)."""
 
     points: FloatArray
     pixels: FloatArray
@@ -177,14 +168,7 @@ def named(samples: Iterable[Sample]) -> Frames:
 
 
 def socket_place(label: str) -> str:
-    """Return the place of a socket LOCATION/SOCKET, as the device of what is measured there.
-
-    Raises
-    ------
-    ConfigError
-        When it is something else.
-
-    """
+    """Return the place of a socket LOCATION/SOCKET, as the device of what is measured there."""
     location, slash, socket = label.rpartition('/')
     names = location, socket
     if not (slash and all(names)) or '_' in socket or '/' in location or not label.isprintable():
@@ -244,14 +228,7 @@ def collect(
 
 
 def lenses(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
-    """Return the lens at each frame of a camera.
-
-    Raises
-    ------
-    InputError
-        When one camera has had different ones.
-
-    """
+    """Return the lens at each frame of a camera, which must not change."""
     found: dict[str, Lens] = {}
     for sample in samples:
         if sample.view is not None:

@@ -12,9 +12,10 @@ import numpy as np
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.configurations import configurations
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.observations import Observations, configurations
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
@@ -51,16 +52,9 @@ RECENT = 20
 class CalibrationSession:
     """Takes messages, keeps the samples, identifies, and keeps the last good result.
 
-    Parameters
-    ----------
-    chain : Chain
-        The nominal chain.
-    settings : Settings
-    on_sample : callable, optional
-        Called with every sample as soon as it is taken.
-    on_removed : callable, optional
-        Called with every sample that is taken back.
-
+    `on_sample` is called with every sample as soon as it is taken, `on_removed` with every one
+    that is taken back. What cannot be done is an InputError, settings that cannot be a
+    ConfigError.
     """
 
     def __init__(
@@ -101,11 +95,7 @@ class CalibrationSession:
     def change(self, settings: Settings) -> None:
         """Go on with other settings; the buffers and samples stay.
 
-        Raises
-        ------
-        ConfigError
-            When no identification could use them; nothing is changed then.
-
+        Settings that no identification could use change nothing.
         """
         check_settings(self.chain, settings)
         self.settings = settings
@@ -158,14 +148,7 @@ class CalibrationSession:
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
     def remove_last(self) -> Sample:
-        """Take back the last sample.
-
-        Raises
-        ------
-        InputError
-            When there is none.
-
-        """
+        """Take back the last sample."""
         if not self.samples:
             raise InputError('there is no sample to remove')
         sample = self.samples.pop()
@@ -255,7 +238,6 @@ class CalibrationSession:
 
     @property
     def _came(self) -> str:
-        """Return in words what became of the messages, and what looks wrong in them."""
         return '; '.join((str(self.account()), *self.warnings))
 
     @property
@@ -275,7 +257,7 @@ class CalibrationSession:
         estimate = self.estimate
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
-            told.append(f'sample {number} does not fit to the others, was the target moved?')
+            told.append(f'sample {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
         told += progress(self.chain, fitted, estimate, self.settings)
         return '; '.join(filter(None, told))
@@ -283,14 +265,7 @@ class CalibrationSession:
     # Identification
 
     def problem(self) -> Problem:
-        """Return a snapshot of the samples as a problem; later messages do not change it.
-
-        Raises
-        ------
-        InputError
-            Without any sample, or when measurements came in different frames.
-
-        """
+        """Return a snapshot of the samples as a problem; later messages do not change it."""
         self._clocks.find(self._collector, None)
         self._flush()
         if self._kept.different:
@@ -299,14 +274,7 @@ class CalibrationSession:
         return self.problem_of(self.usable)
 
     def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
-        """Return samples as a problem; with `posed` boards by their poses, not their corners.
-
-        Raises
-        ------
-        InputError
-            When there is none to fit.
-
-        """
+        """Return samples as a problem; with `posed` boards by their poses, not their corners."""
         found = problem_of(self.chain, samples, self.settings, self.socket_distance, posed)
         if found is None:
             raise InputError(f'no samples to fit: {self._came}')
@@ -329,12 +297,6 @@ class CalibrationSession:
         """Take a calibration as the present one.
 
         `samples` are those that it may not be judged on, all of now by default.
-
-        Raises
-        ------
-        InputError
-            When it has other joints.
-
         """
         refuse_other_joints(calibration, self.chain)
         self._known = frozenset(self.samples if samples is None else samples)
@@ -344,13 +306,6 @@ class CalibrationSession:
         """Judge the calibration on the samples taken since; nothing is fitted.
 
         Return the errors of the calibration, and those of the nominal chain in its frames.
-
-        Raises
-        ------
-        InputError
-            Without a calibration, without samples since, or when they are between frames that it
-            does not have.
-
         """
         calibration, sets = self._since()
         nominal, now = compare(calibration.before, calibration.chain, sets).figures
@@ -362,14 +317,7 @@ class CalibrationSession:
         return calibration.reused(sets)
 
     def recent(self) -> tuple[Calibration, Problem]:
-        """Return the calibration in use, and the last stops since then as a problem.
-
-        Raises
-        ------
-        InputError
-            As for `validate`.
-
-        """
+        """Return the calibration in use, and the last stops since then as a problem."""
         calibration, sets = self._since(RECENT)
         return calibration, problem_since(calibration, self.chain, sets, self.settings)
 

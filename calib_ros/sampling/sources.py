@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from calib_ros.errors import ConfigError, UnknownNameError
@@ -146,10 +146,7 @@ def parse_source(text: str) -> Source:
     return source
 
 
-KEYS = (
-    *('type', 'device', 'target', 'eye_in_hand', 'validation', 'parent', 'child'),
-    *('board', 'info', 'lens'),
-)
+KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
 
 
 def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:

@@ -23,23 +23,12 @@ SAMPLED = 'of a stop that is sampled already'
 class Plan:
     """What becomes of measurements up to stamps, each from the end of the one before.
 
-    Attributes
-    ----------
-    done_ns : int
-        Up to which measurements have been dealt with.
-    sampled_ns : int
-        A stop that stands at this moment has been sampled.
-    ends : list of int
-        Stamps, in order.
-    why : list of str
-        Why those up to each of them are not used; empty where they are.
-    begins : list of int
-        Where the stop begins whose measurements are used.
-
+    Those up to each of the `ends` are not used for a reason, or it is empty and they are, from
+    where their stop begins.
     """
 
-    done_ns: int
-    sampled_ns: int
+    done_ns: int  # up to which measurements have been dealt with
+    sampled_ns: int  # a stop that stands at this moment has been sampled
     ends: list[int] = field(default_factory=list)
     why: list[str] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
@@ -101,16 +90,7 @@ class Plan:
 
 
 class Known:
-    """Where and when stops were sampled: the clock may jump back, and they come again.
-
-    Parameters
-    ----------
-    revolute : (n,) bool
-        True for the joints whose values are angles.
-    capacity : int
-        Stops that are remembered at most.
-
-    """
+    """Where and when stops were sampled: the clock may jump back, and they come again."""
 
     def __init__(self, revolute: NDArray[np.bool_], capacity: int) -> None:
         self._revolute = revolute

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 
-SPIKE = 6.0
-"""A single measurement further from the median [noise] is left out of the mean."""
-MOST_SPIKES = 0.3
-SETTLED = 4.0
-"""Distance [noise] to the later half within which a measurement is taken to have settled."""
 MOST_SPREAD = 2.0
 """Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
+SETTLED = 2.0 * MOST_SPREAD
+"""Distance [noise] to the later half within which a measurement is taken to have settled."""
+SPIKE = 3.0 * MOST_SPREAD
+"""A single measurement further from the median [noise] is left out of the mean."""
+MOST_SPIKES = 0.3
 FEW = 4
 """With fewer measurements nothing can be said about their spread."""
 
@@ -53,17 +53,9 @@ class Means:
 
 
 def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -> Means:
-    """Average measurements stop by stop, in the order of their stamps.
+    """Average positions (N, 3) or distances (N, 1) [m] stop by stop, in the order of their stamps.
 
-    Parameters
-    ----------
-    values : (N, 3) or (N, 1)
-        Positions or distances [m].
-    begins : (S,) int
-        Where the measurements of each stop begin.
-    sigmas : (S,)
-        Standard deviations [m] of one coordinate that are expected.
-
+    The stops begin at `begins` (S,); `sigmas` (S,) [m] are those of one coordinate expected.
     """
     used, limits = np.ones(len(values), dtype=bool), np.full(len(begins), np.inf)
     rests = np.ones(len(begins), dtype=bool)

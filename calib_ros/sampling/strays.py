@@ -23,11 +23,7 @@ STRAY = 'stamp far from those before and after'
 class Gate:
     """Lets messages through, late if they must be held back first, and drops stray ones.
 
-    Parameters
-    ----------
-    far : float
-        Time [s] beyond which two stamps are far from each other.
-
+    Two stamps more than a time [s] apart are `far` from each other.
     """
 
     def __init__(self, far: float) -> None:

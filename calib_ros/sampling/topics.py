@@ -39,11 +39,7 @@ def choose(
 ) -> dict[str, Stream]:
     """Choose topics by type from those available (topic to type), unless they are named.
 
-    Raises
-    ------
-    InputError
-        When there is none or more than one; it lists the candidates.
-
+    Where there is none or more than one an InputError lists the candidates.
     """
     own = outputs(available)
     sources = parse_sources(settings.sources)
@@ -117,22 +113,9 @@ def check_joints(
     joint_names: Sequence[str],
     deserialise: Deserialise,
 ) -> None:
-    """Refuse joint states of which several topics name the same joints of the chain.
+    """Refuse joint states of a recording of which several topics name the same joints.
 
-    Parameters
-    ----------
-    messages : iterator of (Stream, bytes)
-        The joint states of a recording.
-    joint_names : sequence of str
-        How messages name the joints of the chain.
-    deserialise : Deserialise
-        For those that are not decoded at once.
-
-    Raises
-    ------
-    InputError
-        With the topics, and how far their values are apart.
-
+    The InputError has the topics, and how far their values are apart.
     """
     heard: dict[str, dict[str, tuple[Stamps, FloatArray]]] = defaultdict(dict)
     for (topic, name), parts in _joint_values(messages, deserialise).items():

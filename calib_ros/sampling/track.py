@@ -46,17 +46,9 @@ class Motion:
 
 
 class Track:
-    """Recent samples of all joints.
+    """Recent samples of all joints, of which the `revolute` (n,) have angles for values.
 
-    Parameters
-    ----------
-    revolute : (n,) bool
-        True for the joints whose values are angles.
-    max_gap : float
-        Longest time [s] between two samples to interpolate between.
-    capacity : int
-        Samples that are kept of one publisher.
-
+    It interpolates over `max_gap` [s] at most, and keeps up to a capacity of one publisher.
     """
 
     def __init__(self, revolute: Sequence[bool], max_gap: float, capacity: int) -> None:

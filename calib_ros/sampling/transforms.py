@@ -66,15 +66,7 @@ class Seen:
 class Links:
     """The links between frames, and what sources make of them.
 
-    Parameters
-    ----------
-    topic : str
-        Of the links that move; those that stand still come on the same with _static behind it.
-    sources : sequence of Source
-        What is measured on it.
-    kind : str
-        The type of its messages.
-
+    Those that stand still come on the topic of those that move with _static behind it.
     """
 
     def __init__(self, topic: str, sources: Sequence[Source] = (), kind: str = TRANSFORMS) -> None:

@@ -22,23 +22,11 @@ TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
 class Waiting(dict[StreamKey, Rows]):
     """The buffers by stream, of rows (N, width) each.
 
-    Parameters
-    ----------
-    width, capacity : int
-        Numbers and rows of a buffer.
-    dropped : Counter
-        What could not be kept, by cause.
-    kept : callable
-        Tells whether there is a sample of a stream, so that it cannot be forgotten.
-
+    A stream of which samples are `kept` cannot be forgotten.
     """
 
     def __init__(
-        self,
-        width: int,
-        capacity: int,
-        dropped: Counter[str],
-        kept: Callable[[StreamKey], bool],
+        self, width: int, capacity: int, dropped: Counter[str], kept: Callable[[StreamKey], bool]
     ) -> None:
         super().__init__()
         self._width, self._capacity = width, capacity

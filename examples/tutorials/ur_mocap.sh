@@ -1,8 +1,8 @@
 #!/bin/sh
 # From docs/tutorials/ur_mocap.md, by extract.py.
 set -e
-calib_ros plan --chain ur10e --poses 40 --draw 300 --out plan.csv
-calib_ros simulate recording --chain ur10e --poses 40 --seed 1
+calib_ros plan --chain ur10e --poses 30 --draw 200 --out plan.csv
+calib_ros simulate recording --chain ur10e --poses 30 --seed 1
 calib_ros identify recording --chain ur10e --out result --device "motion capture" --tolerance 0.5
 calib_ros export result/calibration.yaml --chain ur10e --out export
 calib_ros plan --chain ur10e --iso9283 --out tests.csv

@@ -21,7 +21,7 @@ def test_the_average_run_length_is_that_of_the_tables(slope, height, nights):
 
 def test_more_steps_change_nothing(monkeypatch):
     few = run_length(0.5, 5.0)
-    monkeypatch.setattr(chart, 'STEPS', 600)
+    monkeypatch.setattr(chart, 'STATES', 600)
     assert run_length(0.5, 5.0) == pytest.approx(few, rel=0.01)
 
 

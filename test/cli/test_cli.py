@@ -180,15 +180,6 @@ def test_rows_marked_test_never_influence_the_fit(identified, tmp_path):
     assert wild['validation']['after']['rms_mm'] > 100.0
 
 
-def test_neither_order_nor_number_of_test_rows_influences_the_fit(identified, tmp_path):
-    rows = rows_of(measured())
-    _, expected = identified('--csv', write_csv(tmp_path / 'a.csv', rows), '--chain', 'ur5e')
-    mixed = [*rows[TRAIN + 3 :], *rows[:TRAIN], rows[TRAIN]]
-    _, found = identified('--csv', write_csv(tmp_path / 'b.csv', mixed), '--chain', 'ur5e')
-    assert found['parameters'] == expected['parameters']
-    assert found['samples']['held_out'] == TEST - 2
-
-
 @pytest.mark.parametrize(
     ('storage', 'held_out', 'oriented'), [('mcap', TEST, True), ('sqlite3', 0, False)]
 )
@@ -231,17 +222,6 @@ def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
         run('simulate', bag, '--chain', 'ur5e', '--poses', 3, '--seed', seed)
         truths[name] = (tmp_path / f'{name}_truth.yaml').read_text()
     assert truths['a'] == truths['b'] != truths['c']
-
-
-def test_simulate_overwrites_nothing(run, tmp_path):
-    arguments = ('simulate', tmp_path / 'bag', '--chain', 'ur5e', '--poses', 3)
-    run(*arguments)
-    before = contents(tmp_path / 'bag') | {'t': (tmp_path / 'bag_truth.yaml').read_bytes()}
-    status, _, err = run(*arguments, '--seed', 7)
-    assert status == 1
-    assert 'exists already' in err
-    after = contents(tmp_path / 'bag') | {'t': (tmp_path / 'bag_truth.yaml').read_bytes()}
-    assert after == before
 
 
 def test_demo_shows_the_whole_way(run, tmp_path):

@@ -7,9 +7,8 @@ import plants
 import pytest
 from distributed import LocalCluster
 
-from calib_ros.cli.fleet import INCOMPLETE
 from calib_ros.cli.main import main
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import INCOMPLETE, NOT_ACCEPTED
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 

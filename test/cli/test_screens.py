@@ -264,11 +264,10 @@ def test_who_reads_no_further_is_no_error():
     assert found.stderr == ''
 
 
-def test_tab_completes_commands_options_and_robots(tmp_path):
+def test_tab_completes_options_and_robots(tmp_path):
     pytest.importorskip('argcomplete')
     for line, wanted in (
-        ('calib_ros ver', 'verify '),
-        ('calib_ros identify --tol', '--tolerance '),
+        ('calib_ros verify --tol', '--tolerance '),
         ('calib_ros plan --chain kuka_i', 'kuka_iiwa14 '),
     ):
         found = tmp_path / 'found'

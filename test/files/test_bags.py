@@ -1,6 +1,5 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-import os
 from collections import Counter
 from types import SimpleNamespace
 
@@ -9,7 +8,6 @@ import pytest
 from recorded import (
     ARM,
     MS,
-    TYPESTORE,
     account_of,
     assert_equal,
     joint_state,
@@ -26,7 +24,7 @@ from recorded import (
     text_message,
     transform_stamped,
 )
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
 from calib_ros.files.bags import replay
@@ -350,59 +348,6 @@ def test_a_session_that_does_not_record_counts_what_it_leaves_out(tmp_path):
     session.recording = False
     replay(path, session)
     assert session.account().unused == {'joints: not recording': 100, 'poses: not recording': 1}
-
-
-@pytest.mark.parametrize('name', ['bag.mcap', 'bag.db3', 'bag.bag', 'bag'])
-@pytest.mark.parametrize(
-    'content',
-    [
-        b'',
-        b'garbage ' * 500,
-        bytes(range(256)) * 8,
-        b'\x89MCAP0\r\n' + b'\x05' * 500,
-        b'SQLite format 3\0' + b'\x01' * 500,
-    ],
-)
-def test_a_file_that_is_no_bag_is_refused(tmp_path, name, content):
-    path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
-        session_of(path)
-    assert str(path) in str(caught.value)
-
-
-@pytest.mark.parametrize('metadata', [None, b'', b'\xff\xfe', b'- 1', b'rosbag2_bagfile: {'])
-def test_a_folder_that_is_no_bag_is_refused(tmp_path, metadata):
-    path = tmp_path / 'folder'
-    path.mkdir()
-    (path / 'notes.txt').write_text('no bag')
-    if metadata is not None:
-        (path / 'metadata.yaml').write_bytes(metadata)
-    with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
-        session_of(path)
-    assert str(path) in str(caught.value)
-
-
-def test_a_path_to_nothing_is_refused(tmp_path):
-    with pytest.raises(InputError, match=f'no bag at {tmp_path}{os.sep}missing'):
-        session_of(tmp_path / 'missing')
-
-
-def test_one_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
-    path = tmp_path / 'bag'
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=TYPESTORE)
-        kind = 'geometry_msgs/msg/PointStamped'
-        poses = writer.add_connection('/point', kind, typestore=TYPESTORE)
-        for k in range(1, 11):
-            data = TYPESTORE.serialize_cdr(joint_state(k * 10 * MS), JOINT_STATE)
-            writer.write(joints, k, data)
-            data = TYPESTORE.serialize_cdr(point_stamped(k * 10 * MS), kind)
-            writer.write(poses, k, data[:-9] if k == 3 else data)
-    session, warnings = session_of(path)
-    assert session.account().samples >= 2
-    assert len(warnings) == 1
-    assert 'lost' in warnings[0]
 
 
 def test_messages_are_read_by_their_attributes_only():

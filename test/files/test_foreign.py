@@ -140,18 +140,9 @@ def test_separators_and_decimal_commas_are_guessed_and_said(read, separator, dec
 
 
 def test_cells_in_quotes_windows_text_and_a_byte_order(read):
-    text = text_of(
-        JOINTS,
-        PLACES,
-        names=[
-            'q1',
-            'q2',
-            'x',
-            'y',
-            'z',
-        ],
-    )
+    text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'])
     assert_same(read(text.replace('0.25', '"0.25"').replace('\n', '\r\n')), None)
+    assert_same(read(text.replace('z', 'z,frame_id', 1).replace('0.25', '"0.25"')), None)
     assert_same(read(text.encode('utf-16')), None)
     named = text.replace('q1', 'Gel\u00e4nk 1')
     table = read(named.encode('cp1252'), columns={'q1': '{Gel\u00e4nk 1}'})

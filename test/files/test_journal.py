@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from calib_ros.errors import InputError
 from calib_ros.files.journal import Journal
-from calib_ros.files.tables import read_journal, read_table
+from calib_ros.files.tables import read_journal, read_table, table_text
 from calib_ros.kinematics import se3
 from calib_ros.sampling.sample import Sample
 
@@ -104,6 +104,12 @@ def plain(number, **more):
     return Sample(number, 0.1 * number * np.ones(JOINTS), position=np.arange(3.0), **more)
 
 
+def test_the_samples_of_a_bag_are_a_table_with_any_names(tmp_path):
+    many = [plain(1, device='a,b'), plain(2, device='say "b"'), plain(3, target='=1')]
+    (tmp_path / 'cell.csv').write_text(table_text(many, JOINTS))
+    assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], many)
+
+
 def test_kinds_of_one_stop_are_told_apart(tmp_path):
     """A stop gives each source the same stamp, often between the same device and target."""
     many = [
@@ -142,7 +148,7 @@ def test_what_was_taken_back_is_left_out_and_can_be_taken_again(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['ball', 'a,b', 'say "ball"', 'Kugel \u00e4\u2460'])
-@pytest.mark.parametrize('share', np.linspace(0.02, 0.98, 13))
+@pytest.mark.parametrize('share', np.linspace(0.02, 0.98, 5))
 def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
     """Whatever is in it: the rows before are there, and new ones can be added."""
     path = tmp_path / 'cell.csv'
@@ -195,7 +201,7 @@ for number in range(1, 10**7):
 
 def test_a_killed_process_leaves_all_whole_rows(tmp_path):
     path = tmp_path / 'cell.csv'
-    for attempt in range(3):
+    for attempt in range(2):
         process = subprocess.Popen(
             [sys.executable, '-c', WRITER, path],
             stdout=subprocess.PIPE,

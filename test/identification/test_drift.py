@@ -7,6 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from fits import NOISE, SIGMAS, UR10E, along_path, arm, rms
 from scipy.signal import lfilter
 
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -16,23 +17,9 @@ from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, chance_in_words
 
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 DRIFTS = ('fading', 'walk', 'swing', 'ramp')
-
-
-def along_path(count, rng, width=None, ways=12):
-    """Return joint values (count, 6) on the lines from one way-point to the next."""
-    corners = UR10E.random_joints(ways, rng)
-    if width is not None:
-        corners = rng.uniform(-1.0, 1.0, 6) + rng.uniform(-width, width, (ways, 6))
-    share = np.arange(count // ways)[:, np.newaxis] / (count // ways)
-    lines = np.roll(corners, -1, axis=0) - corners
-    return (corners[:, np.newaxis] + share * lines[:, np.newaxis]).reshape(-1, 6)
 
 
 def drift(kind, count, rng):
@@ -55,7 +42,7 @@ def drift(kind, count, rng):
 def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
     """Return what a drifting tracker sees of an arm, its errors so many times the usual."""
     rng = np.random.default_rng(seed)
-    usual = faulty(UR10E, Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors), rng)
+    usual = arm(rng, errors)
     q = along_path(count, rng, width)
     if shuffled:
         q = rng.permutation(q)
@@ -145,11 +132,7 @@ def test_effects_are_found_though_the_tracker_drifts(kind):
     assert auto.accepted
     unseen = UR10E.random_joints(300, rng)
 
-    def rms(chain):
-        error = (chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-        return np.sqrt((error**2).sum(axis=1).mean())
-
-    assert rms(auto.chain) < 0.6 * rms(plain.chain)
+    assert rms(auto.chain, true, unseen) < 0.6 * rms(plain.chain, true, unseen)
 
 
 @pytest.mark.parametrize('count', [2, 3, 8, 12])

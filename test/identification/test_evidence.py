@@ -4,26 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import NO_PRIOR, UR10E, arm
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import measure
 from calib_ros.identification.evidence import TYPICAL, considered
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
 
-UR = load_chain('ur10e')
-NO_PRIOR = {'*_joint.*': 1e6}
-"""As good as none, but given: so none is told by the data."""
-EFFECTS = [name for group in ('eccentricity', 'gravity') for name in effects.members(UR, group)]
-
-
-def arm(seed, errors=1.0):
-    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
-    return faulty(UR, cell, np.random.default_rng(seed))
+EFFECTS = [name for group in ('eccentricity', 'gravity') for name in effects.members(UR10E, group)]
 
 
 def spread(seed, reach=2.5, count=60):
@@ -32,7 +24,7 @@ def spread(seed, reach=2.5, count=60):
 
 def problem_of(true, q, seed=0, noise=1.0, **more):
     rng = np.random.default_rng(seed + 7)
-    return Problem(UR, measure(true, q, rng, noise * 5e-5, noise * 2e-4), **more)
+    return Problem(UR10E, measure(true, q, rng, noise * 5e-5, noise * 2e-4), **more)
 
 
 def whole_range(chain, true):
@@ -59,7 +51,7 @@ def test_parameters_that_the_data_determine_stay_where_they_are(seed):
     found = identify(given)
     assert found.names == free.names
     for ours, theirs in zip(found.parameters, free.parameters, strict=True):
-        if ours.std is not None and not UR.owns_frame(ours.name):
+        if ours.std is not None and not UR10E.owns_frame(ours.name):
             assert abs(ours.offset - theirs.offset) < 0.05 * theirs.std, ours.name
 
 
@@ -84,9 +76,9 @@ def test_the_size_of_the_errors_is_found(errors, seed):
     assert found.accepted
     for group, lengths in (('length', True), ('angle', False)):
         offsets = [
-            true.offset(name, UR)
+            true.offset(name, UR10E)
             for name in found.names
-            if not UR.owns_frame(name) and Parameter(name).is_length == lengths
+            if not UR10E.owns_frame(name) and Parameter(name).is_length == lengths
         ]
         ratio = found.posterior.sizes[group] / np.sqrt(np.mean(np.square(offsets)))
         assert 0.5 < ratio < 2.0
@@ -97,7 +89,7 @@ def test_one_gross_offset_is_not_shrunk(seed):
     true = arm(seed).with_offsets({'elbow_joint.theta': 17e-3})
     found = identify(problem_of(true, spread(seed), seed))
     parameter = next(p for p in found.parameters if p.name == 'elbow_joint.theta')
-    assert abs(parameter.offset - true.offset('elbow_joint.theta', UR)) < 4.0 * parameter.std
+    assert abs(parameter.offset - true.offset('elbow_joint.theta', UR10E)) < 4.0 * parameter.std
     assert found.posterior.sizes['angle'] < 2e-3
 
 
@@ -108,7 +100,7 @@ def test_one_gross_offset_is_not_shrunk_where_the_poses_hardly_determine_it():
     q[:, 1] = -1.0 + 0.04 * q[:, 1]
     found = identify(problem_of(true, q))
     parameter = next(p for p in found.parameters if p.name == 'shoulder_lift_joint.theta')
-    assert abs(parameter.offset - true.offset(parameter.name, UR)) < 4.0 * parameter.std
+    assert abs(parameter.offset - true.offset(parameter.name, UR10E)) < 4.0 * parameter.std
     assert abs(parameter.offset) > 14e-3
 
 
@@ -123,7 +115,7 @@ def test_a_healthy_arm_has_small_errors_and_is_not_accepted(seed):
 def test_data_without_noise_stay_exact():
     true = arm(0)
     found = identify(problem_of(true, spread(0), noise=0.0))
-    q = UR.random_joints(200, np.random.default_rng(1))
+    q = UR10E.random_joints(200, np.random.default_rng(1))
     assert np.abs((found.chain.forward(q) - true.forward(q))[:, :3, 3]).max() < 1e-9
 
 

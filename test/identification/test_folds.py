@@ -9,9 +9,10 @@ import pytest
 from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 
 from calib_ros.apply.simulation import measure, random_frame
+from calib_ros.identification.configurations import configurations
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.observations import configurations, numbered
+from calib_ros.identification.observations import numbered
 
 
 def test_targets_of_one_stop_are_one_configuration(rng):

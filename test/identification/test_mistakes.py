@@ -10,6 +10,7 @@ import pytest
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.mistakes import explained
+from calib_ros.identification.suspects import QUARTERS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 
@@ -109,6 +110,12 @@ def test_a_refusal_begins_with_the_mistake_and_nothing_is_applied():
     assert not result.accepted
     assert remedy in result.refusals[0]
     assert len(result.refusals) > 1
+
+
+def test_quarters_are_what_their_names_say():
+    assert {float(name): np.degrees(angle) for name, angle in QUARTERS.items()} == pytest.approx(
+        {90.0: 90.0, -90.0: -90.0, 180.0: 180.0}
+    )
 
 
 def test_good_results_are_not_searched(monkeypatch):

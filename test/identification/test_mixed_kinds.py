@@ -6,14 +6,14 @@ A tracker sees the pose of one target and the position of another, a wire goes f
 own to a third, and a camera on the flange sees a board.
 """
 
-import csv
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+import recorded
+from fits import NOISE, UR10E
+from measured import write_csv
 
 from calib_ros.apply.simulation import Cell, drive, faulty, random_frame
 from calib_ros.cli.main import main
@@ -21,15 +21,9 @@ from calib_ros.files.bags import replay
 from calib_ros.files.journal import Journal
 from calib_ros.identification.validation import residuals
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES = TYPESTORE.types
 START = 1_700_000_000_000_000_000
 
 
@@ -128,15 +122,6 @@ def rows_of(cell, counts):
     return [rows[k] for k in order]
 
 
-def write_csv(path, rows):
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    with path.open('w', newline='') as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
-
-
 COUNTS = (25, 40, 60, 30)
 
 
@@ -179,54 +164,9 @@ def test_rows_of_several_kinds_can_judge(identified, tmp_path):
 # The same from a bag
 
 
-def header(stamp_ns, frame_id='tracker'):
-    time = TYPES['builtin_interfaces/msg/Time'](*divmod(int(stamp_ns), 1_000_000_000))
-    return TYPES['std_msgs/msg/Header'](time, frame_id)
-
-
-def make(kind, *parts):
-    return TYPES[kind](*parts)
-
-
-def quaternion(pose):
-    return make('geometry_msgs/msg/Quaternion', *se3.to_quat(pose[:3, :3]).tolist())
-
-
-def plain_pose(pose):
-    point = make('geometry_msgs/msg/Point', *pose[:3, 3].tolist())
-    return make('geometry_msgs/msg/Pose', point, quaternion(pose))
-
-
-def transform(stamp, pose, child):
-    shift = make('geometry_msgs/msg/Vector3', *pose[:3, 3].tolist())
-    both = make('geometry_msgs/msg/Transform', shift, quaternion(pose))
-    return make('geometry_msgs/msg/TransformStamped', header(stamp), child, both)
-
-
-def odometry(stamp, pose):
-    zero = make('geometry_msgs/msg/Vector3', 0.0, 0.0, 0.0)
-    twist = make('geometry_msgs/msg/Twist', zero, zero)
-    sigmas = np.repeat(NOISE, 3)
-    return make(
-        'nav_msgs/msg/Odometry',
-        header(stamp, 'ground'),
-        '',
-        make(
-            'geometry_msgs/msg/PoseWithCovariance',
-            plain_pose(pose),
-            np.diag(sigmas**2).ravel(),
-        ),
-        make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
-    )
-
-
-def picture(stamp, pose):
-    return make('geometry_msgs/msg/PoseStamped', header(stamp, 'camera'), plain_pose(pose))
-
-
-def length(stamp, value):
-    parts = (header(stamp, 'wire'), 0, 0.0, 0.0, 9.0, float(value), 0.0)
-    return make('sensor_msgs/msg/Range', *parts)
+def placed(pose):
+    """Return position and quaternion of a pose (4, 4)."""
+    return pose[:3, 3].tolist(), se3.to_quat(pose[:3, :3]).tolist()
 
 
 SOURCES = (
@@ -237,48 +177,42 @@ SOURCES = (
 )
 
 
-def record(path, cell, count, storage='mcap'):
-    """Write the bag of an arm that stops at places, where everything is measured at once."""
+def events_of(cell, count):
+    """Return the messages of an arm that stops at places, where everything is measured at once."""
     where = UR10E.random_joints(count, cell.rng)
     stamps, joints, _ = drive(where, Cell(move=0.3, dwell=0.5, joint_rate=50.0), START)
-    period = 0.8
-    events = []
-    for stamp, row in zip(stamps.tolist(), joints, strict=True):
-        none = np.zeros(0)
-        message = make(JOINT_STATE, header(stamp, ''), list(UR10E.joint_names), row, none, none)
-        events.append((stamp, '/joint_states', message))
+    names, covariance = UR10E.joint_names, np.diag(np.repeat(NOISE, 3) ** 2)
+    events = [
+        (stamp, '/joint_states', recorded.joint_state(stamp, row, names))
+        for stamp, row in zip(stamps.tolist(), joints, strict=True)
+    ]
     for offset in (0.2, 0.3, 0.4):
-        at = START + np.round((period * np.arange(count) + offset) * 1e9).astype(np.int64)
-        sets = (
-            ('/markers', cell.poses(where), lambda stamp, pose: transform(stamp, pose, 'plate')),
-            (
-                '/markers',
-                cell.poses(where, tool='tool_ball'),
-                lambda stamp, pose: transform(stamp, pose, 'ball'),
-            ),
-            ('/wire', cell.distances(where), length),
-            ('/odometry', cell.poses(where, 'base_wire', 'tool_ball'), odometry),
-            ('/camera', cell.pictures(where), picture),
+        at = START + np.round((0.8 * np.arange(count) + offset) * 1e9).astype(np.int64)
+        seen = zip(
+            at.tolist(),
+            map(placed, cell.poses(where)),
+            map(placed, cell.poses(where, tool='tool_ball')),
+            cell.distances(where).tolist(),
+            map(placed, cell.poses(where, 'base_wire', 'tool_ball')),
+            map(placed, cell.pictures(where)),
+            strict=True,
         )
-        for topic, seen, of in sets:
-            for stamp, value in zip(at.tolist(), seen, strict=True):
-                events.append((stamp, topic, of(stamp, value)))
-    events.sort(key=lambda event: event[0])
-    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
-            for topic, kind in {topic: each.__msgtype__ for _, topic, each in events}.items()
-        }
-        for stamp, topic, message in events:
-            data = TYPESTORE.serialize_cdr(message, message.__msgtype__)
-            writer.write(connections[topic], stamp, data)
-    return path
+        for stamp, plate, ball, length, ground, board in seen:
+            events += [
+                (stamp, '/markers', recorded.transform_stamped(stamp, *plate, 'plate')),
+                (stamp, '/markers', recorded.transform_stamped(stamp, *ball, 'ball')),
+                (stamp, '/wire', recorded.distance(stamp, length)),
+                (stamp, '/odometry', recorded.odometry(stamp, covariance, '', ground)),
+                (stamp, '/camera', recorded.pose_stamped(stamp, *board)),
+            ]
+    return [event[1:] for event in sorted(events, key=lambda event: event[0])]
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
     cell = Workcell(6)
-    return cell, record(tmp_path_factory.mktemp('cell') / 'bag', cell, 35)
+    path = tmp_path_factory.mktemp('cell') / 'bag'
+    return cell, recorded.record(path, events_of(cell, 35))
 
 
 def settings(**more):
@@ -306,15 +240,17 @@ def test_all_sources_of_one_bag(identified, bag):
 
 
 def test_the_journal_of_a_session_gives_the_same(identified, bag, tmp_path):
-    """What the node keeps can be identified by itself."""
+    """What the node keeps can be identified by itself, without samples that were taken back."""
     _, path = bag
     journal = Journal(tmp_path / 'journal.csv', 6)
     session = CalibrationSession(UR10E, settings(), on_sample=journal.add)
     replay(path, session)
+    for _ in range(7):
+        journal.add(session.remove_last(), removed=True)
     journal.close()
     result = session.identify()
     document = identified('--csv', tmp_path / 'journal.csv')
-    assert document['samples']['samples'] == len(session.samples) == 5 * 35
+    assert document['samples']['samples'] == len(session.samples) == 5 * 35 - 7
     assert document['rank'] == result.rank
     for parameter in result.parameters:
         found = document['parameters'][parameter.name]
@@ -322,23 +258,6 @@ def test_the_journal_of_a_session_gives_the_same(identified, bag, tmp_path):
         assert found['status'] == parameter.status
         if parameter.std is not None:
             assert found['std'] == pytest.approx(parameter.std, rel=1e-6)
-
-
-def test_a_sample_that_was_taken_back_is_not_in_the_journal_either(identified, bag, tmp_path):
-    _, path = bag
-    journal = Journal(tmp_path / 'journal.csv', 6)
-    session = CalibrationSession(UR10E, settings(), on_sample=journal.add)
-    replay(path, session)
-    for _ in range(7):
-        journal.remove(session.remove_last())
-    journal.close()
-    result = session.identify()
-    document = identified('--csv', tmp_path / 'journal.csv')
-    assert document['samples']['samples'] == 5 * 35 - 7
-    for parameter in result.parameters:
-        assert document['parameters'][parameter.name]['value'] == pytest.approx(
-            parameter.value, abs=1e-9
-        )
 
 
 def test_poses_that_were_not_used_are_predicted(bag):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import NOISE, SIGMAS, UR10E, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import UnknownNameError
@@ -11,13 +12,9 @@ from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.effects import group_of
 from calib_ros.settings import Settings
 
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 GEAR = ('shoulder_lift_joint.sin_17', 'shoulder_lift_joint.cos_17')
 LOADED = replace(
     UR10E,
@@ -43,12 +40,6 @@ def observed(true, q, rng, approach=None, oriented=True):
     positions = poses[:, :3, 3] + rng.normal(scale=NOISE[0], size=(len(q), 3))
     seen = Observations.from_arrays(q, positions, turns @ poses[:, :3, :3] if oriented else None)
     return replace(seen, approach=approach)
-
-
-def rms(chain, true, q, approach=None):
-    """Return the RMS position error [m] against the true arm."""
-    error = (chain.forward(q, approach) - true.forward(q, approach))[:, :3, 3]
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
 def chosen(result):

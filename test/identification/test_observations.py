@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import InputError
-from calib_ros.identification.observations import STILL, Observations, configurations
+from calib_ros.identification.configurations import STILL, configurations
+from calib_ros.identification.observations import Observations
 
 
 def test_standing_still_is_one_configuration(rng):

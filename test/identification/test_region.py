@@ -6,25 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from fits import UR10E, arm, rms
 
 from calib_ros.apply.compensation import Compensator, compensate
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import measure
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.region import region_of_record
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, summary
 
-UR = load_chain('ur10e')
 HOME = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
-
-
-def arm(seed, errors=1.0):
-    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
-    return faulty(UR, cell, np.random.default_rng(seed))
 
 
 def around(seed, reach, count=60):
@@ -34,17 +28,12 @@ def around(seed, reach, count=60):
 
 def identified(true, q, seed=0):
     seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
-    return identify(Problem(UR, seen))
-
-
-def rms(chain, true, q):
-    error = (chain.forward(q) - true.forward(q))[:, :3, 3]
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
+    return identify(Problem(UR10E, seen))
 
 
 def with_a_still_joint(seed, reach):
     """Return joint values (60, 6) with the elbow within `reach` [rad] of HOME."""
-    q = UR.random_joints(60, np.random.default_rng(seed))
+    q = UR10E.random_joints(60, np.random.default_rng(seed))
     q[:, 2] = HOME[2] + np.random.default_rng(seed).uniform(-reach, reach, 60)
     return q
 
@@ -66,11 +55,11 @@ def folder(local, tmp_path):
 
 @pytest.mark.parametrize('seed', range(2))
 def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
-    q = UR.random_joints(60, np.random.default_rng(seed))
+    q = UR10E.random_joints(60, np.random.default_rng(seed))
     found = identified(arm(seed), q, seed)
     assert found.accepted
     assert found.region.whole
-    assert found.region.covers(UR.random_joints(50, np.random.default_rng(1))).all()
+    assert found.region.covers(UR10E.random_joints(50, np.random.default_rng(1))).all()
     assert 'valid over the whole joint range' in summary(found)
     assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
 
@@ -86,7 +75,7 @@ def test_a_joint_that_hardly_moved_is_no_worse_where_it_may_be_used(reach, error
     if not found.accepted:
         return
     assert found.region.covers(q).all()
-    other = UR.random_joints(1000, np.random.default_rng(3))
+    other = UR10E.random_joints(1000, np.random.default_rng(3))
     used = other[found.region.covers(other)]
     assert len(used)
     assert rms(found.chain, true, used) < rms(found.before, true, used)
@@ -99,7 +88,7 @@ def test_what_a_still_joint_leaves_open_is_not_covered(local):
     assert region.covers(q).all()
     assert region.covers(away).mean() < 0.5
     assert np.median(region.sigma(away)) > 2.0 * np.median(region.sigma(q))
-    other = region.covers(UR.random_joints(2000, np.random.default_rng(4)))
+    other = region.covers(UR10E.random_joints(2000, np.random.default_rng(4)))
     assert region.share == pytest.approx(other.mean(), abs=0.1)
 
 
@@ -107,12 +96,12 @@ def test_what_a_still_joint_leaves_open_is_not_covered(local):
 @pytest.mark.parametrize('seed', range(2))
 def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
     """Measured on one side of an arm that has what the model lacks."""
-    names = effects.members(UR, group)
+    names = effects.members(UR10E, group)
     rng = np.random.default_rng(seed)
     size = {'eccentricity': 2e-4, 'gravity': 3e-4}[group]
     values = rng.normal(scale=size, size=len(names)).tolist()
     true = arm(seed).with_effects(names).with_effect_values(dict(zip(names, values, strict=True)))
-    q = UR.random_joints(500, rng)
+    q = UR10E.random_joints(500, rng)
     left = (se3.invert(true.base.matrix) @ true.forward(q))[:, 0, 3] < 0.0
     found = identified(true, q[left][:60], seed)
     other = q[~left]
@@ -126,20 +115,20 @@ def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
 
 @pytest.mark.parametrize('seed', range(2))
 def test_a_device_with_a_scale_does_not_calibrate_a_healthy_arm(seed):
-    q = UR.random_joints(60, np.random.default_rng(seed))
+    q = UR10E.random_joints(60, np.random.default_rng(seed))
     seen = measure(arm(seed, 0.0), q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
-    found = identify(Problem(UR, replace(seen, positions=seen.positions * (1.0 + 5e-4))))
+    found = identify(Problem(UR10E, replace(seen, positions=seen.positions * (1.0 + 5e-4))))
     assert not found.accepted
     assert found.region is None
     assert as_document(found, {})['region'] is None
 
 
 def test_the_region_is_kept_with_the_calibration(local, folder):
-    q = UR.random_joints(400, np.random.default_rng(3))
+    q = UR10E.random_joints(400, np.random.default_rng(3))
     covered = local.region.covers(q)
     assert 0.1 < covered.mean() < 0.9
     for path in (folder, folder / 'calibration.yaml'):
-        read = load_calibration(path, UR).region
+        read = load_calibration(path, UR10E).region
         np.testing.assert_allclose(read.sigma(q), local.region.sigma(q), rtol=1e-6)
         assert read.limit == local.region.limit
         assert read.share == local.region.share
@@ -173,7 +162,7 @@ def test_a_damaged_region_is_refused(local, change):
 @pytest.mark.parametrize('what', ['yes', 3, ['limit'], {}, {'limit': None}])
 def test_what_is_no_region_is_refused(what):
     with pytest.raises(ConfigError, match=r'here: calibration\.region is damaged'):
-        region_of_record({'region': what}, UR, 'here')
+        region_of_record({'region': what}, UR10E, 'here')
 
 
 def test_a_calibration_without_a_region_is_still_read(folder):
@@ -181,24 +170,24 @@ def test_a_calibration_without_a_region_is_still_read(folder):
     document = yaml.safe_load(path.read_text())
     del document['calibration']['region']
     path.write_text(yaml.safe_dump(document))
-    assert load_calibration(path, UR).region is None
+    assert load_calibration(path, UR10E).region is None
 
 
 def missed(command, wanted):
     """Return the RMS distance [m] of the true arm's flange from where the nominal one would be."""
     true = replace(arm(0), base=Frame(), tool=Frame())
-    error = (true.forward(command) - UR.forward(wanted))[:, :3, 3]
+    error = (true.forward(command) - UR10E.forward(wanted))[:, :3, 3]
     return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
 def test_programs_are_corrected_inside_the_region_only(local, folder):
     inside = around(2, 0.1, 15)
-    other = UR.random_joints(50, np.random.default_rng(0))
+    other = UR10E.random_joints(50, np.random.default_rng(0))
     outside = other[~local.region.covers(other)][:5]
     assert local.region.covers(inside).all()
     refused = []
-    for calibration in (local, load_calibration(folder, UR)):
-        compensator = Compensator(UR, calibration.chain, region=calibration.region)
+    for calibration in (local, load_calibration(folder, UR10E)):
+        compensator = Compensator(UR10E, calibration.chain, region=calibration.region)
         result = compensate(compensator, inside)
         assert not result.refusals
         assert missed(result.joints, inside) < 0.2 * missed(inside, inside)

@@ -4,17 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import fitted
+from fits import NO_PRIOR, NOISE, UR10E, fitted, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.robust import LOSSES, OUTLIER
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import load_chain
 
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
 POSES = 80
 SEEDS = range(2)
 
@@ -77,12 +74,6 @@ def without(seen, wrong):
     """Return a fit of the other samples."""
     good = np.array([k not in wrong for k in range(len(seen))])
     return fitted(problem(seen.select(good), loss='none'))
-
-
-def rms(chain, true, unseen):
-    """Return the RMS position error [m] against the true arm."""
-    error = (chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
 
 
 GROSS = {
@@ -201,10 +192,6 @@ def test_clean_data_lose_nothing(oriented, scale):
                 robust.chain.forward(unseen), plain.chain.forward(unseen)
             )
             np.testing.assert_array_equal(robust.covariance, plain.covariance)
-
-
-NO_PRIOR = {'*_joint.*': 1e6}
-"""Given, so that the data tell none, by which a fit with gross errors would be another."""
 
 
 @pytest.mark.parametrize(('share', 'limit'), [(0.1, 1.5), (0.3, 15.0)])

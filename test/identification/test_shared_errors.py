@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import fitted
+from fits import NOISE, SIGMAS, UR10E, along_path, fitted
 from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
 
@@ -13,20 +13,7 @@ from calib_ros.identification import samples as samples_module
 from calib_ros.identification import shared_errors
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, noise_in_words
-
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
-
-
-def along_path(count, rng, ways=12):
-    """Return joint values (count, 6) on straight lines through way-points."""
-    corners = UR10E.random_joints(ways, rng)
-    share = np.arange(count // ways)[:, np.newaxis] / (count // ways)
-    lines = np.roll(corners, -1, axis=0) - corners
-    return (corners[:, np.newaxis] + share * lines[:, np.newaxis]).reshape(count, -1)
 
 
 def fading(count, length, rng):

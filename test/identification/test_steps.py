@@ -4,8 +4,10 @@
 
 from dataclasses import replace
 
+import fits
 import numpy as np
 import pytest
+from fits import NOISE, SIGMAS, UR10E, along_path
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification.identification import Problem, identify
@@ -14,12 +16,8 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.robust import Robust
 from calib_ros.identification.steps import find_step
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, remarks
 
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 COUNT, AT = 60, 26
 DESIGNS = ('random', 'path', 'sweep')
 
@@ -29,10 +27,7 @@ def poses(design, rng, count=COUNT):
     if design == 'random':
         return UR10E.random_joints(count, rng)
     if design == 'path':
-        corners = UR10E.random_joints(12, rng)
-        share = np.arange(count // 12)[:, np.newaxis] / (count // 12)
-        ways = np.roll(corners, -1, axis=0) - corners
-        return (corners[:, np.newaxis] + share * ways[:, np.newaxis]).reshape(-1, 6)
+        return along_path(count, rng)
     swept = np.tile(rng.uniform(-1.5, 1.5, 6), (6, count // 6, 1))
     for joint in range(6):
         swept[joint, :, joint] += np.linspace(-1.5, 1.5, count // 6)
@@ -41,7 +36,7 @@ def poses(design, rng, count=COUNT):
 
 def arm(rng, errors=1.0, unmodelled=False):
     """Return an arm; unmodelled ones bend under their weight and have eccentric gears."""
-    true = faulty(UR10E, Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors), rng)
+    true = fits.arm(rng, errors)
     if not unmodelled:
         return true
     names = [f'{joint.name}.{wave}_1' for joint in true.joints for wave in ('sin', 'cos')]

@@ -4,24 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-from calib_ros.kinematics.inverse import TOLERANCE, solve
+from calib_ros.kinematics.inverse import TOLERANCE, limits, solve, solve_positive
 from calib_ros.kinematics.se3 import log_rotation
-
-
-def limits(chain):
-    return np.array(
-        [
-            (
-                -np.inf if joint.lower is None else joint.lower,
-                np.inf if joint.upper is None else joint.upper,
-            )
-            for joint in chain.joints
-        ]
-    ).T
 
 
 @pytest.mark.parametrize('robot', sorted(shipped_robots()))
@@ -109,8 +99,8 @@ def test_limits_hold_and_full_turns_are_taken_back():
     np.testing.assert_allclose(found.joints[:2], [[1.9, 0.2], [1.0, 0.1]], atol=1e-8)
     assert found.joints[2, 0] == pytest.approx(2.0)
     whole = replace(chain, joints=(replace(chain.joints[0], lower=-3.14, upper=3.14),))
-    round_ = solve(whole, whole.forward(np.array([[-3.0]])), np.array([[3.1]]))
-    assert round_.joints[0, 0] == pytest.approx(-3.0)  # 3.28 is beyond the limit
+    round_ = solve(whole, whole.forward(np.array([[-3.0], [3.0]])), np.array([[3.1], [-3.1]]))
+    np.testing.assert_allclose(round_.joints, [[-3.0], [3.0]])  # 3.28 is beyond the limit
     turned = solve(chain, wanted, np.array([[1.8 + 2.0 * np.pi, 0.1], [0.9 - 2.0 * np.pi, 0.2]]))
     np.testing.assert_allclose(turned.joints, [[1.9, 0.2], [1.0, 0.1]], atol=1e-8)
 
@@ -125,3 +115,16 @@ def test_each_pose_is_solved_as_if_alone(rng):
         assert alone.converged[0] == together.converged[k]
         if alone.converged[0]:
             np.testing.assert_allclose(alone.joints[0], together.joints[k], atol=1e-6)
+
+
+@given(st.integers(1, 8), st.integers(0, 1000))
+def test_elimination_solves(size, seed):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(size, size, 4))
+    matrix = np.einsum('ikb,jkb->ijb', root, root) + 0.1 * np.eye(size)[:, :, None]
+    right = rng.normal(size=(size, 4))
+    before = matrix.copy(), right.copy()
+    expected = [np.linalg.solve(matrix[..., k], right[:, k]) for k in range(4)]
+    np.testing.assert_allclose(solve_positive(matrix, right).T, expected, rtol=1e-8, atol=1e-10)
+    np.testing.assert_array_equal(matrix, before[0])
+    np.testing.assert_array_equal(right, before[1])

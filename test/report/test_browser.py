@@ -243,7 +243,7 @@ def test_the_first_printed_page_is_the_certificate(wide):
 
 
 def test_many_poses_are_cells_and_bands(chromium, tmp_path, monkeypatch):
-    monkeypatch.setattr(explorer, 'MOST', 30)
+    monkeypatch.setattr(explorer, 'SINGLE', 30)
     problem = Problem(load_chain('ur5e'), measured())
     found = identify(problem)
     path = tmp_path / 'report.html'

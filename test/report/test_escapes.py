@@ -21,6 +21,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
+from calib_ros.report import reports
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import Origin
 from calib_ros.report.plots import before_after_png
@@ -86,30 +87,35 @@ def result():
     return identify(Problem(load_chain('ur5e'), measured()))
 
 
-@pytest.mark.parametrize('name', HOSTILE[:-3])
-def test_a_report_is_of_one_form_whatever_the_names(result, name):
+def test_a_report_is_of_one_form_whatever_the_names(result, monkeypatch):
     """Of the robot, a joint, what was dropped, and in a warning."""
+    monkeypatch.setattr(reports, 'SURVEYED', 100)
+    problem = Problem(load_chain('ur5e'), measured())
+    poses = poses_of(problem, result)
 
-    def text_of(found, dropped, warning):
-        problem = Problem(load_chain('ur5e'), measured())
-        poses = poses_of(problem, result)
-        report = identification_report(problem, found, poses, Origin(), (warning,))
-        return markdown(report, {'samples': 3, 'dropped': dropped})
+    def lines_of(name):
+        first = replace(result.parameters[0], name=Parameter(name, 'a'))
+        found = replace(
+            result,
+            chain=replace(result.chain, name=name),
+            parameters=(first, *result.parameters[1:]),
+        )
+        report = identification_report(problem, found, poses, Origin(), (name,))
+        return markdown(report, {'samples': 3, 'dropped': {name: 1}}).splitlines()
 
-    usual = text_of(result, {'x': 1}, 'x')
-    joint = result.parameters[0].name
-    first = replace(result.parameters[0], name=Parameter(name, 'a'))
-    renamed = replace(
-        result,
-        chain=replace(result.chain, name=name),
-        parameters=(first, *result.parameters[1:]),
-    )
-    found = text_of(renamed, {name: 1}, name)
-    assert len(found.splitlines()) == len(usual.splitlines())
-    assert '<' not in found
-    row = next(line for line in usual.splitlines() if line.startswith(f'| {joint} |'))
-    other = found.splitlines()[usual.splitlines().index(row)]
-    assert other.replace(r'\\', '').replace(r'\|', '').count('|') == row.count('|')
+    usual = lines_of('x')
+    (row,) = (k for k, line in enumerate(usual) if line.startswith('| x.a |'))
+    for name in HOSTILE[:-3]:
+        lines = lines_of(name)
+        assert len(lines) == len(usual), name
+        assert '<' not in ''.join(lines), name
+        plain = lines[row].replace(r'\\', '').replace(r'\|', '')
+        assert plain.count('|') == usual[row].count('|'), name
+
+
+@pytest.mark.parametrize('name', ['$x^{$', '\\', '<script>'])
+def test_a_figure_is_drawn_whatever_the_name(result, name):
+    renamed = replace(result, chain=replace(result.chain, name=name))
     assert before_after_png(renamed).startswith(b'\x89PNG')
 
 

@@ -249,7 +249,7 @@ def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     problem, result = solved
     poses = poses_of(problem, result)
-    monkeypatch.setattr(explorer, 'MOST', 30)
+    monkeypatch.setattr(explorer, 'SINGLE', 30)
     shown = explorer.explorer(result.chain, poses)
     good = ~poses.outlier
     assert sum(shown['cells']['count']) == good.sum()
@@ -273,10 +273,10 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
         many, stamps_ns=np.arange(count), after=many.after + rng.normal(0, 1e-5, (count, 3))
     )
     shown = explorer.explorer(result.chain, many)
-    assert len(shown['role']) <= 2 * explorer.LARGEST
+    assert len(shown['role']) <= 2 * explorer.WORST
     report = replace(report_of(*solved), explorer=shown)
     assert len(render(report).encode()) < 8e6
-    most = one.select(rng.integers(0, len(one), explorer.MOST))
+    most = one.select(rng.integers(0, len(one), explorer.SINGLE))
     report = replace(report, explorer=explorer.explorer(result.chain, most))
     assert len(render(report).encode()) < 8e6
 

@@ -41,3 +41,21 @@ def cell(tmp_path):
 
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         yield cell
+
+
+@pytest.fixture(scope='module')
+def idle(tmp_path_factory):
+    """Return a cell with a node that nothing shall change."""
+    from ros_cell import Cell
+
+    with Cell(chain='ur10e', data_dir=str(tmp_path_factory.mktemp('idle'))) as cell:
+        yield cell
+
+
+@pytest.fixture(scope='module')
+def empty():
+    """Return a cell in which no node comes up."""
+    from ros_cell import Cell
+
+    with Cell() as cell:
+        yield cell

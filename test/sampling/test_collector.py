@@ -346,17 +346,6 @@ def test_a_capture_that_gives_nothing_leaves_the_stop_its_sample():
     assert samples[1].count > 200
 
 
-def test_in_continuous_mode_a_capture_takes_nothing_away():
-    motion = tour()
-    asking, answers = ask([1.7])
-    expected = play(
-        collector(mode='continuous'), joint_events(motion, 9.5), pose_events(motion, 9.5)
-    )
-    made = collector(mode='continuous')
-    assert_same(play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), asking), expected)
-    assert answers == [(0, 'every measurement is taken in mode continuous')]
-
-
 # Order of arrival
 
 
@@ -477,14 +466,6 @@ def test_after_the_clock_jumped_back_new_stops_are_sampled():
         np.testing.assert_allclose(sample.joints, where, atol=1e-3)
 
 
-def test_one_stamp_from_the_future_does_not_stop_it():
-    motion = tour()
-    made = collector()
-    wrong = [(3.5, (0, 1), START + 10**12, np.zeros(2))]
-    samples = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), wrong)
-    assert len(samples) >= 4
-
-
 # Buffers
 
 
@@ -517,20 +498,6 @@ def test_samples_kept_are_bounded():
     made = collector(mode='continuous', pose_buffer=60, lateness=0.2)
     assert len(play(made, joint_events(motion, 5.0), pose_events(motion, 5.0))) == 60
     assert made.dropped['poses: the memory for samples is full'] > 150
-
-
-# What the operator is told
-
-
-def test_the_state_follows_the_arm():
-    motion = tour()
-    made = collector()
-    assert made.state() == 'waiting for joint states'
-    play(made, joint_events(motion, 0.6), finish=False)
-    assert made.state() == 'the arm stands for 0.6 s'
-    play(made, joint_events(motion, 1.5, begin=0.6), finish=False)
-    assert made.state() == 'the arm is moving'
-    assert collector(mode='continuous').state() == 'waiting for joint states'
 
 
 # Targets without end

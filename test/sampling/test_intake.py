@@ -129,32 +129,6 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     assert one.samples
 
 
-@pytest.mark.parametrize('off', [10_000, 10_000_000])
-def test_two_stray_stamps_in_a_batch_cost_two_messages(rng, off):
-    stamps, values, _ = drive(ARM.random_joints(10, rng), Cell(joint_rate=100.0), START)
-    seen = measure(ARM, values, rng, 5e-5, 2e-4)
-    quats = to_quat(seen.rotations)
-    sane = []
-    for k, stamp in enumerate(stamps.tolist()):
-        sane.append(joints(JOINTS, stamp, ARM.joint_names, values[k]))
-        sane.append(pose(stamp, seen.positions[k], quats[k]))
-    far = int(stamps[len(stamps) // 2]) + off * 1_000_000_000
-    stray = [joints(JOINTS, far, ARM.joint_names, values[0]), pose(far, np.zeros(3), quats[0])]
-    half = len(sane) // 2
-    sessions = CalibrationSession(ARM), CalibrationSession(ARM)
-    for session, messages in zip(
-        sessions, (sane, [*sane[:half], *stray, *sane[half:]]), strict=True
-    ):
-        assert feed(session, messages, STORE.deserialize_cdr) == []
-        session.finish()
-    expected, found = map(outcome, sessions)
-    assert found[1:] == expected[1:]
-    cause = 'stamp far from those before and after'
-    more = {f'joints: {cause}': 1, f'poses: {cause}': 1}
-    assert found[0].dropped == expected[0].dropped | more
-    assert found[0].samples == 10
-
-
 def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
     monkeypatch.setattr('calib_ros.sampling.waiting.MOST_STREAMS', 1)
     quat = [0.0, 0.0, 0.0, 1.0]

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib_ros.kinematics import se3
-from calib_ros.sampling.making import WIDTH, Maker
+from calib_ros.sampling.making import WIDTH, Maker, Matched
 from calib_ros.sampling.slices import StreamKey
 from calib_ros.sampling.track import Motion
 
@@ -26,7 +26,7 @@ def samples(rotations, rng, spikes=(), stops=1):
     stamps = 1 + np.arange(stops * count)
     numbers = np.repeat(np.arange(stops), count)
     made = Maker(np.array([True]), 100)
-    made.add(list(made.of_stops(POSE, numbers, stamps, values, motion, 0, NOISE)))
+    made.add(list(made.of_stops(Matched(POSE, numbers, stamps, values, motion, 0), NOISE)))
     return made.take()[0]
 
 

@@ -22,7 +22,7 @@ from streams import (
 )
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.errors import ConfigError, InputError
+from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import verdict
@@ -94,25 +94,6 @@ def test_samples_are_told_of_as_they_are_taken():
     made.finish()
     assert made.samples == heard
     assert len(heard) == 4
-
-
-def test_the_last_sample_is_taken_back():
-    made = session(samples())
-    last = made.samples[-1]
-    assert made.remove_last() is last
-    assert len(made.samples) == 29
-    with pytest.raises(InputError, match='no sample to remove'):
-        CalibrationSession(UR5E).remove_last()
-
-
-def test_a_sample_that_was_taken_back_is_in_the_account():
-    made = CalibrationSession(UR5E)
-    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), [tracker()])
-    made.finish()
-    taken = made.remove_last()
-    account = made.account()
-    assert account.unused['poses: of a sample that was taken back'] == taken.count
-    assert account.samples == 2
 
 
 def test_restored_samples_come_first_and_are_as_good_as_new():
@@ -280,25 +261,6 @@ def test_devices_and_targets_have_frames_of_their_own():
     assert [len(each) for each in sets] == [5, 5, 5]
 
 
-def test_the_frames_of_two_devices_may_differ():
-    made = CalibrationSession(UR5E, Settings(**SIGMAS))
-    source, kind, seen = tracker()
-
-    def elsewhere(stamp, row):
-        message = seen(stamp, row)
-        message.header.frame_id = 'other'
-        return message
-
-    two = [(source, kind, seen), (Source('b', device='B'), kind, elsewhere)]
-    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), two)
-    assert len(made.problem().sets) == 2
-    same = CalibrationSession(UR5E, Settings(**SIGMAS))
-    two = [(source, kind, seen), (Source('b'), kind, elsewhere)]
-    drive(same, UR5E.random_joints(3, np.random.default_rng(1)), two)
-    with pytest.raises(InputError, match=r'different frames \(other, tracker\)'):
-        same.problem()
-
-
 def test_the_world_is_the_frame_of_the_base():
     """Of two devices the one whose sample came first, and not the one that was heard first."""
     source, kind, seen = tracker()
@@ -322,25 +284,6 @@ def test_the_world_is_the_frame_of_the_base():
 
 
 # Judging
-
-
-def test_without_a_calibration_or_new_samples_nothing_is_judged():
-    made = session(samples())
-    with pytest.raises(InputError, match='no calibration to judge'):
-        made.validate()
-    made.identify()
-    with pytest.raises(InputError, match='measure some new poses first'):
-        made.validate()
-
-
-def test_new_samples_judge_the_calibration():
-    made = session(samples())
-    result = made.identify()
-    drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker()])
-    now, nominal = made.validate()
-    assert now.count == 8
-    assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
-    assert made.calibration.chain is result.chain
 
 
 @pytest.mark.parametrize('first', [0, 1])
@@ -417,15 +360,6 @@ def test_samples_on_a_target_that_the_calibration_does_not_know_are_no_judges():
         made.validate()
 
 
-def test_a_result_that_is_not_accepted_keeps_the_last_good_one():
-    made = session(samples())
-    good = made.identify()
-    made.clear()
-    made.restore(samples(30, true=UR5E, start=500))
-    assert not made.identify().accepted
-    assert made.calibration.chain is good.chain
-
-
 # Settings and words
 
 
@@ -437,14 +371,6 @@ def test_settings_change_without_losing_anything():
     assert {p.name for p in result.parameters if p.status == 'fixed'} == {
         f'{name}.alpha' for name in UR5E.joint_names
     }
-
-
-def test_settings_that_cannot_be_change_nothing():
-    made = session(samples())
-    before = made.settings
-    with pytest.raises(ConfigError, match='nowhere'):
-        made.change(replace(before, fixed=('nowhere.*',)))
-    assert made.settings is before
 
 
 def test_the_way_of_a_stop_can_be_changed_while_it_runs():
@@ -496,7 +422,7 @@ def test_the_status_names_a_sample_that_does_not_fit():
     made = session(given[:45])
     assert 'does not fit' not in made.status()
     made.samples.append(replace(given[45], position=given[45].position + 0.01))
-    assert 'sample 46 does not fit to the others' in made.status()
+    assert 'sample 46 does not fit the others' in made.status()
     made.remove_last()
     assert 'does not fit' not in made.status()
 
@@ -535,12 +461,3 @@ def test_the_status_is_never_an_error():
     assert CalibrationSession(UR5E).status('identifying') == (
         'waiting for joint states; identifying; 0 samples'
     )
-
-
-def test_identifying_nothing_says_what_came():
-    made = CalibrationSession(UR5E)
-    with pytest.raises(InputError, match='no samples to fit: 0 joint states and 0 poses'):
-        made.identify()
-    made.restore(samples(3))
-    with pytest.raises(InputError, match='too few'):
-        made.identify()

@@ -45,13 +45,6 @@ def words(motion):
 # Interpolation
 
 
-def test_between_two_samples_values_are_interpolated():
-    motion = at(filled([(100, (0.0, 1.0)), (140, (0.4, 3.0))]), 110)
-    np.testing.assert_allclose(motion.joints, [[0.1, 1.5]], atol=1e-15)
-    np.testing.assert_allclose(motion.velocity, [[10.0, 50.0]], atol=1e-12)
-    assert words(motion) == ['']
-
-
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_a_cubic_motion_is_met_exactly(seed, even):
     rng = np.random.default_rng(seed)
@@ -75,15 +68,6 @@ def test_a_cubic_motion_is_met_exactly(seed, even):
     np.testing.assert_allclose(motion.joints, values(wanted), atol=1e-12)
     np.testing.assert_allclose(motion.velocity, values(wanted, 1), atol=1e-9)
     np.testing.assert_allclose(motion.acceleration, values(wanted, 2), atol=1e-6)
-
-
-def test_a_fast_motion_is_met_better_than_by_straight_lines():
-    """At 100 Hz, 1 rad and 1 Hz straight lines are off by 0.5 mrad."""
-    times = np.arange(200) * 10.0
-    made = filled([(ms, (np.sin(2e-3 * np.pi * ms), 0.0)) for ms in times])
-    between = np.arange(15.0, 1900.0, 10.0)
-    error = at(made, *between).joints[:, 0] - np.sin(2e-3 * np.pi * between)
-    assert np.abs(error).max() < 1e-6
 
 
 def test_a_cubic_does_not_reach_over_a_pause_in_the_samples():
@@ -110,14 +94,6 @@ def test_stamps_of_today_are_interpolated_to_the_nanosecond():
         add(made, BOTH, start + k, np.array([0.1 * k, 0.2 * k]))
     made.sort()
     np.testing.assert_allclose(made.at(np.array([start + 3])).joints, [[0.3, 0.6]], atol=1e-15)
-
-
-@pytest.mark.parametrize('hit', [100, 120, 140])
-def test_a_sample_at_the_very_stamp_is_taken_as_it_is(hit):
-    samples = {100: (0.1, 0.7), 120: (0.3, -0.3), 140: (0.9, 0.1)}
-    motion = at(filled(samples.items()), hit)
-    np.testing.assert_array_equal(motion.joints, [samples[hit]])
-    assert words(motion) == ['']
 
 
 def test_an_exact_hit_needs_no_neighbour_and_knows_no_gap():

@@ -1,0 +1,24 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How sure claims are, in three steps, and what chance explains."""
+
+from __future__ import annotations
+
+from scipy import special
+
+CONFIDENT = 0.95
+"""Of intervals, and of gains: one in twenty is allowed to be chance."""
+CERTAIN = 0.99
+"""Of what is held against a result, and where several tests are made."""
+SURE = 0.999
+"""Of what changes the model or the noise: hundreds of tests are made in the life of a cell."""
+KNOWN = 1e9
+"""Degrees of freedom that are as good as infinite."""
+
+
+def chance_of(squares: float, rank: int, freedom: float) -> float:
+    """Return the probability of squares as large in `rank` directions of noise alone.
+
+    `freedom` are the degrees of freedom from which the size of the noise was estimated.
+    """
+    return float(special.fdtrc(rank, min(freedom, KNOWN), max(squares, 0.0) / rank))

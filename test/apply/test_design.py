@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a design knows, and what a pose is worth by it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from designs import POSTURE, SIGMAS, arm, design_of, log_det, predicted_square, some
+
+from calib_ros.apply import choice, planning, simulation
+from calib_ros.apply.choice import choose
+from calib_ros.apply.design import (
+    ASSUMED_TOOL,
+    Candidates,
+    Design,
+    accuracy,
+    information_of,
+    predicted,
+)
+from calib_ros.apply.design import _root_of_inverse as root_of_inverse
+from calib_ros.errors import InputError
+from calib_ros.identification.identifiability import observability
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.sampling.live import LOOK, LiveEstimate
+from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.session import CalibrationSession
+
+
+@pytest.mark.parametrize(
+    ('name', 'oriented', 'count'), [('ur10e', False, 27), ('puma560', True, 30)]
+)
+def test_gauge_freedoms_are_left_out_as_in_the_identification(name, oriented, count):
+    chain = arm(name)
+    design = design_of(chain, oriented)
+    rng = np.random.default_rng(3)
+    true = simulation.faulty(chain, simulation.Cell(), rng)
+    q = some(chain, 40)
+    result = identify(Problem(chain, simulation.measure(true, q, rng, *SIGMAS, oriented)))
+    assert len(design.names) == count
+    assert set(design.names) == set(result.names)
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_predicted_errors_are_those_of_the_identification(oriented):
+    """Predicted before anything is measured, at the nominal chain, and after the fit."""
+    chain = arm()
+    rng = np.random.default_rng(4)
+    true = simulation.faulty(chain, simulation.Cell(), rng)
+    q, task = some(chain, 40), some(chain, 200, 2)
+    observations = simulation.measure(true, q, rng, *SIGMAS, oriented)
+    problem = Problem(chain, observations)
+    result = identify(problem)
+    assert result.noise.consistent
+    found = by_parameters(result, task)
+    known = Design.of(problem, result)
+    assert predicted(known, task) == pytest.approx(found, rel=1e-6)
+    assert accuracy(design_of(true, oriented), q, task)[-1] == pytest.approx(found, rel=0.02)
+    more = some(chain, 10, 5)
+    seen = simulation.measure(true, np.concatenate([q, more]), rng, *SIGMAS, oriented)
+    both = identify(Problem(chain, seen))
+    assert predicted(known.after(more), task) == pytest.approx(by_parameters(both, task), rel=0.02)
+
+
+def by_parameters(result, task):
+    """Return the RMS error [m] at a task by the uncertainty of the fitted parameters alone."""
+    rows = ErrorModel(result.chain, result.names).jacobian(task)[:, :3]
+    return np.sqrt(np.einsum('ncp,pr,ncr->', rows, result.covariance, rows) / len(task))
+
+
+def test_what_the_live_estimate_knows_is_known():
+    """The sigma that it predicts, before and after further poses."""
+    chain = arm()
+    rng = np.random.default_rng(4)
+    true = simulation.faulty(chain, simulation.Cell(), rng)
+    seen = simulation.measure(true, some(chain, 60), rng, *SIGMAS)
+    samples = [
+        Sample(int(stamp), joints, position=position, rotation=rotation)
+        for stamp, joints, position, rotation in zip(
+            seen.stamps_ns, seen.joints, seen.positions, seen.rotations, strict=True
+        )
+    ]
+    session = CalibrationSession(chain)
+    first, both = (LiveEstimate(session.problem_of).update(samples[:n]) for n in (30, 60))
+    design = Design.of(session.problem_of(samples[:30]), first)
+    look = first.chain.random_joints(LOOK, np.random.default_rng(0))
+    assert predicted(design, look) == pytest.approx(first.sigma, rel=1e-3)
+    same_noise = both.sigma * first.noise / both.noise
+    assert predicted(design.after(seen.joints[30:]), look) == pytest.approx(same_noise, rel=0.03)
+
+
+def test_poses_to_come_have_the_noise_that_was_found():
+    chain = arm()
+    rng = np.random.default_rng(4)
+    true = simulation.faulty(chain, simulation.Cell(), rng)
+    noisy = simulation.measure(true, some(chain, 60), rng, 3e-4, 1e-3)
+    problem = Problem(chain, noisy)
+    design = Design.of(problem, identify(problem))
+    assert design.sigma_position == pytest.approx(3e-4, rel=0.15)
+    assert design.sigma_orientation == pytest.approx(1e-3, rel=0.15)
+
+
+def test_the_base_frame_has_no_influence(rng):
+    chain = arm()
+    moved = replace(chain, base=simulation.random_frame(rng, 2.0))
+    q, task = some(chain, 60), some(chain, 50, 2)
+    np.testing.assert_array_equal(choose(design_of(chain), q, 20), choose(design_of(moved), q, 20))
+    np.testing.assert_allclose(
+        accuracy(design_of(chain), q, task), accuracy(design_of(moved), q, task), rtol=1e-6
+    )
+
+
+def test_an_unknown_tool_is_taken_off_the_axis():
+    """Else no position would show the last joint, and its error would be left out."""
+    chain = load_chain('ur10e')
+    design = design_of(chain, oriented=False)
+    assert len(design.determined_by(some(chain, 50)).names) == 27
+    np.testing.assert_allclose(design.chain.tool.matrix[:3, 3], ASSUMED_TOOL)
+
+
+def test_parameters_that_no_candidate_shows_are_named():
+    chain = arm()
+    q = some(chain, 80)
+    q[:, 3:] = POSTURE[3:]
+    found = planning.plan(design_of(chain), q, some(chain, 50, 2), 20)
+    rng = np.random.default_rng(0)
+    result = identify(Problem(chain, simulation.measure(chain, q, rng, *SIGMAS)))
+    assert found.lacking
+    assert set(found.lacking) == set(result.not_excited)
+    assert np.isfinite(found.accuracy[-1])
+
+
+def test_a_covariance_that_rounding_made_singular_still_informs():
+    known = np.array([[4.0, 1.0], [1.0, 2.0]])
+    rows = root_of_inverse(known)
+    assert rows.T @ rows == pytest.approx(np.linalg.inv(known))
+    assert np.isfinite(root_of_inverse(np.ones((3, 3)))).all()
+
+
+def test_priors_make_up_for_poses():
+    chain = arm()
+    task = some(chain, 50, 2)
+    plain, helped = (design_of(chain, priors=priors) for priors in ({}, {'*_joint.*': 1e-3}))
+    few = some(chain, 3)
+    assert np.isinf(accuracy(plain, few, task)[-1])
+    plain_formula = np.sqrt(predicted_square(helped, few, task))
+    assert accuracy(helped, few, task)[-1] == pytest.approx(plain_formula, rel=1e-6)
+    many = some(chain, 60)
+    assert accuracy(helped, many, task)[-1] < accuracy(plain, many, task)[-1]
+    assert len(choose(helped, many, 2)) == 2
+
+
+def test_distances_are_refused():
+    chain = arm()
+    observations = simulation.measure(chain, some(chain, 40), np.random.default_rng(0))
+    lengths = np.linalg.norm(observations.positions, axis=1)
+    with pytest.raises(InputError, match='not for distances'):
+        Design.of(Problem(chain, replace(observations, distances=lengths)))
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_worth_by_updates_equals_that_computed_anew(oriented):
+    chain = arm()
+    design = design_of(chain, oriented)
+    q, task = some(chain, 30), some(chain, 40, 2)
+    space = Candidates(design, q)
+    chosen = list(range(12))
+    so_far = space.known + information_of(space.rows[chosen])
+    by_det, by_task = (
+        choice._score(space, criterion, task)(so_far, space.rows) for criterion in ('d', 'task')
+    )
+    for k in (3, 20, 29):  # one of them a second time
+        more = np.concatenate([q[chosen], q[k : k + 1]])
+        anew = log_det(design, more) - log_det(design, q[chosen])
+        assert by_det[k] == pytest.approx(anew, rel=1e-6)
+        anew = predicted_square(design, q[chosen], task) - predicted_square(design, more, task)
+        assert by_task[k] == pytest.approx(anew, rel=1e-6)
+
+
+@pytest.mark.parametrize('criterion', ['o2', 'o3', 'o4', 'o5'])
+def test_indices_are_those_of_the_report(criterion):
+    design = design_of(arm())
+    q = some(design.chain, 30)
+    space = Candidates(design, q)
+    so_far = space.known + information_of(space.rows[:12])
+    worth = choice._score(space, criterion, None)(so_far, space.rows)
+    rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
+    factor = np.linalg.qr(rows, mode='r')
+    assert worth[20] == pytest.approx(getattr(observability(factor, 13), criterion), rel=1e-5)
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_predicted_errors_equal_the_plain_formula(oriented):
+    design = design_of(arm(), oriented)
+    q, task = some(design.chain, 25), some(design.chain, 60, 2)
+    found = accuracy(design, q, task)
+    for count in (12, 25):
+        plain = np.sqrt(predicted_square(design, q[:count], task))
+        assert found[count - 1] == pytest.approx(plain, rel=1e-6)
+    assert np.isinf(found[: 4 if oriented else 8]).all()
+    assert predicted(design.after(q), task) == pytest.approx(found[-1], rel=1e-6)
+    assert np.isinf(predicted(design.after(q[:3]), task))

@@ -1,0 +1,188 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where the target is seen, and `calib_ros plan`."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from designs import arm, design_of, some
+
+from calib_ros.apply import simulation
+from calib_ros.apply.candidates import Visibility, draw_candidates
+from calib_ros.apply.choice import choose
+from calib_ros.cli.main import main
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.waypoints import joints_csv, read_joints
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
+from calib_ros.kinematics.se3 import invert
+
+
+def test_candidates_are_within_box_and_cone(rng):
+    chain = replace(arm(), base=simulation.random_frame(rng, 2.0))
+    design = design_of(chain)
+    box = np.array([[0.0, -1.0, 0.2], [1.2, 1.0, 1.5]])
+    tracker = np.array([3.0, 0.5, 1.0])
+    seen = Visibility(box, tracker, (0.0, 1.0, 0.0), np.radians(30.0))
+    q = draw_candidates(design, 100, rng, seen)
+    poses = invert(chain.base.matrix) @ chain.forward(q)
+    position, axis = poses[:, :3, 3], poses[:, :3, 1]
+    sight = tracker - position
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    assert q.shape == (100, 6)
+    assert ((box[0] <= position) & (position <= box[1])).all()
+    assert np.degrees(np.arccos((axis * sight).sum(axis=1))).max() < 30.0
+    everything = chain.random_joints(2000, rng)
+    share = seen.sees(design, everything).mean()
+    assert 0.0 < share < 0.1
+
+
+def test_the_region_may_be_given_in_the_world(rng):
+    chain = replace(arm(), base=simulation.random_frame(rng, 2.0))
+    world = chain.base.matrix[:3, 3] + np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 0.0]])
+    q = draw_candidates(design_of(chain), 50, rng, Visibility(world, world=True))
+    position = chain.forward(q)[:, :3, 3]
+    assert ((world[0] <= position) & (position <= world[1])).all()
+    with pytest.raises(ConfigError, match='where the base is'):
+        Visibility(world, world=True).sees(design_of(arm()), q)
+
+
+def test_a_region_out_of_reach_is_refused(rng):
+    far = Visibility(np.array([[5.0, 5.0, 5.0], [6.0, 6.0, 6.0]]))
+    with pytest.raises(InputError, match=r'0 of .* random poses'):
+        draw_candidates(design_of(arm()), 10, rng, far)
+    with pytest.raises(ConfigError, match='is empty'):
+        Visibility(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]]))
+    with pytest.raises(ConfigError, match='axis'):
+        Visibility(axis=(0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        status = main(['plan', *map(str, arguments)])
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return run
+
+
+def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
+    status, out, err = run('--chain', 'ur10e', '--poses', 25, '--out', 'plan.csv')
+    assert (status, err) == (0, '')
+    q = read_joints(tmp_path / 'plan.csv', load_chain('ur10e'))
+    assert q.shape == (25, 6)
+    assert np.abs(np.diff(q, axis=0)).max(axis=1).sum() < 150.0
+    assert np.abs(q).max() <= 2.0 * np.pi
+    rows = [line.split() for line in out.splitlines()[2:] if line[:1] == ' ']
+    assert rows[0][0] == '5'
+    assert rows[-1][0] == '25'
+    assert float(rows[-1][1]) == pytest.approx(0.093, abs=0.005)
+    assert all(float(planned) < float(random) for _, planned, random in rows)
+    assert 'the tool is unknown' in out
+    before = (tmp_path / 'plan.csv').read_bytes()
+    again = ('--chain', 'ur10e', '--seed', 1, '--draw', 100, '--out', 'plan.csv')
+    assert run(*again)[0] == 1
+    assert (tmp_path / 'plan.csv').read_bytes() == before
+    assert run(*again, '--force')[0] == 0
+    assert (tmp_path / 'plan.csv').read_bytes() != before
+
+
+def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
+    chain = arm()
+    (tmp_path / 'chain.yaml').write_text(dump_chain(chain))
+    q, task, taken = (some(chain, count, count) for count in (80, 20, 30))
+    for name, values in (('q', q), ('task', task), ('taken', taken)):
+        (tmp_path / f'{name}.csv').write_text(joints_csv(values))
+    common = ('--chain', 'chain.yaml', '--candidates', 'q.csv', '--poses', 12, '--force')
+    common += ('--task', 'task.csv', '--measured', 'position', '--out', 'plan.csv')
+    _, alone, _ = run(*common)
+    found = read_joints(tmp_path / 'plan.csv', chain)
+    nearest = np.abs(found[:, None] - q).max(axis=2).min(axis=1)
+    assert nearest.max() < 1e-8
+    expected = choose(design_of(chain, oriented=False), q, 12)
+    assert {tuple(row) for row in found.round(6)} == {tuple(row) for row in q[expected].round(6)}
+    _, after, _ = run(*common, '--taken', 'taken.csv', '--criterion', 'task')
+
+    def last(text):
+        return float(
+            next(line for line in text.splitlines() if line.startswith('    12')).split()[1]
+        )
+
+    assert last(after) < 0.9 * last(alone)
+    assert 'the tool' not in alone
+
+
+def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
+    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 500)
+    count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
+    assert f'0.1 mm: {count} poses' in out
+    assert 18 <= count <= 26
+    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 500)
+    assert f'0.1 mm: {count} poses' in out
+    assert out.splitlines()[-5].split()[0] == '10'
+
+
+def test_plan_with_too_few_poses_says_so(run):
+    _, out, _ = run('--chain', 'ur10e', '--poses', 3)
+    assert 'too few poses to determine all parameters' in out
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [
+        (('--poses', 0), '--poses must be at least 1'),
+        (('--accuracy', -1), '--accuracy must be positive'),
+        (('--velocity', 0), 'each --velocity must be positive'),
+        (('--velocity', 1, 2), '--velocity: give one value, or 6'),
+        (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
+        (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
+        (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
+        (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
+        (('--iso9283', '--poses', 20), '--poses is of no use with --iso9283'),
+        (('--iso9283', '--candidates', 'q.csv'), '--candidates is of no use'),
+        (('--box', 0, 0, 0, 1, 1, 1, '--world'), 'where the base is'),
+    ],
+)
+def test_plan_refuses_what_makes_no_sense(run, arguments, text):
+    status, out, err = run('--chain', 'ur10e', *arguments)
+    assert (status, out) == (1, '')
+    assert text in err
+
+
+def test_plan_from_candidates_that_nothing_sees(run, tmp_path):
+    (tmp_path / 'q.csv').write_text(joints_csv(some(arm(), 10)))
+    arguments = ('--candidates', 'q.csv', '--box', 5, 5, 5, 6, 6, 6)
+    status, _, err = run('--chain', 'ur10e', *arguments)
+    assert status == 1
+    assert 'measured at no pose of q.csv' in err
+
+
+@pytest.mark.parametrize('option', ['--task', '--taken'])
+def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
+    (tmp_path / 'q.csv').write_text('q1,q2,q3,q4,q5,q6\n0,0,180,0,0,0\n')
+    status, _, err = run('--chain', 'ur10e', option, 'q.csv')
+    assert status == 1
+    assert 'q3 180 is beyond the limits of elbow_joint' in err
+
+
+@pytest.mark.parametrize(
+    ('content', 'text'),
+    [
+        ('q1,q2\n0,0\n', 'has no column q3, q4, q5, q6'),
+        ('q1,q2,q3,q4,q5,q6\n', 'has no rows'),
+        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but the arm has 6 joints only'),
+        (
+            'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
+            'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',
+        ),
+        ('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,x\n', "line 2: q6 must be a number, not 'x'"),
+    ],
+)
+def test_files_of_poses_that_cannot_be_read(run, tmp_path, content, text):
+    (tmp_path / 'q.csv').write_text(content)
+    status, _, err = run('--chain', 'ur10e', '--candidates', 'q.csv')
+    assert status == 1
+    assert text in err

@@ -1,0 +1,175 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Priors: tolerances of manufacture where poses are few."""
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E, fitted, rms
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameError
+from calib_ros.identification.identifiability import (
+    structurally_independent,
+)
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.report.words import summary
+
+
+def manufacture(scale=1.0):
+    """Return the tolerances by which `faulty` makes arms, for what is no gauge freedom."""
+    cell = Cell()
+    names = structurally_independent(UR10E, UR10E.parameter_names)
+    return {
+        name: scale * (cell.length_error if Parameter(name).is_length else cell.angle_error)
+        for name in names
+        if not name.startswith(('base', 'tool'))
+    }
+
+
+@pytest.mark.parametrize(
+    ('count', 'oriented', 'gain'), [(6, True, 0.97), (8, True, 0.97), (10, False, 0.8)]
+)
+def test_priors_help_where_poses_are_few(count, oriented, gain):
+    """With a coarse device, tolerances of manufacture tell as much as eight poses do."""
+    errors = []
+    noise = (3e-4, 1.5e-3)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(count, rng), rng, *noise, oriented=oriented)
+        unseen = UR10E.random_joints(300, rng)
+        options = {'sigma_position': noise[0], 'sigma_orientation': noise[1], 'loss': 'none'}
+        without = fitted(Problem(UR10E, seen, priors={'*_joint.*': 1e6}, **options))
+        told = fitted(Problem(UR10E, seen, **options))
+        helped = fitted(Problem(UR10E, seen, priors=manufacture(), **options))
+        errors.append(
+            [
+                rms(c, true, unseen)
+                for c in (without.before, without.chain, helped.chain, told.chain)
+            ]
+        )
+    nominal, plain, with_priors, told_priors = np.median(errors, axis=0)
+    assert with_priors < gain * plain
+    assert told_priors < 1.1 * with_priors  # the data tell these tolerances as well
+    assert with_priors < 0.7 * nominal
+
+
+def test_priors_allow_fewer_poses_than_parameters():
+    """Four poses have 24 equations for 30 parameters."""
+    errors = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(4, rng), rng, *NOISE)
+        with pytest.raises(TooFewObservationsError):
+            identify(Problem(UR10E, seen, **SIGMAS))
+        result = identify(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
+        assert result.rank == 30
+        unseen = UR10E.random_joints(300, rng)
+        errors.append([rms(chain, true, unseen) for chain in (result.before, result.chain)])
+    before, after = np.median(errors, axis=0)
+    assert after < 0.6 * before
+
+
+@pytest.mark.parametrize('count', [4, 12])
+def test_standard_deviations_are_honest_where_errors_are_drawn_from_the_priors(count):
+    scores = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+        result = fitted(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
+        scores += [
+            (p.value - true.value(p.name)) / p.std for p in result.parameters if p.name in prior
+        ]
+    # 25 runs of 18 parameters, correlated within a run: some 300 degrees of freedom
+    assert np.std(scores) == pytest.approx(1.0, abs=0.12)
+
+
+prior = frozenset(manufacture())
+
+
+def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    plain = identify(Problem(UR10E, seen, **SIGMAS))
+    result = identify(Problem(UR10E, seen, priors={'wrist_3_joint.d': 1e-3}, **SIGMAS))
+    row = {p.name: p for p in result.parameters}['wrist_3_joint.d']
+    assert 'wrist_3_joint.d' in plain.unidentifiable
+    assert row.status == 'fitted'
+    assert row.std == pytest.approx(1e-3, rel=1e-3)
+    assert row.offset == pytest.approx(0.0, abs=1e-6)
+    assert result.rank == plain.rank + 1
+    assert 'wrist_3_joint.d' not in result.gauges
+    # the poses do not know of it: predictions and their uncertainty stay as they are
+    unseen = UR10E.random_joints(50, rng)
+    np.testing.assert_allclose(
+        result.chain.forward(unseen), plain.chain.forward(unseen), rtol=0, atol=1e-8
+    )
+    np.testing.assert_allclose(
+        result.pose_covariance(unseen), plain.pose_covariance(unseen), rtol=0, atol=1e-13
+    )
+
+
+def test_priors_are_off_by_default_and_told_when_on(rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    without = identify(Problem(UR10E, seen, **SIGMAS))
+    assert without.priors == {}
+    assert 'prior' not in summary(without)
+    priors = {'elbow_joint.a': 1e-5, '*_joint.a': 1e-3}
+    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
+    assert result.priors == {
+        f'{name}.a': 1e-5 if name == 'elbow_joint' else 1e-3 for name in UR10E.joint_names
+    }
+    assert 'priors on 6 parameters' in summary(result)
+
+
+def test_narrow_priors_hold_and_wide_ones_let_go(rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    plain = identify(Problem(UR10E, seen, **SIGMAS))
+    narrow, wide = (
+        identify(Problem(UR10E, seen, priors=manufacture(scale), **SIGMAS))
+        for scale in (1e-6, 1e6)
+    )
+    unseen = UR10E.random_joints(100, rng)
+    np.testing.assert_allclose(
+        wide.chain.forward(unseen), plain.chain.forward(unseen), rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(narrow.chain.table, UR10E.table, rtol=0, atol=1e-6)
+    assert rms(narrow.chain, true, unseen) == pytest.approx(
+        rms(narrow.before, true, unseen), rel=0.01
+    )
+
+
+@pytest.mark.parametrize('sigma', [1e-4, 1e-3])
+def test_cross_validation_with_priors_is_that_of_separate_fits(sigma, rng):
+    true = faulty(UR10E, Cell(), rng)
+    seen = measure(true, UR10E.random_joints(30, rng), rng, *NOISE)
+    priors = {f'{name}.*': sigma for name in UR10E.joint_names}
+    result = identify(Problem(UR10E, seen, priors=priors, loss='none', **SIGMAS))
+    folds = seen.configurations % 5
+    wanted = np.empty((30, 3))
+    for fold in range(5):
+        inside = folds == fold
+        part = Problem(
+            UR10E,
+            seen.select(~inside),
+            held_out=seen.select(inside),
+            priors=priors,
+            loss='none',
+            **SIGMAS,
+        )
+        wanted[inside] = identify(part).validation.after.position
+    np.testing.assert_allclose(result.validation.after.position, wanted, rtol=0, atol=2e-6)
+
+
+def test_priors_that_make_no_sense_are_refused(rng):
+    seen = measure(UR10E, UR10E.random_joints(20, rng), rng)
+    with pytest.raises(UnknownNameError, match=r'elbow_joint\.a'):
+        Problem(UR10E, seen, priors={'elbow.a': 1e-3})
+    for sigma in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ConfigError, match='prior'):
+            Problem(UR10E, seen, priors={'elbow_joint.a': sigma})

@@ -1,0 +1,282 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in real rclpy: what it answers."""
+
+import numpy as np
+import pytest
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Log
+from rclpy.parameter import Parameter
+from ros_cell import (
+    STOPS,
+    Cell,
+    pose_messages,
+    topics,
+    values_of,
+)
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+
+from calib_ros.apply.simulation import measure
+from calib_ros.files.history import History
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+
+
+def test_errors_are_answers(cell, recording):
+    for name, said in (
+        ('identify', 'no samples to fit'),
+        ('capture', 'no joint states have come'),
+        ('remove_last', 'no sample to remove'),
+        ('validate', 'identify or load one first'),
+        ('load', 'no saved calibration of ur10e'),
+    ):
+        empty = cell.call(name)
+        assert not empty.success
+        assert said in empty.message
+    some = topics(recording)
+    cell.play(
+        {'joint_states': some['joint_states'][:120], 'measured_pose': some['measured_pose'][:8]}
+    )
+    few = cell.call('identify')
+    assert not few.success
+    assert '2 measured configurations are too few, at least 5' in few.message
+
+
+def test_answers_are_in_the_log_as_well(cell, recording):
+    told = cell.log()
+
+    def said(name, answer, level):
+        text = f'~/{name}: {cell.in_full(answer)}'
+        cell.spin_until(lambda: (text, level) in [(each.msg, each.level) for each in told])
+
+    for name in ('identify', 'export', 'capture', 'remove_last', 'validate', 'save', 'load'):
+        said(name, cell.call(name), Log.WARN)
+    said('record', cell.call('record', SetBool.Request(data=True)), Log.INFO)
+    cell.play(topics(recording))
+    for name in ('identify', 'export', 'save', 'load', 'remove_last', 'clear'):
+        said(name, cell.call(name), Log.INFO)
+
+
+def test_record_remove_last_and_clear(cell, recording):
+    joints, poses = topics(recording).values()
+    assert cell.call('record', SetBool.Request(data=False)).success
+    cell.play({'joint_states': joints[:10], 'measured_pose': poses[:2]})
+    account = cell.node.session.account()
+    assert account.unused == {'joints: not recording': 10, 'poses: not recording': 2}
+    assert cell.call('record', SetBool.Request(data=True)).success
+    cell.play({'joint_states': joints[10:300], 'measured_pose': poses[2:20]})
+    assert len(cell.node.session.samples) == 5
+    removed = cell.call('remove_last')
+    assert removed.success
+    assert removed.message == 'sample 5 removed'
+    assert len(cell.node.session.samples) == 4
+    cleared = cell.call('clear')
+    assert cleared.success
+    assert '4 samples cleared; they stay in' in cleared.message
+    assert cell.node.session.account().samples == 0
+    assert cell.node.session.account().joint_states == 0
+
+
+def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
+    joints, poses = topics(recording).values()
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'mode': 'triggered'}
+    with Cell(**parameters) as cell:
+        cell.play({'joint_states': joints[:28], 'measured_pose': poses[:4]})
+        taken = cell.call('capture')
+        assert taken.success, taken.message
+        assert taken.message.startswith('sample 1 taken (4 measurements, spread 0.0')
+        twice = cell.call('capture')
+        assert not twice.success
+        assert 'no measurements have come since the last sample' in twice.message
+        cell.node.set_parameters([Parameter('socket', value='plate A/1')])
+        ball = cell.call('capture')
+        assert ball.success, ball.message
+        assert ball.message == 'sample 2 taken: ball in socket plate A/1'
+        (path,) = tmp_path.glob('*Z.csv')
+        assert path.read_text().splitlines()[-1].endswith(',plate A,1,')
+        assert cell.call('remove_last').success
+        cell.node.set_parameters([Parameter('socket', value='A')])
+        assert 'socket must be LOCATION/SOCKET' in cell.call('capture').message
+        cell.node.set_parameters([Parameter('socket', value='')])
+        cell.play({'joint_states': joints[28:40], 'measured_pose': poses[4:5]})
+        moving = cell.call('capture')
+        assert not moving.success
+        assert 'the arm has not stood for 0.2 s yet' in moving.message
+        cell.play({'joint_states': joints[40:], 'measured_pose': poses[5:]})
+        assert len(cell.node.session.samples) == 1
+
+
+def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recording):
+    history = tmp_path / 'history'
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    parameters['history'] = str(history)
+    other = tmp_path / 'ur10e_on_linear_axis_20990101T000000000000Z.yaml'
+    other.write_text('of another robot, whose name begins alike')
+    with Cell(**parameters) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        nothing = cell.call('validate')
+        assert not nothing.success
+        assert 'measure some new poses' in nothing.message
+        assert cell.call('save').success
+        chain = cell.node.session.calibration.chain
+    with Cell(**parameters) as cell:
+        loaded = cell.call('load')
+        assert loaded.success, loaded.message
+        np.testing.assert_array_equal(cell.node.session.calibration.chain.table, chain.table)
+        assert cell.node.session.calibration.world_frame == 'tracker'
+        texts = cell.listen(String, 'calibration_node/calibration')
+        cell.spin_until(lambda: texts)
+        np.testing.assert_array_equal(parse_chain(texts[0].data).table, chain.table)
+        cell.play(topics(recording))
+        holds = cell.call('validate')
+        assert holds.success, holds.message
+        assert 'the calibration holds: RMS 0.0' in holds.message
+        assert f'{STOPS} samples taken since' in holds.message
+        agrees = cell.call('check')
+        assert agrees.success, agrees.message
+        assert 'agrees with what was measured: RMS 0.0' in agrees.message
+        cell.call('clear')
+        moved = pose_messages(recording.poses)
+        for message in moved:
+            message.pose.position.x += 0.003
+        cell.play(topics(recording, measured_pose=moved))
+        broken = cell.call('validate')
+        assert not broken.success
+        assert 'does not hold any more' in broken.message
+        assert 'RMS 3.0' in broken.message
+        bumped = cell.call('check')
+        assert not bumped.success
+        assert 'does not fit any more, changed: base' in bumped.message
+    filed = {(row.kind, row.verdict): row for row in History(history).rows('7')}
+    holds, broken = (filed['validate', text] for text in ('holds', 'does not hold'))
+    assert set(filed) == {
+        ('identify', 'accepted'),
+        *((r.kind, r.verdict) for r in (holds, broken)),
+    }
+    assert broken.rms_mm > 3.0 > holds.rms_mm
+
+
+def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, recording):
+    saved = tmp_path / 'saved.yaml'
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
+    with Cell(**parameters, serial='7', target_filename=str(saved)) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        assert cell.call('save').success
+    for serial, loads in (('8', False), ('7', True), ('', True)):
+        with Cell(**parameters, serial=serial, calibration_filename=str(saved)) as cell:
+            answer = cell.call('load')
+            assert answer.success == loads, answer.message
+            assert loads or 'the robot with serial "7", this is "8"' in answer.message
+            assert (cell.node.session.calibration is not None) == loads
+
+
+@pytest.fixture(scope='module')
+def saved(tmp_path_factory, recording):
+    """Return a folder in which two calibrations are saved, and the path of the newest."""
+    folder = tmp_path_factory.mktemp('saved')
+    with Cell(chain='ur10e', data_dir=str(folder)) as cell:
+        cell.play(topics(recording))
+        assert cell.call('identify').success
+        assert cell.call('save').success
+        assert cell.call('save').success
+    *_, newest = sorted(folder.glob('*Z.yaml'))
+    return folder, newest
+
+
+@pytest.mark.parametrize('named', [True, False])
+def test_the_calibration_is_published_again_after_a_restart(saved, named):
+    folder, newest = saved
+    path = sorted(folder.glob('*Z.yaml'))[0] if named else newest
+    given = {'calibration_filename': path.name} if named else {'autoload': True}
+    with Cell() as cell:
+        told = cell.log()
+        node = cell.start(chain='ur10e', data_dir=str(folder), **given)
+        texts = cell.listen(String, 'calibration_node/calibration')
+        cell.spin_until(lambda: texts)
+        assert texts[0].data == path.read_text()
+        assert node.session.calibration.world_frame == 'tracker'
+        cell.spin_until(lambda: any(f'loaded {path}' in each.msg for each in told))
+
+
+def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
+    folder, newest = saved
+    with Cell() as cell:
+        told = cell.log()
+        node = cell.start(chain='ur10e', data_dir=str(folder))
+        cell.spin_until(lambda: any(str(newest) in each.msg for each in told))
+        assert any('~/load' in each.msg for each in told)
+        assert node.session.calibration is None
+
+
+@pytest.mark.parametrize(
+    ('content', 'said'),
+    [(None, 'there is no file'), ('puma', 'joints')],
+)
+def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
+    tmp_path, recording, content, said
+):
+    """A node that did not start would take no samples, and a respawned one gives up."""
+    path = tmp_path / 'of_before.yaml'
+    if content is not None:
+        path.write_text(dump_chain(load_chain('puma560')))
+    given = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'calibration_filename': str(path)}
+    with Cell() as cell:
+        told = cell.log()
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        node = cell.start(**given)
+        cell.spin_until(lambda: any(said in m.msg and m.level == m.ERROR for m in told))
+        cell.spin_until(lambda: heard and said in values_of(heard[-1])['last identification'])
+        assert node.session.calibration is None
+        cell.play(topics(recording), node=node)
+        assert cell.call('identify').success
+
+
+def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording):
+    """Whatever has been changed since."""
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': '7'}
+    with Cell(**parameters) as cell:
+        cell.play(topics(recording))
+        assert cell.set_parameters({'folds': 4})[0].successful
+        assert cell.call('identify').success
+        assert cell.set_parameters({'folds': 7})[0].successful
+        assert cell.call('save').success
+        (path,) = tmp_path.glob('*Z.yaml')
+        settings = yaml.safe_load(path.with_suffix('.settings.yaml').read_text())
+        used = settings['/**']['ros__parameters']
+        assert (used['chain'], used['serial'], used['folds']) == ('ur10e', '7', 4)
+
+
+def test_outliers_are_named_by_number_and_stamp(cell, recording):
+    some = pose_messages(recording.poses)
+    for message in some[24:28]:
+        message.pose.position.z += 0.02
+    cell.play(topics(recording, measured_pose=some))
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    sample = cell.node.session.samples[6]
+    stamp = f'{sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d}'
+    assert f'1 outliers carry no weight: sample 7 ({stamp})' in cell.in_full(answer)
+
+
+def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cell, recording):
+    cell.play(topics(recording))
+    texts = cell.listen(String, 'calibration_node/calibration')
+    assert cell.call('identify').success
+    cell.spin_until(lambda: texts)
+    good = cell.node.session.calibration
+    assert cell.call('clear').success
+    nominal = load_chain('ur10e')
+    noisy = measure(nominal, recording.poses.joints, np.random.default_rng(5), 1e-4, 1e-4)
+    noisy = noisy.at(recording.poses.stamps_ns)
+    cell.play(topics(recording, measured_pose=pose_messages(noisy)))
+    answer = cell.call('identify')
+    assert not answer.success
+    assert 'no gain' in answer.message
+    assert 'last good calibration stays' in cell.in_full(answer)
+    assert cell.node.session.calibration is good
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: heard)
+    assert len(texts) == 1

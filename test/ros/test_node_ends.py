@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in a process of its own that is killed, or finds no room."""
+
+import resource
+import signal
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from ros_cell import (
+    START,
+    STOPS,
+    Cell,
+    Child,
+    direct,
+    part,
+    topics,
+    values_of,
+)
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+
+from calib_ros.files.archive import Archive
+from calib_ros.files.tables import read_journal
+
+
+@pytest.fixture
+def journal(tmp_path, recording):
+    """Return a folder with the journal of a whole shift."""
+    archive = Archive(tmp_path, 'ur10e', 6, lambda: '')
+    session = direct(recording)
+    session.finish()
+    for sample in session.samples:
+        archive.add(sample)
+    archive.close()
+    return tmp_path
+
+
+def begun(folder):
+    return any(path.stat().st_size for path in folder.glob('*Z.csv'))
+
+
+def samples_in(folder):
+    (path,) = folder.glob('*Z.csv')
+    return read_journal(path, 6)[0]
+
+
+@contextmanager
+def cell_and_child(**parameters):
+    """Start a peer and a node in a child process, which misses nothing.
+
+    Each child has a peer and a domain of its own: DDS takes a killed one to be alive for a while.
+    """
+    reliable = {
+        f'qos_overrides./{topic}.subscription.reliability': 'reliable'
+        for topic in ('joint_states', 'measured_pose')
+    }
+    with (
+        Cell() as cell,
+        Child(domain=cell.domain, chain='ur10e', **reliable, **parameters) as child,
+    ):
+        reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        probes = [
+            (cell.publisher(JointState, 'joint_states'), JointState()),
+            (cell.publisher(PoseStamped, 'measured_pose'), PoseStamped()),
+        ]
+
+        def hears():  # that the peer knows of the child does not say that it hears the peer
+            for publisher, probe in probes:
+                publisher.publish(probe)
+            values = {v.key: v.value for r in reports[-1:] for v in r.status[0].values}
+            return all(int(values.get(stream, 0)) for stream in ('joint states', 'poses'))
+
+        cell.spin_until(hears)
+        yield cell, child
+
+
+# Killed
+
+
+def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
+    monkeypatch, tmp_path, recording
+):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    monkeypatch.delenv('ROS_HOME', raising=False)
+    monkeypatch.delenv('ROS_LOG_DIR', raising=False)
+    folder = tmp_path / '.ros' / 'calib_ros'
+    with cell_and_child() as (cell, child):
+        cell.play(part(recording, 0.0, 12.0))
+        cell.spin_until(lambda: begun(folder))
+        cell.spin_until(lambda: len(samples_in(folder)) == 10)
+        child.kill()
+    (path,) = folder.glob('*Z.csv')
+    with path.open('a') as file:
+        file.write('1700000000,0.1,0.')  # a row that a crash of the machine cut off
+    with cell_and_child(resume='true') as (cell, child):
+        output = child.wait_for('ready to calibrate')
+        assert 'was cut off and is left out' in output
+        assert f'resumed 10 samples of {path}' in output
+        cell.play(part(recording, 12.0, 24.0))
+        cell.spin_until(lambda: len(samples_in(folder)) == 20)
+        answer = cell.call('identify')
+        assert answer.success, answer.message
+        assert '22 samples' in answer.message  # two stops waited when it was killed
+    expected = direct(recording)
+    expected.finish()
+    survived = [s for s in expected.samples if not 10.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
+    for kept, sample in zip(samples_in(folder), survived, strict=True):
+        assert kept.stamp_ns == sample.stamp_ns
+        np.testing.assert_array_equal(kept.joints, sample.joints)
+        np.testing.assert_array_equal(kept.position, sample.position)
+
+
+SLOW_SAVE = """
+import os, time
+sync = os.fsync
+saved = []
+def slow(file):
+    sync(file)
+    name = os.readlink(f'/proc/self/fd/{file}')
+    if '.yaml' in name and name.endswith('.partial'):
+        saved.append(name)
+        if len(saved) > 2:  # the settings and the calibration of the first time
+            print('in the middle of saving', flush=True)
+            time.sleep(60.0)
+os.fsync = slow
+"""
+SLOW_IDENTIFICATION = """
+import time
+from calib_ros.ros import identifying, node
+def identify_model(problem, model, progress):
+    print('identifying', flush=True)
+    time.sleep(60.0)
+identifying.identify_model = identify_model
+close = node.CalibrationNode.close
+def noisy(self):
+    print('joining', flush=True)
+    return close(self)
+node.CalibrationNode.close = noisy
+"""
+RUN = """
+import sys
+from calib_ros.ros.node import main
+sys.exit(main())
+"""
+
+
+def test_killed_while_it_saves(journal):
+    command = ('-c', SLOW_SAVE + RUN)
+    with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
+        assert cell.call('identify').success
+        assert cell.call('save').success
+        saved = sorted(journal.glob('*Z*.yaml'))
+        contents = [path.read_text() for path in saved]
+        cell.start_call('save')
+        child.wait_for('in the middle of saving')
+        child.kill()
+    assert sorted(journal.glob('*Z*.yaml')) == saved
+    assert [path.read_text() for path in saved] == contents
+    with Cell(chain='ur10e', data_dir=str(journal)) as cell:
+        loaded = cell.call('load')
+        assert loaded.success, loaded.message
+        assert str(next(journal.glob('*Z.yaml'))) in loaded.message
+
+
+def test_ended_while_an_identification_runs(journal):
+    command = ('-c', SLOW_IDENTIFICATION + RUN)
+    with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
+        cell.start_call('identify')
+        child.wait_for('identifying')
+        child.process.send_signal(signal.SIGTERM)
+        child.process.send_signal(signal.SIGINT)  # a second one harms nothing
+        child.wait_for('joining')
+        child.process.send_signal(signal.SIGINT)
+        assert child.end() == 0, child.output
+        assert 'Traceback' not in child.output
+
+
+def test_the_last_stop_is_kept_at_the_end(tmp_path, recording):
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        cell.play(topics(recording))
+        assert len(cell.node.session.samples) == STOPS - 2
+    assert len(samples_in(tmp_path)) == STOPS
+
+
+def test_a_node_that_could_keep_no_samples_does_not_start(capsys, ended_by):
+    folder = '/proc/nope'
+    assert ended_by('chain:=ur10e', f'data_dir:={folder}') == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f'samples cannot be kept in {folder}' in line
+    assert 'set data_dir' in line
+
+
+# A full disk
+
+
+def test_a_full_disk(tmp_path, recording):
+    with cell_and_child(data_dir=tmp_path) as (cell, child):
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        status = cell.listen(String, '/calibration_node/status')
+        cell.play(part(recording, 0.0, 6.0))
+        cell.spin_until(lambda: begun(tmp_path))
+        cell.spin_until(lambda: len(samples_in(tmp_path)) == 4)
+        (path,) = tmp_path.glob('*Z.csv')
+        _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
+        full = path.stat().st_size + 100  # there is room for a part of the next row
+        resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (full, hard))
+        cell.play(part(recording, 6.0, 24.0))
+
+        def level(wanted, said):
+            cell.spin_until(lambda: heard and heard[-1].status[0].level == wanted)
+            assert said in heard[-1].status[0].message
+
+        level(DiagnosticStatus.ERROR, 'samples are in memory only')
+        cell.spin_until(lambda: status[-1].data.startswith('samples are in memory only: '))
+        assert heard[-1].status[0].message.count('in memory only') == 1
+        cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
+        assert len(samples_in(tmp_path)) == 4
+        answer = cell.call('clear')
+        assert not answer.success
+        assert 'samples are in memory only and would be lost' in answer.message
+        answer = cell.call('identify')
+        assert answer.success, answer.message
+        resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
+        unsaved = cell.call('save')
+        assert not unsaved.success
+        assert 'File too large' in unsaved.message
+        assert unsaved.message.endswith('write to another place')
+        assert [each.name for each in tmp_path.iterdir() if 'yaml' in each.name] == [
+            path.with_suffix('.settings.yaml').name
+        ]
+        resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
+        level(DiagnosticStatus.OK, 'samples')
+        cell.spin_until(lambda: 'memory' not in status[-1].data)
+        assert len(samples_in(tmp_path)) == STOPS
+        assert cell.call('save').success
+        assert child.end(signal.SIGINT) == 0
+        assert child.output.count('samples are kept in memory only') == 1

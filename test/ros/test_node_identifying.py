@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in real rclpy: an identification that runs."""
+
+import queue
+import threading
+
+import pytest
+from ros_cell import (
+    STOPS,
+    Cell,
+    topics,
+)
+from std_msgs.msg import String
+
+from calib_ros.identification.identification import identify
+from calib_ros.ros import identifying as identifying_module
+
+
+def test_messages_are_taken_while_an_identification_runs(monkeypatch, tmp_path, recording):
+    release, problems = threading.Event(), []
+
+    def slow(problem, model, progress):
+        problems.append(problem)
+        assert release.wait(20.0)
+        return identify(problem)
+
+    monkeypatch.setattr(identifying_module, 'identify_model', slow)
+    joints, poses = topics(recording).values()
+    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
+        cell.play({'joint_states': joints[:1000], 'measured_pose': poses[:80]})
+        first = cell.start_call('identify')
+        cell.spin_until(lambda: problems)
+        second = cell.call('identify')
+        assert not second.success
+        assert 'running' in second.message
+        unsaved = cell.call('save')
+        assert not unsaved.success
+        assert 'no accepted calibration' in unsaved.message
+        cell.play({'joint_states': joints[1000:], 'measured_pose': poses[80:]})
+        assert cell.node.session.account().poses == len(poses)
+        assert not first.done()
+        release.set()
+        cell.spin_until(first.done)
+        assert first.result().success, first.result().message
+        assert len(problems[0].observations) == 20
+        # The samples that came meanwhile were not fitted, so they may judge.
+        judged = cell.call('validate')
+        assert judged.success
+        assert '4 samples taken since' in judged.message
+        assert cell.call('identify').success
+
+
+STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
+
+
+@pytest.fixture
+def stages(monkeypatch):
+    """Let identifications of model auto wait at each stage; return a queue that lets them go."""
+    release, reached = queue.Queue(), []
+    identify_model = identifying_module.identify_model
+
+    def slow(problem, model, progress):
+        def at(stage):
+            progress(stage)
+            reached.append(stage)
+            release.get(timeout=20.0)
+
+        return identify_model(problem, model, at)
+
+    monkeypatch.setattr(identifying_module, 'identify_model', slow)
+    return release, reached
+
+
+def test_the_status_names_the_stage_of_an_identification(tmp_path, recording, stages):
+    release, reached = stages
+    with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
+        words = cell.listen(String, 'calibration_node/status')
+        cell.play(topics(recording))
+        running = cell.start_call('identify')
+        for stage in STAGES[:2]:
+            cell.spin_until(lambda now=stage: words and f's ({now}); ' in words[-1].data)
+            assert '; identifying for ' in words[-1].data
+            release.put(None)
+        for _ in range(100):
+            release.put(None)
+        cell.spin_until(running.done)
+        assert running.result().success, running.result().message
+        assert set(STAGES) <= set(reached)
+        cell.spin_until(lambda: 'identifying' not in words[-1].data)
+
+
+def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stages):
+    release, reached = stages
+    with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
+        none = cell.call('cancel')
+        assert not none.success
+        assert 'nothing to cancel' in none.message
+        cell.play(topics(recording))
+        texts = cell.listen(String, 'calibration_node/calibration')
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
+        cell.spin_until(lambda: texts)
+        good = cell.node.session.calibration
+        while not release.empty():
+            release.get()
+        for stage in (0, 2):
+            reached.clear()
+            running = cell.start_call('identify')
+            for _ in range(stage):
+                release.put(None)
+            cell.spin_until(lambda last=stage: len(reached) == last + 1)
+            answer = cell.call('cancel')
+            assert answer.success
+            assert f'({reached[-1]})' in answer.message
+            release.put(None)
+            cell.spin_until(running.done)
+            assert not running.result().success
+            assert f'cancelled after the stage "{reached[-1]}"' in running.result().message
+            assert len(reached) == stage + 1
+        assert cell.node.session.calibration is good
+        assert len(texts) == 1
+        assert len(cell.node.session.samples) == STOPS
+        for _ in range(100):
+            release.put(None)
+        assert cell.call('identify').success
+
+
+def test_a_result_that_was_cancelled_at_last_is_not_published(monkeypatch, cell, recording):
+    release, running = threading.Event(), threading.Event()
+
+    def slow(problem, model, progress):
+        result = identify(problem)
+        running.set()
+        assert release.wait(20.0)
+        return result
+
+    monkeypatch.setattr(identifying_module, 'identify_model', slow)
+    cell.play(topics(recording))
+    answer = cell.start_call('identify')
+    cell.spin_until(running.is_set)
+    assert cell.call('cancel').success
+    release.set()
+    cell.spin_until(answer.done)
+    assert not answer.result().success
+    assert 'cancelled' in answer.result().message
+    assert cell.node.session.calibration is None
+
+
+def test_clear_while_an_identification_runs(monkeypatch, cell, recording):
+    release, problems = threading.Event(), []
+
+    def slow(problem, model, progress):
+        problems.append(problem)
+        assert release.wait(20.0)
+        return identify(problem)
+
+    monkeypatch.setattr(identifying_module, 'identify_model', slow)
+    cell.play(topics(recording))
+    running = cell.start_call('identify')
+    cell.spin_until(lambda: problems)
+    assert cell.call('clear').success
+    release.set()
+    cell.spin_until(running.done)
+    assert running.result().success, running.result().message
+    cell.play(topics(recording))
+    judged = cell.call('validate')
+    assert f'{STOPS} samples taken since' in judged.message

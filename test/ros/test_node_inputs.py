@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in real rclpy and how well it hears."""
+
+import signal
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PointStamped
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_cell import (
+    Cell,
+    Child,
+    joint_messages,
+    topics,
+    values_of,
+)
+from sensor_msgs.msg import JointState
+
+from calib_ros.errors import ConfigError
+from calib_ros.ros import inputs as inputs_module
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def test_an_overridden_qos(tmp_path, recording):
+    override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        deaf = cell.peer.create_publisher(JointState, 'joint_states', BEST_EFFORT)
+        cell.spin_until(
+            lambda: (
+                heard
+                and '/joint_states is published best effort, but reliable is asked for'
+                in heard[-1].status[0].message
+            )
+        )
+        assert heard[-1].status[0].level == DiagnosticStatus.WARN
+        deaf.publish(joint_messages(recording)[0])
+        cell.play(topics(recording))
+        assert cell.node.session.received['joints'] == len(recording.joints)
+        assert cell.call('identify').success
+        cell.spin_until(lambda: 'best effort' not in heard[-1].status[0].message)
+
+
+def test_a_topic_of_another_type_is_told(cell):
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    context = rclpy.Context()  # a participant of its own: one has one type for each topic
+    rclpy.init(context=context, args=[], domain_id=cell.domain)
+    other = Node('other', context=context)
+    other.create_publisher(PointStamped, 'measured_pose', 10)
+    said = '/measured_pose is published as geometry_msgs/msg/PointStamped, not as'
+    cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
+    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    other.destroy_node()
+    cell.spin_until(lambda: said not in heard[-1].status[0].message)
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    ('policy', 'value', 'said'),
+    [
+        ('reliability', 'often', 'often'),
+        ('reliability', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('history', 'sometimes', 'sometimes'),
+        ('history', 'unknown', 'qos_overrides for "joint_states" cannot be'),
+        ('depth', 0, 'must be >= 1'),
+        ('reliabilty', 'reliable', r'did you mean .*/joint_states.subscription.reliability'),
+        ('durability', 'volatile', 'unknown parameter'),
+    ],
+)
+def test_a_qos_that_there_is_not_is_refused(empty, tmp_path, policy, value, said):
+    override = {f'qos_overrides./joint_states.subscription.{policy}': value}
+    with pytest.raises(ConfigError, match=said):
+        empty.start(chain='ur10e', data_dir=str(tmp_path), **override)
+
+
+def test_an_overridden_qos_leaves_other_topics_alone(tmp_path):
+    override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+
+        def offered(topic):
+            return [each.qos_profile.reliability for each in infos(topic)]
+
+        def infos(topic):
+            return cell.peer.get_subscriptions_info_by_topic(topic)
+
+        cell.spin_until(lambda: infos('/joint_states') and infos('/measured_pose'))
+        assert offered('/joint_states') == [ReliabilityPolicy.RELIABLE]
+        assert offered('/measured_pose') == [ReliabilityPolicy.BEST_EFFORT]
+
+
+def test_a_queue_that_was_full_is_told(tmp_path, recording):
+    override = {'qos_overrides./joint_states.subscription.depth': 5}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(JointState, 'joint_states')
+        for message in joint_messages(recording)[:20]:
+            publisher.publish(message)
+        cell.spin_until(
+            lambda: any('messages get lost on /joint_states' in r.status[0].message for r in heard)
+        )
+        assert cell.node.session.received['joints'] < 20
+        assert int(values_of(heard[-1])['queue of /joint_states full']) > 0
+        cell.spin_until(lambda: 'get lost' not in heard[-1].status[0].message)
+
+
+def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, recording):
+    with Cell() as cell, Child(domain=cell.domain, chain='ur10e', data_dir=tmp_path) as child:
+        reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(JointState, 'joint_states', ReliabilityPolicy.BEST_EFFORT)
+
+        def told():
+            values = values_of(reports[-1]) if reports else {}
+            names = 'joint states', 'lost on /joint_states'
+            return [int(values.get(name, 0)) for name in names]
+
+        sent = 0
+        message = joint_messages(recording)[0]
+
+        def heard():
+            nonlocal sent
+            publisher.publish(message)
+            sent += 1
+            return told()[0] > 0
+
+        cell.spin_until(heard)
+        count = len(reports)
+        cell.spin_until(lambda: len(reports) >= count + 2)
+        first = sent - sum(told())
+
+        def flood():
+            child.process.send_signal(signal.SIGSTOP)
+            for _ in range(3000):
+                publisher.publish(message)
+            child.process.send_signal(signal.SIGCONT)
+            publisher.publish(message)
+
+        flood()
+        cell.spin_until(lambda: told()[1] > 0)
+        count = len(reports)
+        cell.spin_until(lambda: len(reports) >= count + 2)
+        missing = sent + 3001 - first - told()[0]
+        flood()  # DDS may tell the rest of a loss with the next one only
+        cell.spin_until(lambda: told()[1] >= missing)
+
+
+def test_what_dds_tells_of_losses_never_goes_below_zero():
+    """A total of -2147483645 came as 18446744071562067971 once."""
+    heard = inputs_module.Hearing()
+    for total, lost in (
+        (3, 3),
+        (2**64 - 2147483645, 3),
+        (2**64 - 2147483640, 8),
+        (5, 8),
+        (9, 12),
+        (9, 12),
+    ):
+        heard.note_lost(total)
+        assert heard.lost == lost
+
+
+def test_a_count_of_losses_goes_on_where_it_overflows():
+    heard = inputs_module.Hearing()
+    for total in (2**29, 2**30, 3 * 2**29, 2**31 - 1, 2**64 - 2**31, 2**64 - 2**31 + 2):
+        heard.note_lost(total)
+    assert heard.lost == 2**31 + 2

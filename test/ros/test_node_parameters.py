@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in real rclpy: its parameters, at the start and later."""
+
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.exceptions import ParameterException
+from rclpy.parameter import Parameter
+from ros_cell import (
+    Cell,
+    Child,
+    topics,
+)
+
+from calib_ros.errors import CalibrationError
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.ros import node as node_module
+from calib_ros.ros.arguments import PARAMETERS, typed
+from calib_ros.settings import Settings
+
+SHIPPED = Path(__file__).parents[2] / 'config' / 'calibration_node.yaml'
+
+
+def declared(node):
+    return {name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()}
+
+
+def test_the_parameter_file_holds_every_parameter_with_its_default(idle):
+    with open(SHIPPED) as file:
+        (content,) = yaml.safe_load(file).values()
+    shipped = content['ros__parameters']
+    foreign = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+    plain = {
+        name: value for name, value in declared(idle.node).items() if not name.startswith(foreign)
+    }
+    assert list(shipped) == list(plain)
+    of_this_test = {'chain': '', 'data_dir': ''}
+    assert shipped == plain | of_this_test
+
+
+@pytest.mark.parametrize(
+    ('name', 'value', 'said'),
+    [
+        ('model', 'nonsense', 'unknown effect or joint "nonsense"'),
+        ('model', 'gear', 'nothing to fit in "gear"'),
+        ('loss', 'hubert', 'did you mean "huber"'),
+        ('fixed', ['joint_7.a'], 'unknown parameter "joint_7.a"'),
+        ('priors', ['*.a=much'], 'must be a finite number'),
+        ('sigma_position', -1.0, 'sigma_position'),
+        ('sigma_position', 1, "expected 'Type.DOUBLE'"),
+        ('folds', 1, 'folds'),
+        ('longest_stop', 0.1, 'must be shorter than longest_stop (0.1 s)'),
+        ('mode', 'continuous', 'read-only'),
+        ('joint_names', ['a'], 'read-only'),
+        ('serial', 'A8', 'read-only'),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_and_changes_nothing(idle, name, value, said):
+    before, settings = declared(idle.node), idle.node.session.settings
+    (result,) = idle.set_parameters({name: value})
+    assert not result.successful
+    assert said in result.reason
+    assert declared(idle.node) == before
+    assert idle.node.session.settings == settings
+
+
+def test_settings_change_at_run_time(cell, recording):
+    cell.play(topics(recording))
+    assert cell.call('identify').success
+    before = cell.node.session.calibration.chain
+    changes = {
+        'model': 'ratio',
+        'sigma_position': 2e-4,
+        'wanted_accuracy': 1e-6,
+        'fixed': ['elbow_joint.a'],
+        'marker_scale': 10.0,
+        'still': 1e-3,
+    }
+    results = cell.set_parameters(changes)
+    assert all(result.successful for result in results), results
+    assert cell.node.session.settings == replace(
+        Settings(),
+        model='ratio',
+        sigma_position=2e-4,
+        wanted_accuracy=1e-6,
+        still=1e-3,
+        fixed=('elbow_joint.a',),
+    )
+    assert 'more expected for 0.001 mm' in cell.node.session.status()
+    answer = cell.call('identify')
+    assert answer.success, answer.message
+    after = cell.node.session.calibration.chain
+    assert after.table[2, 0] == load_chain('ur10e').table[2, 0] != before.table[2, 0]
+    assert len(after.effects) == 6
+
+
+def test_all_of_an_atomic_change_or_nothing(idle):
+    settings = idle.node.session.settings
+    changes = [Parameter('sigma_position', value=5e-4), Parameter('model', value='nonsense')]
+    assert not idle.node.set_parameters_atomically(changes).successful
+    assert idle.node.session.settings == settings
+    assert idle.node.get_parameter('sigma_position').value == settings.sigma_position
+
+
+@pytest.mark.parametrize(
+    ('parameters', 'said'),
+    [
+        ({'chain': ''}, 'parameter "chain" is not set'),
+        ({'chain': 'ur10f'}, 'did you mean "ur10"?'),
+        ({'folds': 1}, 'folds'),
+        ({'folds': 5.5}, 'folds'),
+        ({'model': 'ration'}, 'did you mean "ratio"'),
+        ({'mode': 'dwel'}, 'did you mean "dwell"'),
+        ({'fixed': ['joint_2.a']}, 'unknown parameter "joint_2.a"'),
+        ({'sources': ['pose typ=Range']}, 'did you mean "type"'),
+        ({'sources': ['/pose type=Rangee']}, 'sensor_msgs/msg/Range'),
+        ({'sources': ['/pose', '/pose type=Range']}, 'named twice'),
+        ({'max_gapp': 1.0}, 'did you mean "max_gap"'),
+        ({'delay': 'none'}, 'parameter "delay" must be a number'),
+        ({'serial': 12}, 'must be text, not 12: write it in quotes'),
+        ({'model': True}, 'parameter "model" must be text, not True'),
+        ({'marker_scale': 'large'}, 'parameter "marker_scale" must be a number, not \'large\''),
+        ({'resume': 1}, 'parameter "resume" must be true or false, not 1'),
+        ({'folds': 5.0}, 'parameter "folds" must be a whole number, not 5.0'),
+        ({'folds': True}, 'parameter "folds" must be a whole number, not True'),
+        ({'sources': '/tf'}, 'parameter "sources" must be a list of texts such as ['),
+        ({'joint_names': [1, 2]}, 'parameter "joint_names" must be a list of texts such as ['),
+        ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
+        ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
+    ],
+)
+def test_a_wrong_parameter_is_refused_at_the_start(empty, tmp_path, parameters, said):
+    with pytest.raises((CalibrationError, ParameterException)) as caught:
+        empty.start(**{'chain': 'ur10e', 'data_dir': str(tmp_path)} | parameters)
+    assert said in str(caught.value)
+
+
+def test_whole_numbers_are_numbers(tmp_path):
+    with Cell(chain='ur10e', data_dir=str(tmp_path), marker_scale=100, settle=1) as cell:
+        assert cell.node.get_parameter('marker_scale').value == 100.0
+        assert cell.node.session.settings.settle == 1.0
+
+
+def test_a_parameter_out_of_range_ends_the_node_with_one_clear_line(capsys, ended_by):
+    assert ended_by('chain:=ur10e', 'folds:=1') == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'folds' in line
+
+
+@pytest.mark.parametrize(
+    ('words', 'said'),
+    [
+        (['--params-file', '/nowhere.yaml'], '/nowhere.yaml'),
+        (['-p', 'chain'], "parse parameter override rule: '-p chain'"),
+        (['-r', '__ns:=bad-name'], '__ns:=bad-name'),
+        (['--foo'], "unknown ROS arguments: ['--foo']"),
+    ],
+)
+def test_words_that_ros_cannot_read_are_told(capsys, words, said):
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--ros-args', '-p', 'chain:=ur10e', *words])
+    assert caught.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_help_names_every_parameter_and_starts_nothing(capsys):
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--help'])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    for name in PARAMETERS:
+        assert f'\n  {name}' in out
+    assert '--ros-args -p chain:=ur10e' in out
+
+
+def test_words_that_are_not_for_ros_are_refused(capsys):
+    """ROS ignores them."""
+    with pytest.raises(SystemExit) as caught:
+        node_module.main(['--serial', '7', '--ros-args', '-p', 'chain:=ur10e'])
+    assert caught.value.code == 2
+    assert 'unrecognized arguments: --serial 7' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('word', 'meant'),
+    [('0012', '0012'), ('"0012"', '0012'), ("'1e5'", '1e5'), ('yes', 'yes'), ('A 7', 'A 7')],
+)
+def test_a_serial_number_is_text(word, meant):
+    words = typed(['node', '--ros-args', '-p', f'serial:={word}', '-p', 'folds:=4'])
+    assert words[-1] == 'folds:=4'
+    assert yaml.safe_load(words[3].partition(':=')[2]) == meant
+
+
+def test_the_parameter_file_applies_under_a_namespace(tmp_path):
+    with open(SHIPPED) as file:
+        text = file.read().replace("chain: ''", 'chain: meca500')
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(text)
+    words = ('--params-file', str(path), '-r', '__ns:=/cell_2', '-r', '__node:=arm')
+    with (
+        Cell() as cell,
+        Child(*words, domain=cell.domain, serial='0012', data_dir=tmp_path) as child,
+    ):
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        assert 'cell_2.arm' in child.wait_for('ready to calibrate meca500')
+        cell.spin_until(lambda: heard)
+        assert heard[0].status[0].hardware_id == '0012'  # text, although ROS makes it 12
+        assert child.end(signal.SIGINT) == 0, child.output
+        assert 'Traceback' not in child.output

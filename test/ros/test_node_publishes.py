@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A real node in real rclpy: what it publishes."""
+
+from dataclasses import replace
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import (
+    PoseStamped,
+)
+from ros_cell import (
+    STOPS,
+    Cell,
+    joint_messages,
+    pose_messages,
+    topics,
+    values_of,
+)
+from std_msgs.msg import String
+from visualization_msgs.msg import Marker, MarkerArray
+
+from calib_ros.apply.simulation import measure, random_frame
+from calib_ros.files.archive import Archive
+from calib_ros.sampling.session import CalibrationSession
+
+
+def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
+    joints = joint_messages(recording)
+    twice = joints[:1000] + joints[900:901] + joints[1000:]
+    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'serial': 'A7'}
+    with Cell(**parameters) as cell:
+        diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        corrected = cell.listen(PoseStamped, 'calibration_node/corrected_pose', 10)
+        cell.play(topics(recording, joint_states=twice))
+        assert cell.call('identify').success
+        cell.play({'joint_states': joints[-1:]})
+        cell.spin_until(
+            lambda: [m for m in corrected if m.header.stamp == joints[-1].header.stamp]
+        )
+        message = corrected[-1]
+        assert message.header.frame_id == 'tracker'
+        true = truth.forward(recording.joints[-1:])[0, :3, 3]
+        point = message.pose.position
+        np.testing.assert_allclose([point.x, point.y, point.z], true, rtol=0, atol=1e-4)
+        diagnostics.clear()
+        cell.spin_until(lambda: diagnostics)
+        status = diagnostics[0].status[0]
+        assert (status.name, status.hardware_id) == ('calibration_node: calibration', 'A7')
+        values = values_of(diagnostics[0])
+        assert values['samples'] == str(STOPS)
+        assert values['calibrated'] == 'True'
+        assert values['dropped joints: same stamp twice'] == '2'
+        assert values['last identification'].startswith('accepted')
+        assert float(values['rate of /joint_states [Hz]']) >= 0.0
+        assert float(values['age of /measured_pose [s]']) < 20.0
+        words = cell.listen(String, 'calibration_node/status')
+        cell.spin_until(lambda: words)
+        assert words[0].data.startswith('the arm ')
+        assert f'; {STOPS} samples, 0.0' in words[0].data
+        assert 'enough for the accuracy wanted' in words[0].data
+
+
+def test_the_status_tells_what_the_arm_does(cell, recording):
+    joints = joint_messages(recording)
+    session = cell.node.session
+    assert session.state == 'waiting for joint states'
+    cell.play({'joint_states': joints[:15]})
+    assert session.state.startswith('the arm stands for 0.')
+    cell.play({'joint_states': joints[15:40]})
+    assert session.state == 'the arm is moving'
+    few = cell.listen(String, 'calibration_node/status')
+    cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
+    assert few[-1].data == 'the arm is moving; 0 samples'
+
+
+def test_the_status_is_short_and_its_first_words_are_those_that_matter(
+    monkeypatch, cell, recording
+):
+    """The rest is in the diagnostics; `ros2 topic echo` cuts texts at 128 characters."""
+    words = cell.listen(String, 'calibration_node/status')
+    long = '; '.join(['the arm is moving', *(f'sample {k} of many words' for k in range(20))])
+    monkeypatch.setattr(CalibrationSession, 'status', lambda *arguments: long)
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: words and words[-1].data.startswith('the arm is moving; sample 0'))
+    assert 100 < len(words[-1].data) <= 120
+    assert words[-1].data.endswith(' ...')
+    cell.spin_until(lambda: heard and heard[-1].status[0].message.endswith(long))
+    trouble = 'samples are in memory only: ' + 'no space left on a device of a long name ' * 5
+    monkeypatch.setattr(Archive, 'trouble', f'{trouble}; ')
+    cell.spin_until(lambda: words[-1].data.startswith('samples are in memory only: '))
+    assert 100 < len(words[-1].data) <= 120
+    assert '...; the arm is moving' in words[-1].data
+
+
+def test_residual_markers_are_well_formed(cell, recording):
+    cell.play(topics(recording))
+    assert cell.call('identify').success
+    heard = cell.listen(MarkerArray, 'calibration_node/residuals')
+    cell.spin_until(lambda: heard)
+    (lines,) = heard[0].markers
+    assert (lines.type, lines.action) == (Marker.LINE_LIST, Marker.ADD)
+    assert lines.header.frame_id == 'tracker'
+    assert lines.pose.orientation.w == 1.0
+    assert lines.scale.x > 0.0
+    assert len(lines.points) == len(lines.colors) == 2 * STOPS
+    assert all(color.a == 1.0 and 0.0 <= color.r <= 1.0 for color in lines.colors)
+    begins = np.array([[p.x, p.y, p.z] for p in lines.points[::2]])
+    ends = np.array([[p.x, p.y, p.z] for p in lines.points[1::2]])
+    measured = cell.node.session.problem().observations
+    np.testing.assert_allclose(begins, measured.positions, atol=1e-12)
+    predicted = cell.node.session.calibration.chain.forward(measured.joints)[:, :3, 3]
+    np.testing.assert_allclose(ends - begins, 200.0 * (predicted - measured.positions), atol=1e-9)
+
+
+def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, truth):
+    there = replace(truth, base=random_frame(np.random.default_rng(8), 2.0))
+    joints = recording.poses.joints
+    other = measure(there, joints, np.random.default_rng(9), 2e-5, 1e-4).at(
+        recording.poses.stamps_ns
+    )
+    sources = ['measured_pose', 'other device=B']
+    with Cell(chain='ur10e', data_dir=str(tmp_path), sources=sources) as cell:
+        some = pose_messages(other, frame_id='elsewhere')
+        cell.play(topics(recording, other=some))
+        assert cell.call('identify').success
+        heard = cell.listen(MarkerArray, 'calibration_node/residuals')
+        cell.spin_until(lambda: heard)
+        (lines,) = heard[0].markers
+        assert lines.header.frame_id == 'tracker'
+        ends = np.array([[p.x, p.y, p.z] for p in lines.points[::2]]).reshape(2, STOPS, 3)
+        np.testing.assert_allclose(ends[1], ends[0], atol=5e-4)
