@@ -185,7 +185,8 @@ def main():
         errors = np.sqrt((np.array([row[2] for row in rows]) ** 2).mean(axis=0))
         print(
             f'{name}: MSE / CRLB {ratios.mean():.3f} +- {spread:.3f}, coverage '
-            f'{100 * hits.mean():.1f} %, error {errors[0]:.4f} mm by pixels, {errors[1]:.4f} mm by poses from PnP',
+            f'{100 * hits.mean():.1f} %, error {errors[0]:.4f} mm by pixels, '
+            f'{errors[1]:.4f} mm by poses from PnP',
             flush=True,
         )
 
