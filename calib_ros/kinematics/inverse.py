@@ -16,6 +16,7 @@ Arrays are laid out (component, sample), as in `jacobian.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,10 +83,12 @@ def solve(
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
+    def missed(q: FloatArray, which: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+        error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], LEVER)
+        return error[part], columns[:, part], np.linalg.norm(error[part], axis=0)
+
     q = _within(chain, np.array(start, dtype=float).T)
-    error, columns = aim.linearise(q, None, positions, axes, LEVER)
-    error, columns = error[part], columns[:, part]
-    size = np.linalg.norm(error, axis=0)
+    error, columns, size = missed(q, slice(None))
     least, first, most = DAMPING
     damping = np.full(len(poses), first)
     diagonal = np.diag_indices(len(q))
@@ -98,11 +101,7 @@ def solve(
         normal[diagonal] += damping[active]
         slope = np.einsum('ikb,kb->ib', own, error[:, active])
         tried = _within(chain, q[:, active] + solve_positive(normal, slope))
-        new_error, new_columns = aim.linearise(
-            tried, None, positions[:, active], axes[:, :, active], LEVER
-        )
-        new_error, new_columns = new_error[part], new_columns[:, part]
-        new_size = np.linalg.norm(new_error, axis=0)
+        new_error, new_columns, new_size = missed(tried, active)
         better = new_size < size[active]
         damping[active] *= np.where(better, 0.1, 10.0)
         damping = np.maximum(damping, least)
