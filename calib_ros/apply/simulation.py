@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.errors import InputError
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import seen_residuals
@@ -120,15 +121,24 @@ def photograph(
     count: int,
     rng: np.random.Generator,
     noise: float = 0.0,
+    rounds: int = 50,
 ) -> Observations:
     """Return images of all points (M, 3) of a board, with normally distributed noise [px].
 
     The board faces the camera from anywhere in its view; the arm holds it with its joints anyhow.
+
+    Raises
+    ------
+    InputError
+        When the arm hardly reaches what the camera sees: after `rounds` of `count` tries.
+
     """
     size = len(points)
     joints = np.zeros((0, len(chain.joints)))
     exact = np.zeros((0, size, 2))
-    while len(joints) < count:
+    for _ in range(rounds):
+        if len(joints) == count:
+            break
         wanted = _facing(camera, points, count, rng)
         if on_flange:
             wanted = se3.invert(wanted)
@@ -146,6 +156,11 @@ def photograph(
         good = ((pixels > 0.0) & (pixels < (camera.width, camera.height))).all(axis=(1, 2))
         joints = np.concatenate([joints, drawn[good]])[:count]
         exact = np.concatenate([exact, pixels[good]])[:count]
+    if len(joints) < count:
+        raise InputError(
+            f'of {rounds * count} places before the camera the arm reaches {len(joints)}, expected'
+            f' {count}: place the camera elsewhere'
+        )
     number = np.repeat(np.arange(count), size)
     pixels = exact.reshape(-1, 2) + rng.normal(scale=noise, size=(count * size, 2))
     return Observations.from_pixels(
