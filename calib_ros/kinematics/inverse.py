@@ -16,6 +16,7 @@ Arrays are laid out (component, sample), as in `jacobian.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,25 +83,25 @@ def solve(
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
+    def missed(q: FloatArray, which: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+        error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], LEVER)
+        return error[part], columns[:, part], np.linalg.norm(error[part], axis=0)
+
     q = _within(chain, np.array(start, dtype=float).T)
-    error, columns = aim.linearise(q, None, positions, axes, LEVER)
-    error, columns = error[part], columns[:, part]
-    size = np.linalg.norm(error, axis=0)
+    error, columns, size = missed(q, slice(None))
     least, first, most = DAMPING
     damping = np.full(len(poses), first)
+    diagonal = np.diag_indices(len(q))
     for _ in range(ITERATIONS):
         (active,) = np.nonzero((size > TOLERANCE) & (damping < most))
         if not active.size:
             break
         own = columns[:, :, active]
         normal = np.einsum('ikb,jkb->ijb', own, own)
-        normal[np.diag_indices(len(q))] += damping[active]
+        normal[diagonal] += damping[active]
         slope = np.einsum('ikb,kb->ib', own, error[:, active])
         tried = _within(chain, q[:, active] + solve_positive(normal, slope))
-        wanted = positions[:, active], axes[:, :, active]
-        new_error, new_columns = aim.linearise(tried, None, *wanted, LEVER)
-        new_error, new_columns = new_error[part], new_columns[:, part]
-        new_size = np.linalg.norm(new_error, axis=0)
+        new_error, new_columns, new_size = missed(tried, active)
         better = new_size < size[active]
         damping[active] *= np.where(better, 0.1, 10.0)
         damping = np.maximum(damping, least)
