@@ -7,7 +7,7 @@
 Simulated UR10e, measured along a path through 12 way-points (all of the joint range, or +-0.8 rad)
 with noise of 0.05 mm and 0.2 mrad, by a tracker that drifts by 0.3 mm: errors that fade over 10
 poses, a random walk, a swing of about one period, a ramp. Of arms without any error none should be
-accepted; `without` is how many would be without the test of `chance.py`. Of arms with errors of
+accepted; `without` is how many would be without the test of `drift.py`. Of arms with errors of
 0.5 mm and 1 mrad all should be. `effects`: arms with such errors, on which `auto` chose an effect
 that is not there. `coverage_95`: how many 95 % intervals of their DH parameters hold the truth;
 `independent`: without regard to what neighbours share.

@@ -215,9 +215,7 @@ def _compared(
     if commanded is not None:
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
-    new_base, new_tool = ('base' in fitted), ('tool' in fitted)
-    before = _in_new_frames(before, sets, new_base, new_tool)
-    after = _in_new_frames(after, wanted, new_base, new_tool)
+    before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
     reached = compare(before, after, wanted).after
     shaped = compare(before, _rebased(after, wanted), wanted).after
     return replace(compare(before, after, sets), after=reached), shaped.position
@@ -278,20 +276,18 @@ def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
     return np.asarray(commanded[away.argmin(axis=1)])
 
 
-def _in_new_frames(
-    chain: Chain, sets: Sequence[Observations], new_base: bool, new_tool: bool
-) -> Chain:
+def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str, ...]) -> Chain:
     """Return the chain with base and tool frames, as asked, fitted to measured positions.
 
     A new tool is turned as the orientations say, if any were measured. Where they hardly vary, the
     tool keeps the translation that it had: the base takes up the same.
     """
-    if new_base:
+    if 'base' in fitted:
         chain = _rebased(chain, sets)
-    if not new_tool:
+    if 'tool' not in fitted:
         return chain
     names = [name for each in sets for name in parameters_of(each.tool)[:3]]
-    if new_base:
+    if 'base' in fitted:
         names = [name for each in sets for name in parameters_of(each.base)] + names
     none = [np.zeros(len(each), dtype=bool) for each in sets]
     plain = [replace(s, oriented=n, covariance=None) for s, n in zip(sets, none, strict=True)]

@@ -88,12 +88,10 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
             'in more combinations, or fix these parameters',
         )
     for p in found.parameters:
-        length = p.name.is_length
-        limit = problem.largest_length if length else problem.largest_angle
-        if p.std is not None and p.name.of_dh and abs(p.offset) - 3.0 * p.std > limit:
+        if p.beyond(problem.largest_length, problem.largest_angle):
             yield Reason(
                 Rule.COMMON_SENSE,
-                f'{p.name} is off by {1e3 * p.offset:.0f} {"mm" if length else "mrad"}, '
+                f'{p.name} is off by {1e3 * p.offset:.0f} m{p.name.unit}, '
                 'more than a faulty robot of this kind can be: is it the right chain file?',
             )
 

@@ -45,7 +45,7 @@ FALSE = 0.005
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
 way costs half a unit of the evidence's logarithm."""
-MOST = 3
+MOST_CHANGES = 3
 """Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
 """Kinds in the order in which they are named where two of a joint do the same."""

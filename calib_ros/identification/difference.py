@@ -28,7 +28,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import (
     FALSE,
     GAUGE,
-    MOST,
+    MOST_CHANGES,
     Columns,
     Explanation,
     Told,
@@ -177,7 +177,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     told = _told(names, change, square)
     chance = _chance(told, freedom)
     changed: list[tuple[Explanation, ...]] = []
-    while len(changed) < MOST and (reasons := reasons_of(told, columns, freedom)):
+    while len(changed) < MOST_CHANGES and (reasons := reasons_of(told, columns, freedom)):
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
     predicted = _predicted(chain, names)

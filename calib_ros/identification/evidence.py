@@ -59,11 +59,11 @@ SHOWN, REFUTED = 1.35, 3.0
 which those of usual size are refuted."""
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
-MOST = 2000
+MOST_SAMPLES = 2000
 """Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
-LEAST = 1e-3
+LEAST_SIZE = 1e-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
 
@@ -230,7 +230,7 @@ def _told(
     many are taken; `known` holds the products of all of them for the names alone.
     """
     columns = list(dict.fromkeys([*names, *(name for parts in beside for name in parts)]))
-    share = max(1, -(-system.count // MOST))
+    share = max(1, -(-system.count // MOST_SAMPLES))
     if known is None or share > 1 or beside:
         few = system.select([np.arange(0, each.count, share) for each in system.sets])
         known = normal_equations(chain, columns, replace(few, prior=None))
@@ -291,7 +291,7 @@ class _Evidence:
         """
         size, width = self._typical.copy(), np.log(SPREAD) ** -2
         if self._own.sum() == self._member.sum():
-            free = self._given + self._weight(size - np.log(LEAST)).sum(axis=0)
+            free = self._given + self._weight(size - np.log(LEAST_SIZE)).sum(axis=0)
             mean, root = _solved(self._matrix, self._vector, free)
             surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt((root**2).sum(axis=1)), 0.0)
             self._lengthen(surely**2, 1.0, size)
@@ -309,7 +309,7 @@ class _Evidence:
         for k, name in enumerate(self._names):
             if name in considered:
                 tried = np.tile(size, (3, 1))
-                tried[1:, k] = self._typical[k] + np.log(LEAST), self._typical[k]
+                tried[1:, k] = self._typical[k] + np.log(LEAST_SIZE), self._typical[k]
                 here, without, usual = self._of(tried).tolist()
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
@@ -322,7 +322,7 @@ class _Evidence:
         order (the unscented transform, Julier and Uhlmann 1997); the evidence weighs both. What
         is of no size stays so.
         """
-        some = np.flatnonzero(size > self._typical + np.log(LEAST))
+        some = np.flatnonzero(size > self._typical + np.log(LEAST_SIZE))
         if not len(some):
             return [(1.0, size)]
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
@@ -336,7 +336,9 @@ class _Evidence:
 
     def _within(self, size: FloatArray) -> FloatArray:
         """Return sizes (G,) no further from the typical ones than any that are looked for."""
-        return self._typical + np.clip(size - self._typical, np.log(LEAST), -np.log(LEAST))
+        return self._typical + np.clip(
+            size - self._typical, np.log(LEAST_SIZE), -np.log(LEAST_SIZE)
+        )
 
     def stds(self, size: FloatArray) -> FloatArray:
         """Return the standard deviation (P,) of each parameter for sizes (G,), by logarithms."""

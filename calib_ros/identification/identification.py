@@ -332,7 +332,7 @@ def _priors(problem: Problem) -> dict[str, float]:
 
 
 def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
-    """Return how probable it is that what the arm's parameters explain is chance (`chance.py`).
+    """Return how probable it is that what the arm's parameters explain is chance (`drift.py`).
 
     None for a target in sockets: nothing measures there that could drift.
     """

@@ -7,7 +7,7 @@ the arm's own behaviour where
 
 - a joint hardly moves but in them,
 - all targets that were seen at a stop are off there, more often than by chance,
-- they go with the values of a joint. Moved in time against the joint values, as in `chance.py`,
+- they go with the values of a joint. Moved in time against the joint values, as in `drift.py`,
   outliers of a device do as well, also where they come in a row.
 """
 

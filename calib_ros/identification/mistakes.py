@@ -17,7 +17,7 @@ a last one's the tool's.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -34,11 +34,12 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
 
-SAMPLES = 48
+TRIED = 48
 """Samples of a set, spread evenly, by which suspects are tried."""
 NEARER = 0.3
 """Ratio of the typical errors from which a suspect is named, or another is not named with it."""
@@ -84,26 +85,19 @@ def remarked(problem: Problem, result: Identification) -> Identification:
 
 def _suspicious(problem: Problem, result: Identification) -> bool:
     """Tell whether errors, before or after, are larger than those of faulty arms."""
-    judged = result.fitted if result.validation is None else result.validation
-    before, after = judged.before, judged.after
-    for each in (before, after, result.fitted.before):
-        sizes = np.linalg.norm(each.position, axis=1)
-        if np.sqrt(np.mean(sizes**2)) > problem.largest_error:
-            return True
-        turns = np.linalg.norm(each.orientation, axis=1)
-        turns = turns[~np.isnan(turns)]
-        if turns.size and np.sqrt(np.mean(turns**2)) > problem.largest_angle:
+    judged = result.validation or result.fitted
+    for each in (judged.before, judged.after, result.fitted.before):
+        turns = each.orientation[~np.isnan(each.orientation[:, 0])]
+        if _rms(each.position) > problem.largest_error or _rms(turns) > problem.largest_angle:
             return True
     if judged.outliers > MOST_OUTLIERS * len(judged.judged):
         return True
-    arm = problem.chain.joint_names
-    return any(
-        p.std is not None
-        and p.name.owner in arm
-        and abs(p.offset) - 3.0 * p.std
-        > (problem.largest_length if p.name.is_length else problem.largest_angle)
-        for p in result.parameters
-    )
+    limits = problem.largest_length, problem.largest_angle
+    return any(each.beyond(*limits) for each in result.parameters)
+
+
+def _rms(vectors: FloatArray) -> float:
+    return float(np.sqrt((vectors**2).sum() / max(len(vectors), 1)))
 
 
 def explained(problem: Problem) -> Explained | None:
@@ -153,7 +147,7 @@ def _known(frame: Frame | None) -> Frame | None:
 
 def _few(observations: Observations) -> Observations:
     count = len(observations)
-    index = np.linspace(0, count - 1, min(count, SAMPLES)).round().astype(int)
+    index = np.linspace(0, count - 1, min(count, TRIED)).round().astype(int)
     return observations.select(np.unique(index))
 
 
@@ -234,21 +228,13 @@ def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     """Return each measurement with the joint values so many rows below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
     parts = [replace(e, covariance=None) for e in (each, *same) if e.distances is None]
-    stamps = np.concatenate([e.stamps_ns for e in parts])
-    order = np.argsort(stamps, kind='stable')
-    joined = {
-        name: np.concatenate([getattr(e, name) for e in parts])[order]
-        for name in ('joints', 'positions', 'rotations', 'oriented')
-    }
+    order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
     here = slice(max(0, -rows), len(order) - max(0, rows))
     there = slice(max(0, rows), len(order) - max(0, -rows))
-    return Observations(
-        stamps[order][here],
-        joined['joints'][there],
-        joined['positions'][here],
-        joined['rotations'][here],
-        joined['oriented'][here],
-        base=each.base,
-        tool=each.tool,
-        socket=each.socket,
-    )
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(e, name) for e in parts])[
+            order[there if name == 'joints' else here]
+        ]
+        for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
+    }
+    return Observations(**joined, base=each.base, tool=each.tool, socket=each.socket)

@@ -8,14 +8,14 @@ other parts. Parts are dealt out twice, one by one and in blocks of what was mea
 succession, and both must agree, because neighbours share errors. Groups of effects are added one
 by one, the best first, as long as the position error on the configurations left out falls by more
 than chance explains, and explain more of the residuals than of the same moved in time
-(`chance.py`), as a drift would be. Then the spectrum of what is left is searched, joint by joint,
+(`drift.py`), as a drift would be. Then the spectrum of what is left is searched, joint by joint,
 for harmonics of gears: the one that explains most is added while it pays as well.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -40,20 +40,12 @@ LEAST_GAIN = 0.005
 """Least decrease of the RMS error that is worth a group or a harmonic."""
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
-SUBSET = 3000
+COMPARED = 3000
 """Samples by which effects are compared; of more, every so many are taken."""
 
 
 def _unheard(stage: str) -> None:
     """Tell nobody which stage begins."""
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The effects that pay for themselves, and the verdicts on all that were tried."""
-
-    effects: tuple[str, ...]
-    verdicts: tuple[Verdict, ...]
 
 
 def identify_model(
@@ -69,10 +61,10 @@ def identify_model(
     result = identify(problem)
     if model != 'auto':
         return result
-    selection = choose_effects(problem, result, progress)
-    if selection.effects:
-        progress(f'model with {len(selection.effects)} effects')
-        richer = identify(replace(problem, effects=selection.effects), result)
+    chosen, verdicts = _chosen(problem, result, progress)
+    if chosen:
+        progress(f'model with {len(chosen)} effects')
+        richer = identify(replace(problem, effects=chosen), result)
         reasons: tuple[str, ...] = ()
         if not richer.converged:
             reasons = ('its fit has not converged',)
@@ -83,13 +75,13 @@ def identify_model(
             result = replace(result, remarks=(*result.remarks, remark))
         else:
             result = richer
-    return replace(result, verdicts=selection.verdicts)
+    return replace(result, verdicts=verdicts)
 
 
-def choose_effects(
-    problem: Problem, geometric: Identification, progress: Callable[[str], None] = _unheard
-) -> Selection:
-    """Choose the effects for a problem from its geometric result."""
+def _chosen(
+    problem: Problem, geometric: Identification, progress: Callable[[str], None]
+) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
+    """Return the effects that pay for themselves, and the verdicts on all that were tried."""
     progress('effects')
     model = _Linear(problem, geometric)
     chosen: list[str] = []
@@ -123,7 +115,7 @@ def choose_effects(
         if not verdict.pays:
             break
         chosen += harmonic
-    return Selection(tuple(chosen), tuple(found))
+    return tuple(chosen), tuple(found)
 
 
 class _Linear:
@@ -144,7 +136,7 @@ class _Linear:
         judged = np.split(
             geometric.fitted.judged, np.cumsum([len(each) for each in problem.sets])[:-1]
         )
-        share = max(1, -(-sum(map(len, problem.sets)) // SUBSET))
+        share = max(1, -(-sum(map(len, problem.sets)) // COMPARED))
         sets = [
             each.select(np.flatnonzero(good)[::share])
             for each, good in zip(problem.sets, judged, strict=True)

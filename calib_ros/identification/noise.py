@@ -29,9 +29,9 @@ class Noise:
 
     `successive` and `near` are the correlations of the residuals of configurations that follow
     each other and that are near each other in joint space; `shared` names which of them a test
-    finds to share errors (`correlation.py`), and `widened` by what factor that makes the standard
-    deviations larger (median). `size` is that by which they are larger than the sigmas given
-    would make them, in all.
+    finds to share errors (`shared_errors.py`), and `widened` by what factor that makes the
+    standard deviations larger (median). `size` is that by which they are larger than the sigmas
+    given would make them, in all.
     """
 
     position: float

@@ -24,7 +24,7 @@ from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import (
     FALSE,
-    MOST,
+    MOST_CHANGES,
     SIZES,
     Columns,
     Explanation,
@@ -173,7 +173,7 @@ def recalibrate(
     columns = Columns(arm.chain, arm.names, movable)
     changed: list[tuple[Explanation, ...]] = []
     found = arm.solved(system)
-    while len(changed) < MOST:
+    while len(changed) < MOST_CHANGES:
         reasons = reasons_of(found.told.beside(arm.square), columns, previous.freedom)
         if not reasons:
             break

@@ -214,7 +214,7 @@ def covariance_of(
         if not (np.diag(square) > 0.0).all() or not freedom > 0.0:
             raise ValueError('no covariance')
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
-        raise _damaged('covariance', where, err) from err
+        raise damaged('covariance', where, err) from err
     return names, square, freedom
 
 
@@ -236,7 +236,7 @@ def noise_of(record: Mapping[str, Any], where: str) -> Noise | None:
             parse_number(known['size'], 'size'),
         )
     except (ConfigError, KeyError, TypeError) as err:
-        raise _damaged('noise_in_sigma', where, err) from err
+        raise damaged('noise_in_sigma', where, err) from err
 
 
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
@@ -256,11 +256,12 @@ def owners_of(record: Mapping[str, Any], where: str) -> dict[str, Owner]:
         session, eye, socket, label = (parts.get(key) for key in OWNER)
         told = isinstance(session, str) and isinstance(label, str)
         if not (told and isinstance(eye, bool) and isinstance(socket, bool)):
-            raise _damaged(f'frames.{name}', where)
+            raise damaged(f'frames.{name}', where)
         owners[name] = (str(session), bool(eye), bool(socket), str(label))
     return owners
 
 
-def _damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
+def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
+    """Return the error that says which part of a record is not as it was written."""
     kind = '' if err is None else f' ({type(err).__name__})'
     return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')

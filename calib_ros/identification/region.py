@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import UnknownNameError
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.observations import POSES, Observations
-from calib_ros.identification.records import packed, unpacked
+from calib_ros.identification.records import damaged, packed, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -129,7 +129,8 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         return None
     try:
         names = tuple(str(name) for name in document['names'])
-        chain = chain.with_effects([n for n in names if not _is_geometric(chain, n)])
+        geometric = {n for n in names if chain.owns_frame(n) or Parameter(n).of_dh}
+        chain = chain.with_effects([n for n in names if n not in geometric])
         ErrorModel(chain, names)
         limit = document['limit']
         region = Region(
@@ -145,21 +146,15 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         what = f'parameter in {where}: calibration.region'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
-        raise ConfigError(
-            f'{where}: calibration.region is damaged ({type(err).__name__}): identify again'
-        ) from err
+        raise damaged('region', where, err) from err
     if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
-        raise ConfigError(f'{where}: calibration.region is damaged: identify again')
+        raise damaged('region', where)
     for frame in (region.base, region.tool):
         if frame not in chain.frame_names:
             raise UnknownNameError(
                 f'frame in {where}: calibration.region', frame, chain.frame_names
             )
     return region
-
-
-def _is_geometric(chain: Chain, name: str) -> bool:
-    return chain.owns_frame(name) or Parameter(name).of_dh
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:

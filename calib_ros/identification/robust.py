@@ -149,12 +149,11 @@ def reweighted(
     distances = judged(chain)
     iterations = 0
     settled = False
-    weights = [np.ones(0)] * len(system.sets)
+    weights: list[FloatArray] = []
     for _ in range(ROUNDS):
         last, weights = weights, [weights_of(d, loss) for d in distances]
-        settled = all(
-            len(w) == len(b) and np.allclose(w, b, rtol=0, atol=1e-4)
-            for w, b in zip(weights, last, strict=True)
+        settled = bool(last) and all(
+            np.allclose(w, b, rtol=0, atol=1e-4) for w, b in zip(weights, last, strict=True)
         )
         if settled:
             break

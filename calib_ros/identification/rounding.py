@@ -36,13 +36,13 @@ EXACT = 1e-3
 """Share of a step by which multiples of it may be off."""
 FEW = 0.5
 """Values of a joint beside the number of stops, up to which they repeat."""
-SAMPLES = 150
+LOOKED_AT = 150
 """Samples that are looked at; of more, evenly spread ones."""
 USUAL = (5e-4, 1e-3)
 """Errors [m, rad] of an arm, whose size is found."""
-SIZES = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+RATIOS = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 NOISES = np.geomspace(0.2, 20.0, 15)
-SURE = 4.0
+DECIDED = 4.0
 """Logarithm of the ratio of evidences from which on a gain is the arm's."""
 
 
@@ -94,7 +94,7 @@ def may_be_rounding(
     `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
     of rounded joints, and `good` (N,) tells which samples of each set are no outliers.
     """
-    share = -(-sum(map(len, problem.sets)) // SAMPLES)
+    share = -(-sum(map(len, problem.sets)) // LOOKED_AT)
     pairs = zip(problem.sets, good, strict=True)
     sets = [each.select(np.flatnonzero(which)[::share]) for each, which in pairs]
     joints = np.concatenate([each.joints for each in sets])
@@ -130,10 +130,10 @@ def may_be_rounding(
             freedom,
         )
         for with_rounding in (0.0, 1.0)
-        for size in SIZES
+        for size in RATIOS
     }
     healthy = max(found[key] for key in found if key[1] == 0.0)
-    return bool(max(found.values()) - healthy < SURE)
+    return bool(max(found.values()) - healthy < DECIDED)
 
 
 def _usual(name: str) -> float:

@@ -41,7 +41,7 @@ LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
 NEAREST = 3
 """Neighbours in joint space of each configuration that are tested."""
-MOST = 400
+MOST_STOPS = 400
 """Stops on which sizes are estimated; of more, every so many runs of a
 twentieth."""
 APART = 1e9
@@ -117,8 +117,8 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     """Return which neighbours share errors, and the noise that follows."""
     kinds = tuple(LENGTHS)
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
-    share = max(1, -(-total // MOST))
-    few = _gather(fit.chain, names, system, share, MOST // 20)
+    share = max(1, -(-total // MOST_STOPS))
+    few = _gather(fit.chain, names, system, share, MOST_STOPS // 20)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < FEWEST:
         return Shared(**correlations, found=(), middles={})

@@ -43,7 +43,7 @@ SUSPECTED = 0.4
 """The same at a stop near by, where not all are looked at first."""
 PLACES = 40
 """Stops at which steps are looked for first."""
-LEAST = 3
+LEAST_ASIDE = 3
 """Stops before and after a step: fewer are gross errors."""
 ROWS_NS = 10**15
 """Whole seconds below that are the numbers of rows, in place of stamps."""
@@ -120,7 +120,7 @@ class Step:
 def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:
     """Return the step that explains more than half of the residuals of a fit, if there is one."""
     scan = _Scan(problem, names, robust)
-    places = np.arange(LEAST, scan.stops - LEAST + 1)
+    places = np.arange(LEAST_ASIDE, scan.stops - LEAST_ASIDE + 1)
     if not len(places):
         return None
     coarse = places[:: 1 + (len(places) - 1) // PLACES]

@@ -138,12 +138,7 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
 
 def _sister(problem: Problem, result: Identification) -> str:
     """Return in words which shipped robot is much nearer to the arm found than the nominal."""
-    if not any(
-        p.std is not None
-        and p.name.of_dh
-        and abs(p.offset) - 3.0 * p.std > ANOTHER[0 if p.name.is_length else 1]
-        for p in result.parameters
-    ):
+    if not any(each.beyond(*ANOTHER) for each in result.parameters):
         return ''
     types = [joint.type for joint in problem.chain.joints]
     joints = problem.sets[0].spread().joints

@@ -27,11 +27,11 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
 STARTS = 500
-STEPS = 4
+CONCENTRATIONS = 4
 """Concentration steps from every start; then only the BEST are followed to their end."""
 BEST = 10
 RELINEARISATIONS = 5
-SUBSET = 300
+SEARCHED = 300
 """Samples that are searched, evenly spread over all, of each set a tenth at least; the fit that
 follows takes all."""
 DRAWN = 0.5
@@ -53,7 +53,7 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
     halves = _Halves(few, need)
     masks = halves.draw(need)
     linear = _Linear(chain, names, few)
-    for _ in range(STEPS):
+    for _ in range(CONCENTRATIONS):
         masks, sums = halves.concentrate(linear.squares(masks))
     masks = masks[np.argsort(sums)[:BEST]]
     half = masks[0]
@@ -84,7 +84,7 @@ def trimmed_sum(chain: Chain, system: System) -> float:
 
 def _thinned(system: System) -> System:
     """Return a part of the samples."""
-    most = max(SUBSET // len(system.sets), SUBSET // 10)
+    most = max(SEARCHED // len(system.sets), SEARCHED // 10)
     return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
 
 

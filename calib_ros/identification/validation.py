@@ -51,6 +51,11 @@ class ParameterRow:
             return None
         return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
 
+    def beyond(self, length: float, angle: float) -> bool:
+        """Tell whether it is a DH parameter certainly further from nominal than a limit."""
+        limit = length if self.name.is_length else angle
+        return self.std is not None and self.name.of_dh and abs(self.offset) - 3 * self.std > limit
+
 
 @dataclass(frozen=True)
 class ErrorFigures:

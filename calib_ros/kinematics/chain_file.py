@@ -13,7 +13,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -108,9 +108,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     if len(rows) > MOST_JOINTS:
         raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_JOINTS}')
     parallel = content.get('parallel')
-    if parallel is not None and not (
-        isinstance(parallel, list) and all(isinstance(name, str) for name in parallel)
-    ):
+    if parallel is not None and not (isinstance(parallel, list) and _texts(parallel)):
         raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')
     try:
         return Chain(
@@ -168,11 +166,9 @@ def chain_document(chain: Chain) -> dict[str, Any]:
     joints = []
     for joint in chain.joints:
         row: dict[str, Any] = {'name': joint.name, 'type': joint.type}
-        row |= {kind: float(getattr(joint, kind)) for kind in DH_KINDS}
-        row['sign'] = joint.sign
-        for key in ('lower', 'upper'):
-            if getattr(joint, key) is not None:
-                row[key] = float(getattr(joint, key))
+        row |= {kind: float(getattr(joint, kind)) for kind in DH_KINDS} | {'sign': joint.sign}
+        ends = {'lower': joint.lower, 'upper': joint.upper}
+        row |= {key: float(end) for key, end in ends.items() if end is not None}
         if joint.mass or any(joint.com):
             row |= {'mass': float(joint.mass), 'com': [float(part) for part in joint.com]}
         if joint.gear_ratio:
@@ -255,11 +251,15 @@ def _flag(content: dict[str, Any], where: str, default: bool) -> bool:
     return fixed
 
 
+def _texts(values: Iterable[object]) -> bool:
+    return all(isinstance(value, str) for value in values)
+
+
 def dictionary(value: object, where: str) -> dict[str, Any]:
     """Return a mapping of names, empty for none; `where` names it in the error."""
     if value is None:
         return {}
-    if not isinstance(value, dict) or not all(isinstance(key, str) for key in value):
+    if not isinstance(value, dict) or not _texts(value):
         raise ConfigError(f'{where} must be a mapping of names, not {value!r}')
     return value
 

@@ -88,14 +88,13 @@ def solve(
     size = np.linalg.norm(error, axis=0)
     least, first, most = DAMPING
     damping = np.full(len(poses), first)
-    diagonal = np.diag_indices(len(q))
     for _ in range(ITERATIONS):
         (active,) = np.nonzero((size > TOLERANCE) & (damping < most))
         if not active.size:
             break
         own = columns[:, :, active]
         normal = np.einsum('ikb,jkb->ijb', own, own)
-        normal[diagonal] += damping[active]
+        normal[np.diag_indices(len(q))] += damping[active]
         slope = np.einsum('ikb,kb->ib', own, error[:, active])
         tried = _within(chain, q[:, active] + solve_positive(normal, slope))
         new_error, new_columns = aim.linearise(

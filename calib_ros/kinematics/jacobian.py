@@ -114,7 +114,7 @@ class ErrorModel:
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
         se3.cross(axes, target[3] - flat[layout.points], levers[:-1])
-        shift = np.empty((len(layout.row) + 1, 3, samples))
+        shift = np.empty((len(self.names) + 1, 3, samples))
         turn = np.empty((self.rotations + 1, 3, samples))
         np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
         np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
@@ -173,18 +173,15 @@ class ErrorModel:
 
 
 class _Layout(NamedTuple):
-    """Where the columns of parameters stand.
+    """Where the columns of parameters stand, rotations first, and in which `order` of the names.
 
-    `row` of each parameter, rotations first, of which there are so many; `order` of the rows in
-    the order of the names. Of the rows of all frames, four each, `axes` and `points` are those
-    that something turns about; `levers` (of these), `shifts` and `turns` the ones that each
-    parameter takes, `still` those that move nothing. `behind` are the frames behind the constant
-    part of each link, `bent` where something goes along or about x there; `effects` stand among
-    the parameters, with the rows `driven` and the `joints` that they drive; `delay` is the row of
-    a delay.
+    Of the rows of all frames, four each, `axes` and `points` are those that something turns
+    about; `levers` (of these), `shifts` and `turns` the ones that each parameter takes, `still`
+    those that move nothing. `behind` are the frames behind the constant part of each link, `bent`
+    where something goes along or about x there; `effects` stand among the parameters, with the
+    rows `driven` and the `joints` that they drive; `delay` is the row of a delay.
     """
 
-    row: Mapping[str, int]
     rotations: int
     order: NDArray[np.intp]
     axes: NDArray[np.intp]
@@ -255,7 +252,6 @@ def _layout(
     axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
     levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
     return _Layout(
-        row,
         rotations,
         _indices(row[name] for name in names),
         _indices(axes),

@@ -27,6 +27,7 @@ from calib_ros.values import LARGEST, parse_name
 MOVING = ('revolute', 'continuous', 'prismatic')
 TYPES = (*MOVING, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
+ENDS = ('lower', 'upper')
 MOST_LINKS = 10_000
 """Links, and joints, of a URDF."""
 
@@ -214,25 +215,11 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
         axis = axis / np.linalg.norm(axis)
     lower, upper = None, None
     limit = _child(element, 'limit')
-    if kind in ('revolute', 'prismatic') and {'lower', 'upper'} & set(limit.keys()):
-        lower, upper = (_limit(limit, key, where) for key in ('lower', 'upper'))
-    return DescribedJoint(
-        name=name,
-        type=kind,
-        parent=parent,
-        child=child,
-        origin=_origin(element, where),
-        axis=axis,
-        lower=lower,
-        upper=upper,
-        mimics=element.find('mimic') is not None,
-    )
-
-
-def _limit(element: ET.Element, key: str, where: str) -> float | None:
-    """Return a limit [rad or m]; none where it is as large as no arm moves."""
-    limit = float(_numbers(element, key, f'limit of {where}', '0', 1, math.inf)[0])
-    return limit if abs(limit) <= LARGEST else None
+    if kind in ('revolute', 'prismatic') and set(ENDS) & set(limit.keys()):
+        ends = (_numbers(limit, key, f'limit of {where}', '0', 1, math.inf) for key in ENDS)
+        lower, upper = (float(x[0]) if abs(x[0]) <= LARGEST else None for x in ends)
+    origin, mimics = _origin(element, where), element.find('mimic') is not None
+    return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, mimics)
 
 
 def _inertial(link: ET.Element) -> tuple[float, FloatArray]:
@@ -245,8 +232,13 @@ def _inertial(link: ET.Element) -> tuple[float, FloatArray]:
 
 def _origin(element: ET.Element, where: str) -> FloatArray:
     origin = _child(element, 'origin')
-    xyz, rpy = (_numbers(origin, key, f'origin of {where}', '0 0 0') for key in ('xyz', 'rpy'))
-    return se3.transform(_from_rpy(rpy), xyz)
+    return _placed(origin, f'origin of {where}')[0]
+
+
+def _placed(origin: ET.Element, where: str) -> tuple[FloatArray, FloatArray]:
+    """Return the transform (4, 4) of the tag of an origin, and its roll, pitch, yaw [rad]."""
+    xyz, rpy = (_numbers(origin, key, where, '0 0 0') for key in ('xyz', 'rpy'))
+    return se3.transform(np.asarray(Rotation.from_euler('xyz', rpy).as_matrix()), xyz), rpy
 
 
 def _child(element: ET.Element, tag: str) -> ET.Element:
@@ -276,10 +268,6 @@ def _numbers(
     if np.abs(values).max() > largest:
         raise ConfigError(f'{key} in the {where} must be at most {largest:g}, not "{text}"')
     return values
-
-
-def _from_rpy(rpy: FloatArray) -> FloatArray:
-    return np.asarray(Rotation.from_euler('xyz', rpy).as_matrix())
 
 
 # ---- back into the text
@@ -334,10 +322,11 @@ def _places(data: bytes, joints: Mapping[str, object]) -> list[tuple[int, str, s
 def _with_origin(tag: str, origin: FloatArray) -> str:
     """Return the text of an origin's tag with another value; what stays is not touched."""
     element = ET.fromstring(tag if tag.endswith('/>') else tag[:-1] + '/>')
-    xyz, rpy = (_numbers(element, key, 'origin', '0 0 0') for key in ('xyz', 'rpy'))
-    if np.abs(origin[:3, :3] - _from_rpy(rpy)).max() > ROUNDING:
+    written, rpy = _placed(element, 'origin')
+    change = np.abs(origin - written)
+    if change[:3, :3].max() > ROUNDING:
         tag = _with_attribute(tag, 'rpy', _to_rpy(origin[:3, :3], rpy))
-    if np.abs(origin[:3, 3] - xyz).max() > ROUNDING:
+    if change[:3, 3].max() > ROUNDING:
         tag = _with_attribute(tag, 'xyz', origin[:3, 3])
     return tag
 

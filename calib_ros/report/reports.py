@@ -194,18 +194,14 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
 
 def _effects(result: Identification) -> Section:
     """Return what each effect beyond geometry brings."""
+    pays = {True: 'yes', False: 'no: does not pay for itself'}
     return Section(
         'effects',
         'Errors beyond geometry',
         ('RMS position error on configurations left out, with and without each effect.',),
         head=('effect', 'without [mm]', 'with it [mm]', 'used'),
         rows=tuple(
-            (
-                v.what,
-                f'{v.rms_mm_before:.4f}',
-                f'{v.rms_mm_after:.4f}',
-                'yes' if v.pays else 'no: does not pay for itself',
-            )
+            (v.what, f'{v.rms_mm_before:.4f}', f'{v.rms_mm_after:.4f}', pays[v.pays])
             for v in result.verdicts
         ),
     )

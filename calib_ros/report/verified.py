@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 from calib_ros.apply.verification import Verification, remarks
 from calib_ros.kinematics.chain import Chain
@@ -94,14 +94,8 @@ def _by_configuration(found: Verification) -> list[Section]:
             ),
             head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
             rows=tuple(
-                (
-                    f'P{k}',
-                    str(pose.cycles),
-                    f'{pose.before:.4f}',
-                    f'{pose.after:.4f}',
-                    '' if pose.repeatability is None else f'{pose.repeatability:.4f}',
-                )
-                for k, pose in enumerate(found.each, 1)
+                (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in figures))
+                for k, (cycles, *figures) in enumerate(map(astuple, found.each), 1)
             ),
         )
     ]

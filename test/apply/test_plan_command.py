@@ -116,11 +116,11 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
 
 
 def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
-    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 500)
+    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 200)
     count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
     assert f'0.1 mm: {count} poses' in out
     assert 18 <= count <= 26
-    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 500)
+    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 200)
     assert f'0.1 mm: {count} poses' in out
     assert out.splitlines()[-5].split()[0] == '10'
 

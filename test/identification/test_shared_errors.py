@@ -175,8 +175,8 @@ def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypa
 
 
 def test_a_part_of_many_stops_tells_nearly_the_same(monkeypatch):
-    whole = shifted_run(monkeypatch, 960, MOST=960)
-    part = shifted_run(monkeypatch, 960, MOST=240)
+    whole = shifted_run(monkeypatch, 960, MOST_STOPS=960)
+    part = shifted_run(monkeypatch, 960, MOST_STOPS=240)
     assert part.noise.shared == whole.noise.shared
     ratio = np.sqrt(np.diag(part.covariance) / np.diag(whole.covariance))
     assert 0.6 < np.median(ratio) < 1.7

@@ -331,7 +331,8 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
 
 
 def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'jinja2', None)
+    for name in ('jinja2', 'weasyprint'):
+        monkeypatch.setitem(sys.modules, name, None)
     out = tmp_path / 'out'
     arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
     assert main(arguments) == 0

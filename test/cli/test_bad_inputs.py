@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a command line cannot use is told in one line."""
+
+import pytest
+from measured import TRAIN, measured, rows_of, write_csv
+
+from calib_ros.cli.main import main
+
+
+def bad_inputs():
+    """Yield the name of a bad input, its arguments, and what the complaint must hold."""
+    csv_of = ('identify', '--chain', 'ur5e', '--csv')
+    bag_of = ('identify', '--chain', 'ur5e')
+    good = (*csv_of, 'good.csv')
+    chain_of = ('identify', '--csv', 'good.csv', '--chain')
+    yield 'no input', bag_of, 'either a bag, or a table'
+    yield 'two inputs', (*good, 'bag'), 'either a bag, or a table'
+    yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
+    yield 'a folder as table', (*csv_of, 'folder'), 'folder'
+    yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
+    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a number'
+    yield 'too few rows', (*csv_of, 'few.csv'), '3 measured configurations are too few'
+    yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
+    yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
+    yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
+    yield 'an empty bag folder', (*bag_of, 'folder'), 'folder is not a readable rosbag2'
+    yield 'an empty bag file', (*bag_of, 'empty.mcap'), 'empty.mcap is not a readable rosbag2'
+    yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
+    yield 'no such chain', (*chain_of, 'missing.yaml'), 'missing.yaml'
+    yield 'no such robot', (*chain_of, 'ur10x'), 'did you mean "ur10'
+    yield 'not YAML', (*chain_of, 'broken.yaml'), 'broken.yaml is not valid YAML'
+    yield 'no chain', (*chain_of, 'good.csv'), 'good.csv'
+    yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
+    yield 'unknown parameter', (*good, '--fixed', 'elbow.a'), 'did you mean "elbow_joint.a"'
+    yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
+    yield 'nothing left', (*good, '--fixed', '*'), 'nothing is left to identify'
+    yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
+    yield 'NaN', (*good, '--sigma-orientation', 'nan'), 'sigma_orientation must be'
+    yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
+    yield (
+        'useless option',
+        (*good, '--sources', '/pose'),
+        '--sources is of no use with a table',
+    )
+    yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'of no use with a bag'
+    names = ('--joint-names', 'a,a,b,c,d,e,f')
+    yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
+    yield 'out is a file', (*good, '--out', 'empty'), 'empty'
+    yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
+    yield 'csv2bag, bad table', ('csv2bag', 'number.csv', 'b', '--chain', 'ur5e'), 'line 4: q2'
+    yield 'csv2bag, bag exists', ('csv2bag', 'good.csv', 'folder', '--chain', 'ur5e'), 'exists al'
+    yield 'csv2bag, into a file', ('csv2bag', 'good.csv', 'empty/b', '--chain', 'ur5e'), 'empty'
+    yield 'simulate, bag exists', ('simulate', 'folder', '--chain', 'ur5e'), 'exists already'
+    yield 'simulate, into a file', ('simulate', 'empty/b', '--chain', 'ur5e'), 'empty'
+    yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
+    yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
+    yield 'demo, into a file', ('demo', '--out', 'empty', '--poses', '5'), 'empty'
+    yield 'demo, too few', ('demo', '--poses', '2'), '2 measured configurations are too few'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'complaint'),
+    [pytest.param(*rest, id=name) for name, *rest in bad_inputs()],
+)
+def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint):
+    rows = rows_of(measured())
+    table.rename(tmp_path / 'good.csv')
+    write_csv(tmp_path / 'few.csv', rows[:3])
+    write_csv(tmp_path / 'judging.csv', rows[TRAIN:])
+    rows[2]['q2'] = 'zero'
+    write_csv(tmp_path / 'number.csv', rows)
+    (tmp_path / 'empty').write_text('')
+    (tmp_path / 'empty.mcap').write_text('')
+    (tmp_path / 'broken.yaml').write_text('joints: [\n')
+    (tmp_path / 'folder').mkdir()
+    status, _, err = run(*arguments)
+    assert status == 1
+    assert err.startswith('calib_ros: ')
+    assert complaint in err
+    assert err.count('\n') == 1
+    assert err.endswith('\n')
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        (),
+        ('calibrate',),
+        ('identify', '--csv', 'cell.csv'),
+        ('identify', '--chain', 'ur5e', '--csv', 'cell.csv', '--folds', 'five'),
+        ('simulate', 'bag', '--chain', 'ur5e', '--storage', 'rosbag1'),
+    ],
+)
+def test_wrong_usage_is_status_2(run, arguments):
+    with pytest.raises(SystemExit) as caught:
+        run(*arguments)
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize('command', ['identify', 'plan', 'verify', 'import'])
+def test_help_tells_defaults_only_where_there_are_some(capsys, command):
+    with pytest.raises(SystemExit):
+        main([command, '--help'])
+    text = ' '.join(capsys.readouterr().out.split())
+    for nothing in ('(default: None)', '(default: )', '(default: False)'):
+        assert nothing not in text
+    assert command == 'import' or '(default: ' in text
