@@ -97,9 +97,8 @@ def solve(
         normal[np.diag_indices(len(q))] += damping[active]
         slope = np.einsum('ikb,kb->ib', own, error[:, active])
         tried = _within(chain, q[:, active] + solve_positive(normal, slope))
-        new_error, new_columns = aim.linearise(
-            tried, None, positions[:, active], axes[:, :, active], LEVER
-        )
+        wanted = positions[:, active], axes[:, :, active]
+        new_error, new_columns = aim.linearise(tried, None, *wanted, LEVER)
         new_error, new_columns = new_error[part], new_columns[:, part]
         new_size = np.linalg.norm(new_error, axis=0)
         better = new_size < size[active]

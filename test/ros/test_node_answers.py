@@ -21,6 +21,7 @@ from std_srvs.srv import SetBool
 from calib_ros.apply.simulation import measure
 from calib_ros.files.history import History
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.ros.identifying import _without_middle
 
 
 def test_errors_are_answers(cell, recording):
@@ -41,6 +42,22 @@ def test_errors_are_answers(cell, recording):
     few = cell.call('identify')
     assert not few.success
     assert '2 measured configurations are too few, at least 5' in few.message
+
+
+@pytest.mark.parametrize(
+    ('verdict', 'middle', 'advice'),
+    [
+        ('NOT accepted: the poses do not determine', ' joint,' * 50, ': move the joints further'),
+        ('poses came in different frames', ' (a, b)', f': set frame_id{" to one" * 10}'),
+        ('one clause without an end', ' and so on' * 50, ''),
+    ],
+)
+def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
+    found = _without_middle(verdict + middle + advice, 120)
+    assert len(found) <= 120
+    assert found.startswith(verdict[:25])
+    assert found.endswith(advice[2:])
+    assert ' ... ' in found
 
 
 def test_answers_are_in_the_log_as_well(cell, recording):

@@ -9,7 +9,7 @@ from streams import joint_state, of_joints, take
 
 from calib_ros.errors import ConfigError
 from calib_ros.files.journal import Journal
-from calib_ros.files.tables import columns, read_journal, read_table
+from calib_ros.files.tables import read_journal, read_table
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -71,14 +71,3 @@ def test_a_moving_arm_and_a_wrong_label_are_refused():
     for label in ('A', '/1', 'A/', 'A/1_2', 'A/B/1', 'A/\n'):
         with pytest.raises(ConfigError, match='LOCATION/SOCKET'):
             session.capture(label)
-
-
-def test_a_journal_of_before_keeps_its_columns(tmp_path):
-    path = tmp_path / 'journal.csv'
-    path.write_text(','.join(columns(7)[: columns(7).index('location')]) + '\n')
-    session = captured(cell(0, count=1)[1], 1)
-    journal = Journal(path, 7)
-    with pytest.raises(OSError, match='call ~/clear'):
-        journal.add(session.samples[0])
-    journal.close()
-    assert read_journal(path, 7)[0] == ()
