@@ -121,7 +121,7 @@ def photograph(
     count: int,
     rng: np.random.Generator,
     noise: float = 0.0,
-    rounds: int = 50,
+    tries: int = 2000,
 ) -> Observations:
     """Return images of all points (M, 3) of a board, with normally distributed noise [px].
 
@@ -130,13 +130,13 @@ def photograph(
     Raises
     ------
     InputError
-        When the arm hardly reaches what the camera sees: after `rounds` of `count` tries.
+        When the arm hardly reaches what the camera sees: after so many `tries`.
 
     """
     size = len(points)
     joints = np.zeros((0, len(chain.joints)))
     exact = np.zeros((0, size, 2))
-    for _ in range(rounds):
+    for _ in range(0, tries, count):
         if len(joints) == count:
             break
         wanted = _facing(camera, points, count, rng)
@@ -158,7 +158,7 @@ def photograph(
         exact = np.concatenate([exact, pixels[good]])[:count]
     if len(joints) < count:
         raise InputError(
-            f'of {rounds * count} places before the camera the arm reaches {len(joints)}, expected'
+            f'of {tries} places before the camera the arm reaches {len(joints)}, expected'
             f' {count}: place the camera elsewhere'
         )
     number = np.repeat(np.arange(count), size)

@@ -129,7 +129,7 @@ def test_a_camera_out_of_reach_is_refused():
     true, _ = scene(1, False)
     away = replace(true, base=replace(true.base, matrix=true.base.matrix + 5.0 * np.eye(4, k=3)))
     with pytest.raises(InputError, match='reaches 0, expected 2: place the camera elsewhere'):
-        photograph(away, CAMERA, POINTS, False, 2, np.random.default_rng(0), rounds=3)
+        photograph(away, CAMERA, POINTS, False, 2, np.random.default_rng(0), tries=6)
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
