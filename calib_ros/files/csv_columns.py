@@ -83,7 +83,7 @@ class TextColumns(Columns):
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
         columns = [self.header.index(name) for name in names]
         blank = self._empty[:, columns]
-        lacking = blank.any(axis=0)
+        lacking = np.asarray(blank.any(axis=0))
         some = np.flatnonzero(~(lacking & blank.all(axis=0)))
         if not len(some):
             return np.full(blank.shape, np.nan)
