@@ -7,7 +7,7 @@
 nights: 200 robots x 30 nights x 60 poses (0.05 mm, 0.2 mrad). Five robots are bumped in some night
 but the first three: one parameter of the arm moves by 0.1 mm or 0.2 mrad. Found: the joint named
 within two nights. A second run has nothing to do. workers: throughput of one and two workers on
-tables of 12,000 poses, over a second each, beside that of one and two processes without dask: what
+tables of 25,000 poses, over a second each, beside that of one and two processes without dask: what
 the machine can do. scheduler: its time and the client's for each task. kills: ten runs in which a
 worker, then the client is killed with SIGKILL; the history must hold each result once.
 """
@@ -254,7 +254,7 @@ def main():
             Cluster(options.scheduler, options.workers),
         ),
         'workers': lambda folder: workers_part(
-            folder, 4 if quick else 8, 12_000, 1 if quick else 5
+            folder, 4 if quick else 12, 25_000, 1 if quick else 3
         ),
         'scheduler': lambda folder: scheduler_part(folder, 200 if quick else 1000),
         'kills': lambda folder: kills_part(folder, 1 if quick else 10, 3, 6),
