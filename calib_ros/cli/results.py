@@ -63,7 +63,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     else:
         screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
     screen.table(_rows(result))
-    for each in advice(result.refusals):
+    for each in advice(result.refusals, result.noise.position):
         screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if result.accepted:
         for note in words.notes(result):

@@ -91,7 +91,7 @@ RULES: dict[Rule, Advice] = {
         'Too few poses were measured',
         'A correction must be tested on poses that it was not computed from. There are not '
         'enough poses for both.',
-        (f'Measure at least 30 different poses, {SPREAD}.',),
+        (f'Measure at least 30 different poses in all, {SPREAD}. Those that you have count.',),
     ),
     Rule.OUTLIERS: Advice(
         'Too many measurements do not fit',
@@ -134,8 +134,9 @@ RULES: dict[Rule, Advice] = {
         'The correction is smaller than its own uncertainty, even at the poses measured. '
         'Used on the arm, it could make it worse.',
         (
-            f'Measure more poses, {SPREAD}. `calib_ros plan --accuracy` says how many.',
-            'Measure with a more accurate device, or orientation as well as position.',
+            f'Measure more poses, {SPREAD}. `calib_ros plan --chain ROBOT --accuracy MM` says how '
+            'many.',
+            'Or measure with a more accurate device; orientation too, if it was position only.',
         ),
     ),
     Rule.GAIN_WITH_OUTLIERS: Advice(
@@ -218,11 +219,36 @@ WRONG_ARM = {Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR}
 """Where the description does not fit the arm, its lengths are of no scale either."""
 
 
-def advice(reasons: Sequence[Reason]) -> tuple[Advice, ...]:
-    """Return the refusals in plain words, those of one rule together."""
+NOISY = 10.0
+"""Ratio of what is left to the stated noise that an arm's own errors rarely reach."""
+
+
+def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
+    """Return the refusals in plain words, those of one rule together.
+
+    `left` is the ratio of what is left after the correction to the stated noise.
+    """
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
     if found.keys() & WRONG_ARM:
         found.pop(Rule.SCALE, None)
-    return tuple(replace(RULES[rule], refusal='; '.join(texts)) for rule, texts in found.items())
+    return tuple(
+        replace(
+            RULES[rule],
+            steps=(*_first(rule, left), *RULES[rule].steps),
+            refusal='; '.join(texts),
+        )
+        for rule, texts in found.items()
+    )
+
+
+def _first(rule: Rule, left: float) -> tuple[str, ...]:
+    """Return what to check before more is measured, where the measurements are far too coarse."""
+    if left < NOISY or rule not in {Rule.GAIN, Rule.REGION}:
+        return ()
+    return (
+        f'The measurements scatter {left:.0f} times as much as the device is said to. Before you '
+        'measure more, check that the target sits firmly, that the arm stood still, the clocks '
+        'and the units.',
+    )

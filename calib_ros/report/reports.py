@@ -59,7 +59,7 @@ def identification_report(
         kind='Kinematic calibration',
         robot=result.chain.name,
         verdict=_verdict(result, limits, tolerance),
-        advice=advice(result.refusals),
+        advice=advice(result.refusals, result.noise.position),
         accuracy=accuracy_section(
             'Accuracy before and after',
             (

@@ -259,9 +259,11 @@ def scatter_in_words(noise: Noise) -> str:
         text += f' and {noise.orientation:.2f} times in orientation'
     if noise.consistent:
         return f'{text}, consistent with it (chi-squared test)'
+    if noise.position < 1.0:
+        return f'{text}: less than --sigma-position and --sigma-orientation say'
     return (
         f'{text}: the measurements are not what --sigma-position and --sigma-orientation say; '
-        'intervals follow what is left'
+        'intervals are as wide as what is left makes them'
     )
 
 
@@ -279,7 +281,7 @@ def neighbours_in_words(noise: Noise) -> str:
     return (
         f'configurations {" and ".join(parts)} share errors, as of a drifting tracker or of '
         'effects that the model lacks, and count for fewer: standard deviations are '
-        f'{noise.widened:.1f} times those of independent errors'
+        f'{noise.widened:.2f} times those of independent errors'
     )
 
 

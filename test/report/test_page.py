@@ -219,6 +219,14 @@ def test_every_refusal_is_told_in_plain_words(rule):
     assert told.refusal == 'something new'
 
 
+@pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])
+def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
+    (usual,) = advice.advice([Reason(rule, 'little gain')], 2.0)
+    (coarse,) = advice.advice([Reason(rule, 'little gain')], 47.6)
+    assert '48 times' in coarse.steps[0]
+    assert coarse.steps[1:] == usual.steps
+
+
 def test_a_refused_page_says_why_and_what_to_do():
     rng = np.random.default_rng(3)
     rows = measured(chain=UR, count=40)
