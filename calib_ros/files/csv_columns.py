@@ -21,6 +21,8 @@ from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, read_text
 
 IRREGULAR = ('"', '\r', '\0')
 """What cells are not cut at separators alone with."""
+BLOCK = 2**18
+"""Bytes that are looked at together: they stay in the cache."""
 WIDEST, FEW = 40, 100
 """Characters of a text, and how many different ones, that are told apart all at once."""
 
@@ -177,15 +179,26 @@ def regular(
     width = len(header)
     if not len(lines) or len(set(header)) < width or width > MOST_ENTRIES:
         return None
-    cut = flat == ord(separator)
-    cut |= flat == ord('\n')
-    ends = np.empty(np.count_nonzero(cut) + 1, dtype=np.int32)
-    if len(ends) != width * len(lines) + 1:
+    ends = _ends(flat, separator, width * len(lines))
+    if ends is None:
         return None
-    ends[0], ends[1:] = -1, np.flatnonzero(cut)
     if not (flat[ends[width::width]] == ord('\n')).all():
         return None
     return TextColumns(path, tuple(header), lines, rows, separator, flat, ends)
+
+
+def _ends(flat: NDArray[np.uint8], separator: str, count: int) -> NDArray[np.int32] | None:
+    """Return where the cells of a text end, behind a -1; None where they are not `count`."""
+    ends = np.empty(count + 1, dtype=np.int32)
+    ends[0], known = -1, 1
+    for begin in range(0, len(flat), BLOCK):
+        part = flat[begin : begin + BLOCK]
+        found = np.flatnonzero((part == ord(separator)) | (part == ord('\n')))
+        if known + len(found) > len(ends):
+            return None
+        ends[known : known + len(found)] = found + begin
+        known += len(found)
+    return ends if known == len(ends) else None
 
 
 def _irregular(path: Path, text: str) -> MadeColumns:
