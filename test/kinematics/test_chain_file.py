@@ -18,11 +18,9 @@ from calib_ros.kinematics.chain_file import (
     parse_chain,
     shipped_robots,
 )
-from calib_ros.settings import Settings
 
 GOLDEN = yaml.safe_load(Path(__file__).with_name('golden_fk.yaml').read_text())
 HALF = np.pi / 2
-
 UR = """
 name: some_ur
 convention: standard
@@ -101,6 +99,8 @@ def assert_same(chain, expected, tolerance=1e-12):
 
 
 numbers = st.floats(-10.0, 10.0) | st.sampled_from([0.0, 1e-3, 1e-5, 1e-300, HALF, -0.0])
+
+
 # Names that YAML would read as something else when they are not quoted.
 names = st.sampled_from(
     ['yes', 'null', '1', '1e3', '~', 'a: b', 'joint 2', '#3', "it's", '"q"', '[x]', 'Gelenk_ä']
@@ -282,52 +282,6 @@ def test_an_empty_list_of_parallel_joints_is_kept():
     assert_same(parse_chain(dump_chain(chain)), chain)
 
 
-def row_of(alphas, convention, types='rrrrrr'):
-    kinds = {'r': 'revolute', 'p': 'prismatic'}
-    rows = [
-        Joint(f'j{k + 1}', kinds[types[k]], a=0.3, alpha=alpha) for k, alpha in enumerate(alphas)
-    ]
-    return Chain('arm', convention, tuple(rows))
-
-
-@pytest.mark.parametrize(
-    ('alphas', 'convention', 'parallel'),
-    [
-        # A row leads from its axis to the next (standard) or from the one before (modified).
-        ((HALF, 0.0, 0.0, HALF, -HALF, 0.0), 'standard', ('j2', 'j3')),
-        ((0.0, HALF, 0.0, 0.0, HALF, -HALF), 'modified', ('j3', 'j4')),
-        ((0.0, 0.0), 'standard', ('j1',)),
-        ((0.0, 0.0), 'modified', ('j2',)),
-        ((HALF, np.pi, HALF), 'standard', ('j2',)),
-        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', ('j2',)),
-    ],
-)
-def test_parallel_by_convention_and_tilt(alphas, convention, parallel):
-    assert row_of(alphas, convention).parallel == parallel
-
-
-@pytest.mark.parametrize(
-    ('types', 'convention', 'parallel'),
-    [
-        ('rrr', 'standard', ('j1', 'j2')),
-        ('rpr', 'standard', ('j1', 'j2')),
-        ('rpp', 'standard', ('j1',)),
-        ('rpr', 'modified', ('j2', 'j3')),
-        ('rrp', 'modified', ('j2', 'j3')),
-        ('rpp', 'modified', ('j2',)),
-    ],
-)
-def test_rows_that_join_parallel_axes_are_found_unless_both_are_prismatic(
-    types, convention, parallel
-):
-    assert row_of((0.0, 0.0, 0.0), convention, types).parallel == parallel
-
-
-def test_a_nominal_beta_tilts_the_axis():
-    rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.2, 0.0]))
-    assert Chain('arm', 'standard', rows).parallel == ('j0',)
-
-
 @pytest.mark.parametrize('robot', sorted(GOLDEN))
 def test_a_shipped_robot_stands_where_another_source_says(robot):
     golden, chain = GOLDEN[robot], load_chain(robot)
@@ -389,30 +343,6 @@ def test_a_folder_does_not_hide_the_robot_of_the_same_name(tmp_path, monkeypatch
 def test_a_path_to_nothing_is_not_taken_for_a_robot(tmp_path):
     with pytest.raises(ConfigError, match='ur10e'):
         load_chain(tmp_path / 'ur10e')
-
-
-@pytest.mark.parametrize(
-    ('name', 'value'),
-    [
-        ('sigma_position', 0.0),
-        ('sigma_position', -1e-4),
-        ('sigma_position', np.nan),
-        ('sigma_orientation', np.inf),
-        ('max_gap', -0.1),
-        ('max_gap', np.inf),
-        ('joint_buffer', 1),
-        ('pose_buffer', 0),
-        ('folds', 1),
-    ],
-)
-def test_a_setting_out_of_range_is_refused(name, value):
-    with pytest.raises(ConfigError, match=f'{name} must be .*, not {value}'):
-        Settings(**{name: value})
-
-
-def test_settings_at_the_edge_are_taken():
-    settings = Settings(max_gap=0.0, joint_buffer=2, pose_buffer=1, folds=2, sigma_position=1e-9)
-    assert (settings.joint_buffer, settings.pose_buffer, settings.folds) == (2, 1, 2)
 
 
 def test_a_key_that_comes_twice_is_refused():

@@ -1,0 +1,72 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Sessions of a UR5e with errors, and samples of it."""
+
+import numpy as np
+from streams import (
+    POSE,
+    TRACKER,
+    joint_state,
+    of_joints,
+    pose,
+    stamps,
+    stops,
+    take,
+)
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+UR5E = load_chain('ur5e')
+TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))
+NOISE = (5e-5, 2e-4)
+SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
+
+
+def samples(count=30, seed=5, true=TRUE, start=0, **more):
+    rng = np.random.default_rng(seed)
+    joints = UR5E.random_joints(count, rng)
+    seen = measure(true, joints, rng, *NOISE)
+    return [
+        Sample(
+            start + k + 1,
+            joints[k],
+            position=seen.positions[k],
+            rotation=seen.rotations[k],
+            **more,
+        )
+        for k in range(count)
+    ]
+
+
+def session(*given, **settings):
+    made = CalibrationSession(UR5E, Settings(**SIGMAS | settings))
+    made.restore([each for some in given for each in some])
+    return made
+
+
+def drive(made, configurations, sources, start=0.0, rate=25.0):
+    """Let an arm stand at each configuration while sources (source, type, maker) measure."""
+    motion = stops(configurations, 0.8, 0.8)
+    end = 1.6 * len(configurations)
+    times = np.arange(0.0, end, 1.0 / rate)
+    rows = motion(times)
+    come = []
+    for row, stamp in zip(rows, stamps(times + start).tolist(), strict=True):
+        come.append(of_joints(joint_state(stamp, UR5E.joint_names, row.tolist())))
+        come += [(source, kind, make(stamp, row)) for source, kind, make in sources]
+    take(made, *come)
+    return end
+
+
+def tracker(true=TRUE, seed=3):
+    rng = np.random.default_rng(seed)
+
+    def seen(stamp, row):
+        found = measure(true, row[np.newaxis], rng, *NOISE)
+        return pose(stamp, found.positions[0], found.rotations[0])
+
+    return TRACKER, POSE, seen

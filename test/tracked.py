@@ -1,0 +1,32 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tracks of two joints."""
+
+import numpy as np
+
+from calib_ros.sampling.track import Track
+
+MS = 1_000_000
+MAX_GAP = 0.1
+BOTH = (0, 1)
+
+
+def track(revolute=(True, True), capacity=1000):
+    return Track(revolute, MAX_GAP, capacity)
+
+
+def add(made, columns, stamp_ns, values):
+    made.extend(columns, np.array([stamp_ns]), np.array([values], dtype=float))
+
+
+def filled(samples, columns=BOTH, **options):
+    """Return a track of samples (stamp [ms], values)."""
+    made = track(**options)
+    for ms, values in samples:
+        add(made, columns, round(ms * MS), np.array(values, dtype=float))
+    made.sort()
+    return made
+
+
+def at(made, *ms, **options):
+    return made.at(np.array([round(each * MS) for each in ms], dtype=np.int64), **options)
