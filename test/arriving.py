@@ -85,6 +85,12 @@ def collector(**settings):
     return Collector([True, True], Settings(**settings))
 
 
+def toured(*more, end=9.5, **settings):
+    """Return a collector that hears of joints and poses on a tour, and its samples."""
+    made, motion = collector(**settings), tour()
+    return made, play(made, joint_events(motion, end), pose_events(motion, end), *more)
+
+
 def tour(**settings):
     return stops(STOPS, settings.pop('move', MOVE), settings.pop('stand', STAND))
 

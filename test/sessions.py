@@ -3,6 +3,7 @@
 """Sessions of a UR5e with errors, and samples of it."""
 
 import numpy as np
+from fits import NOISE, SIGMAS
 from streams import (
     POSE,
     TRACKER,
@@ -22,24 +23,14 @@ from calib_ros.settings import Settings
 
 UR5E = load_chain('ur5e')
 TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 
 
 def samples(count=30, seed=5, true=TRUE, start=0, **more):
     rng = np.random.default_rng(seed)
     joints = UR5E.random_joints(count, rng)
     seen = measure(true, joints, rng, *NOISE)
-    return [
-        Sample(
-            start + k + 1,
-            joints[k],
-            position=seen.positions[k],
-            rotation=seen.rotations[k],
-            **more,
-        )
-        for k in range(count)
-    ]
+    rows = enumerate(zip(joints, seen.positions, seen.rotations, strict=True), start + 1)
+    return [Sample(k, q, position=p, rotation=r, **more) for k, (q, p, r) in rows]
 
 
 def session(*given, **settings):
@@ -49,7 +40,12 @@ def session(*given, **settings):
 
 
 def drive(made, configurations, sources, start=0.0, rate=25.0):
-    """Let an arm stand at each configuration while sources (source, type, maker) measure."""
+    """Let an arm stand at each configuration while sources (source, type, maker) measure.
+
+    Configurations may be a number of random ones.
+    """
+    if isinstance(configurations, int):
+        configurations = UR5E.random_joints(configurations, np.random.default_rng(1))
     motion = stops(configurations, 0.8, 0.8)
     end = 1.6 * len(configurations)
     times = np.arange(0.0, end, 1.0 / rate)

@@ -19,13 +19,16 @@ def add(made, columns, stamp_ns, values):
     made.extend(columns, np.array([stamp_ns]), np.array([values], dtype=float))
 
 
-def filled(samples, columns=BOTH, **options):
-    """Return a track of samples (stamp [ms], values)."""
-    made = track(**options)
+def fill(made, samples, columns=BOTH):
+    """Add samples (stamp [ms], values) of one publisher."""
     for ms, values in samples:
-        add(made, columns, round(ms * MS), np.array(values, dtype=float))
+        add(made, columns, round(ms * MS), values)
     made.sort()
     return made
+
+
+def filled(samples, columns=BOTH, **options):
+    return fill(track(**options), samples, columns)
 
 
 def at(made, *ms, **options):

@@ -15,6 +15,7 @@ from arriving import (
     play,
     pose_events,
     tour,
+    toured,
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -60,8 +61,7 @@ def test_what_comes_later_than_lateness_is_counted(mode):
     motion = tour()
     made = collector(mode=mode, lateness=0.5)
     late = [(time + 2.0, *what) for time, *what in pose_events(motion, 7.0)]
-    samples = play(made, joint_events(motion, 9.5), late)
-    assert samples == []
+    assert play(made, joint_events(motion, 9.5), late) == []
     assert made.dropped == {LATE: pytest.approx(350, abs=10)}
     made = collector(mode=mode, lateness=2.5)
     assert len(play(made, joint_events(motion, 9.5), late)) >= 4
@@ -69,9 +69,8 @@ def test_what_comes_later_than_lateness_is_counted(mode):
 
 
 def test_joint_samples_that_come_too_late_are_counted():
-    motion = tour()
     made = collector(lateness=0.5)
-    play(made, joint_events(motion, 9.5))
+    play(made, joint_events(tour(), 9.5))
     play(made, [(0.0, (0, 1), START, np.zeros(2))], finish=False)
     assert made.dropped == {'joints: later than lateness allows': 1}
 
@@ -95,25 +94,18 @@ def test_a_tracker_that_stamps_late_is_set_right_by_the_delay(delay, mode):
 
 
 def test_a_flush_in_the_middle_of_a_stop_samples_it_once():
-    motion = tour()
-    made = collector()
     flushing = [(time, lambda made: made.flush()) for time in (2.6, 2.8, 4.05, 7.0)]
-    samples = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), flushing)
-    assert len(samples) == 5
+    made, samples = toured(flushing)
     assert made.unused[REST] > 10
-    for sample, where in zip(samples, STOPS, strict=True):
-        np.testing.assert_allclose(sample.joints, where, atol=1e-3)
+    np.testing.assert_allclose([each.joints for each in samples], STOPS, atol=1e-3)
 
 
 @pytest.mark.parametrize('mode', ['dwell', 'continuous'])
 @pytest.mark.parametrize('rate', [50.0, 500.0])
 def test_a_bag_in_a_loop_gives_nothing_twice(mode, rate):
-    motion = tour()
-    end = 9.5
-    events = [*joint_events(motion, end, rate), *pose_events(motion, end)]
-    once = collector(mode=mode)
-    expected = play(once, events)
-    made = collector(mode=mode)
+    motion, made = tour(), collector(mode=mode)
+    events = [*joint_events(motion, 9.5, rate), *pose_events(motion, 9.5)]
+    expected = play(collector(mode=mode), events)
     again = [(time + 10.0 * k, *what) for k in range(3) for time, *what in events]
     samples = play(made, again)
     assert made.notes['the clock jumped back'] == 2
@@ -124,8 +116,7 @@ def test_a_bag_in_a_loop_gives_nothing_twice(mode, rate):
 
 
 def test_a_stop_that_was_taken_back_is_sampled_when_it_comes_again():
-    motion = tour()
-    made = collector()
+    motion, made = tour(), collector()
     events = [*joint_events(motion, 9.5), *pose_events(motion, 9.5)]
     samples = play(made, events)
     made.forget(samples[3])
@@ -140,9 +131,8 @@ def test_after_the_clock_jumped_back_new_stops_are_sampled():
     events = [*joint_events(motion, 9.5), *pose_events(motion, 9.5)]
     more = [*joint_events(other, 9.5), *pose_events(other, 9.5, begin=0.007)]
     samples = play(made, events, [(time + 10.0, *what) for time, *what in more])
-    assert len(samples) == 10
-    for sample, where in zip(samples, [*STOPS, *(STOPS[::-1] + 0.1)], strict=True):
-        np.testing.assert_allclose(sample.joints, where, atol=1e-3)
+    where = [*STOPS, *(STOPS[::-1] + 0.1)]
+    np.testing.assert_allclose([each.joints for each in samples], where, atol=1e-3)
 
 
 # Buffers
@@ -150,25 +140,17 @@ def test_after_the_clock_jumped_back_new_stops_are_sampled():
 
 def test_a_small_joint_buffer_costs_only_what_it_cannot_hold():
     """Three seconds of joint samples are enough for stops of one."""
-    motion = tour()
-    made = collector(joint_buffer=300)
-    samples = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5))
-    whole = collector()
-    assert_same(samples, play(whole, joint_events(motion, 9.5), pose_events(motion, 9.5)))
+    assert_same(toured(joint_buffer=300)[1], toured()[1])
 
 
 @pytest.mark.parametrize('capacity', [2, 60])
 def test_a_joint_buffer_that_is_too_small_says_so(capacity):
-    motion = tour()
-    made = collector(joint_buffer=capacity)
-    play(made, joint_events(motion, 4.5), pose_events(motion, 4.5))
+    made, _ = toured(joint_buffer=capacity, end=4.5)
     assert made.notes['joint samples let go, the joint buffer was full'] > 0
 
 
 def test_a_full_pose_buffer_drops_new_measurements_and_counts_them():
-    motion = tour()
-    made = collector(pose_buffer=10)
-    play(made, joint_events(motion, 9.5), pose_events(motion, 9.5))
+    made, _ = toured(pose_buffer=10)
     assert made.dropped['poses: pose buffer full'] > 300
 
 
@@ -203,15 +185,10 @@ def test_targets_without_end_are_dropped_and_counted():
 
 def test_targets_that_gave_no_sample_make_room_for_others():
     """Many markers are seen in every motion; the one that is sampled stays."""
-    motion = tour()
-    made = collector()
-    begins = np.array([1.2, 3.2, 5.2, 7.2])
-    glimpses = [
-        glimpse(100 * leg + k, begins[leg] + 5e-3 * k) for leg in range(4) for k in range(100)
-    ]
-    samples = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5), glimpses)
-    assert len(samples) == 5
-    assert {each.target for each in samples} == {''}
+    legs, few = range(4), range(100)
+    glimpses = [glimpse(100 * leg + k, 1.2 + 2.0 * leg + 5e-3 * k) for leg in legs for k in few]
+    made, samples = toured(glimpses)
+    assert [each.target for each in samples] == [''] * 5
     assert made.dropped == {TOO_MANY: 4 * (100 - (MOST_STREAMS - 1))}
 
 

@@ -17,6 +17,7 @@ from arriving import (
     play,
     pose_events,
     tour,
+    toured,
 )
 from streams import START, stamps, stops, sweep
 
@@ -28,15 +29,10 @@ CALM = 'poses: the arm had just stopped'
 
 
 def test_a_stop_is_one_sample_of_each_stream():
-    motion = tour()
-    made = collector()
-    samples = play(
-        made,
-        joint_events(motion, 9.5),
-        pose_events(motion, 9.5),
-        pose_events(motion, 9.5, 20.0, key=WIRE),
-        pose_events(motion, 9.5, 30.0, key=JUDGE),
+    wire, judge = (
+        pose_events(tour(), 9.5, rate, key=key) for rate, key in ((20.0, WIRE), (30.0, JUDGE))
     )
+    made, samples = toured(wire, judge)
     assert len(samples) == 15
     for k, where in enumerate(STOPS):
         three = samples[3 * k : 3 * k + 3]
@@ -82,17 +78,14 @@ def test_the_covariance_of_a_stop_is_the_mean_of_its_measurements():
 
 @pytest.mark.parametrize(('settle', 'count'), [(0.0, 50), (0.3, 35), (0.7, 15)])
 def test_measuring_begins_after_the_arm_has_settled(settle, count):
-    motion = tour()
-    made = collector(settle=settle)
-    first = play(made, joint_events(motion, 9.5), pose_events(motion, 9.5))[1]
+    made, (_, first, *_) = toured(settle=settle)
     assert first.count == pytest.approx(count, abs=6)
     assert (made.unused[CALM] > 0) == (settle > 0.0)
 
 
 def test_a_stop_that_is_too_short_is_no_sample():
-    motion = tour()
-    made = collector(shortest_stop=1.6)
-    assert play(made, joint_events(motion, 9.5), pose_events(motion, 9.5)) == []
+    made, samples = toured(shortest_stop=1.6)
+    assert samples == []
     assert made.unused['poses: the stop was too short'] > 200
 
 
@@ -190,9 +183,8 @@ def test_in_continuous_mode_samples_come_while_the_arm_moves():
 
 
 def test_in_triggered_mode_nothing_is_taken_unasked():
-    motion = tour()
-    made = collector(mode='triggered')
-    assert play(made, joint_events(motion, 9.5), pose_events(motion, 9.5)) == []
+    made, samples = toured(mode='triggered')
+    assert samples == []
     assert set(made.unused) == {MOVING, 'poses: nobody asked for them'}
 
 
@@ -202,20 +194,10 @@ def ask(times):
 
 
 def test_a_sample_is_taken_when_it_is_asked_for():
-    motion = tour()
-    made = collector(mode='triggered')
     asking, answers = ask([0.8, 4.9])
-    samples = play(
-        made,
-        joint_events(motion, 9.5),
-        pose_events(motion, 9.5),
-        pose_events(motion, 9.5, key=WIRE),
-        asking,
-    )
+    _, samples = toured(pose_events(tour(), 9.5, key=WIRE), asking, mode='triggered')
     assert answers == [(2, ''), (2, '')]
-    assert len(samples) == 4
-    for sample, where in zip(samples, STOPS[[0, 0, 2, 2]], strict=True):
-        np.testing.assert_allclose(sample.joints, where, atol=1e-3)
+    np.testing.assert_allclose([each.joints for each in samples], STOPS[[0, 0, 2, 2]], atol=1e-3)
 
 
 def test_a_capture_that_gives_nothing_says_why():
@@ -224,12 +206,8 @@ def test_a_capture_that_gives_nothing_says_why():
     assert made.capture() == (0, 'no joint states have come')
     play(made, joint_events(motion, 0.5), finish=False)
     assert made.capture() == (0, 'no measurements have come since the last sample')
-    play(
-        made,
-        joint_events(motion, 1.5, begin=0.5),
-        pose_events(motion, 1.5, begin=0.5),
-        finish=False,
-    )
+    events = joint_events(motion, 1.5, begin=0.5), pose_events(motion, 1.5, begin=0.5)
+    play(made, *events, finish=False)
     count, why = made.capture()
     assert count == 0
     assert 'has not stood for 0.2 s' in why
@@ -252,8 +230,7 @@ def test_a_capture_leaves_the_stop_before_its_sample():
     asking, answers = ask([1.25])
     samples = play(made, joint_events(motion, 2.4), pose_events(motion, 2.4), asking)
     assert answers == [(1, '')]
-    for sample, where in zip(samples, STOPS[:3], strict=True):
-        np.testing.assert_allclose(sample.joints, where, atol=1e-3)
+    np.testing.assert_allclose([each.joints for each in samples], STOPS[:3], atol=1e-3)
 
 
 def test_a_capture_that_gives_nothing_leaves_the_stop_its_sample():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tracked import MS, add, filled, track
+from tracked import MS, fill, filled
 
 from calib_ros.sampling.intervals import LAGS
 
@@ -61,11 +61,8 @@ def test_a_stop_begins_when_the_joints_do_not_move_any_longer():
 
 
 def test_all_publishers_must_stand():
-    made = track()
-    for ms in range(0, 1000, 10):
-        add(made, (0,), ms * MS, np.array([max(0.0, 0.3 - 1e-3 * ms)]))
-        add(made, (1,), ms * MS, np.array([max(0.0, 1e-3 * ms - 0.7)]))
-    made.sort()
+    made = filled([(ms, (max(0.0, 0.3 - 1e-3 * ms),)) for ms in range(0, 1000, 10)], (0,))
+    fill(made, [(ms, (max(0.0, 1e-3 * ms - 0.7),)) for ms in range(0, 1000, 10)], (1,))
     ((begin, end),) = made.standing(1e-3, 0.1).tolist()
     assert abs(begin - 300 * MS) <= 20 * MS
     assert abs(end - 700 * MS) <= 20 * MS
@@ -74,18 +71,14 @@ def test_all_publishers_must_stand():
 @pytest.mark.parametrize('times', [[300], [100, 700], range(0, 1000, 250), range(300, 340, 10)])
 def test_a_publisher_that_is_heard_now_and_then_does_not_part_a_stop(times):
     made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
-    for ms in times:
-        add(made, (1,), ms * MS, np.array([0.0]))
-    made.sort()
+    fill(made, [(ms, (0.0,)) for ms in times], (1,))
     assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
 
 
 def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
     """As one that repeats what others published, some time later."""
     made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
-    for ms in range(200, 800, 10):
-        add(made, (1,), ms * MS, np.array([max(0.0, 1e-4 * (ms - 500))]))
-    made.sort()
+    fill(made, [(ms, (max(0.0, 1e-4 * (ms - 500)),)) for ms in range(200, 800, 10)], (1,))
     (begin, first), (second, end) = (np.array(made.standing(5e-4, 0.1)) // MS).tolist()
     assert (begin, end) == (0, 990)
     assert 500 <= first <= 510
@@ -94,10 +87,8 @@ def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
 
 def test_a_joint_that_nobody_shows_to_stand_does_not():
     made = filled([(0, (0.0, 0.0)), (500, (0.0, 0.0))])
-    add(made, (1,), 250 * MS, np.array([0.0]))
-    for ms in range(0, 600, 10):
-        add(made, (0,), ms * MS, np.array([0.0]))
-    made.sort()
+    fill(made, [(250, (0.0,))], (1,))
+    fill(made, [(ms, (0.0,)) for ms in range(0, 600, 10)], (0,))
     assert made.standing(5e-4, 0.1).tolist() == []
 
 
@@ -106,8 +97,7 @@ def test_a_joint_that_stands_at_half_a_turn_stands(rng):
     angles = np.pi + rng.normal(scale=1e-5, size=100)
     angles = (angles + np.pi) % (2.0 * np.pi) - np.pi
     assert np.ptp(angles) > 6.0
-    made = filled([(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)])
-    assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
-    assert filled(
-        [(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)], revolute=(False, True)
-    ).standing(5e-4, 0.1).tolist() != [[0, 990 * MS]]
+    samples = [(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)]
+    for revolute in (True, False):
+        made = filled(samples, revolute=(revolute, True))
+        assert (made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]) is revolute

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import SIGMAS, TRUE, UR5E, drive, samples, session, tracker
+from sessions import TRUE, UR5E, drive, samples, session, tracker
 from streams import (
     POSE,
     RANGE,
@@ -25,7 +25,6 @@ from calib_ros.report.words import verdict
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
-from calib_ros.settings import Settings
 
 # Samples
 
@@ -33,7 +32,7 @@ from calib_ros.settings import Settings
 def test_samples_are_told_of_as_they_are_taken():
     heard = []
     made = CalibrationSession(UR5E, on_sample=heard.append)
-    drive(made, UR5E.random_joints(4, np.random.default_rng(1)), [tracker()])
+    drive(made, 4, [tracker()])
     assert 2 <= len(heard) <= 3
     made.finish()
     assert made.samples == heard
@@ -53,7 +52,7 @@ def test_restored_samples_come_first_and_are_as_good_as_new():
 def test_restored_samples_know_their_frame():
     made = session(samples(frame_id='world'))
     assert made.problem().world_frame == 'world'
-    drive(made, UR5E.random_joints(2, np.random.default_rng(1)), [tracker()])  # in 'tracker'
+    drive(made, 2, [tracker()])  # in 'tracker'
     with pytest.raises(InputError, match=r'different frames \(tracker, world\)'):
         made.problem()
 
@@ -74,11 +73,10 @@ def renamed(tracked, frames):
 @pytest.mark.parametrize('where', [0, 10, 100])
 def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     """Also of the first measurement, which would make a sample of its own."""
-    configurations = UR5E.random_joints(16, np.random.default_rng(1))
     made, expected, removed = CalibrationSession(UR5E), CalibrationSession(UR5E), []
     made.on_removed = removed.append
-    drive(made, configurations, [renamed(tracker(), {where: 'stray'})])
-    drive(expected, configurations, [tracker()])
+    drive(made, 16, [renamed(tracker(), {where: 'stray'})])
+    drive(expected, 16, [tracker()])
     made.finish()
     expected.finish()
     if where:  # the first comes in the time in which the arm has just stopped
@@ -143,7 +141,7 @@ def test_targets_that_were_measured_once_are_left_out():
 
 def test_frames_without_end_are_not_remembered():
     made = session()
-    drive(made, UR5E.random_joints(1, np.random.default_rng(1)), [])
+    drive(made, 1, [])
     for k in range(60):
         message = pose(k + 1, np.zeros(3), np.eye(3))
         message.header.frame_id = f'frame {k}' if k else 'line\nbreak'
@@ -161,8 +159,8 @@ def test_samples_of_another_robot_are_not_restored():
 
 
 def test_clear_forgets_samples_and_counts_but_not_the_calibration():
-    made = CalibrationSession(UR5E, Settings(**SIGMAS))
-    drive(made, UR5E.random_joints(30, np.random.default_rng(1)), [tracker()])
+    made = session()
+    drive(made, 30, [tracker()])
     made.finish()
     result = made.identify()
     assert result.accepted
@@ -187,13 +185,9 @@ def test_devices_and_targets_have_frames_of_their_own():
     def wire(stamp, row):
         return distance(stamp, np.linalg.norm(TRUE.forward(row[np.newaxis])[0, :3, 3]))
 
-    made = CalibrationSession(UR5E, Settings(**SIGMAS))
-    sources = [
-        tracker(),
-        (Source('marker'), TRANSFORM, marker),
-        (Source('wire', device='wire'), RANGE, wire),
-    ]
-    drive(made, UR5E.random_joints(5, rng), sources)
+    made = session()
+    others = (Source('marker'), TRANSFORM, marker), (Source('wire', device='wire'), RANGE, wire)
+    drive(made, 5, [tracker(), *others])
     made.finish()
     sets = made.problem().sets
     # streams of one stop come in the order of their names
@@ -207,24 +201,13 @@ def test_devices_and_targets_have_frames_of_their_own():
 
 def test_the_world_is_the_frame_of_the_base():
     """Of two devices the one whose sample came first, and not the one that was heard first."""
-    source, kind, seen = tracker()
-    other = Source('a', device='A')
-
-    def elsewhere(stamp, row):
-        message = seen(stamp, row)
-        message.header.frame_id = 'other'
-        return message
-
-    made = CalibrationSession(UR5E, Settings(**SIGMAS))
-    two = [(other, kind, elsewhere), (source, kind, seen)]
-    drive(made, UR5E.random_joints(3, np.random.default_rng(1)), two)
-    problem = made.problem()
-    assert [(each.device, each.frame_id) for each in made.samples[:2]] == [
-        ('', 'tracker'),
-        ('A', 'other'),
-    ]
-    assert [each.base for each in problem.sets] == ['base', 'base_A']
-    assert problem.world_frame == 'tracker'
+    made, every = session(), dict.fromkeys(range(1000), 'other')
+    elsewhere = renamed((Source('a', device='A'), *tracker()[1:]), every)
+    drive(made, 3, [elsewhere, tracker()])
+    frames = [(each.device, each.frame_id) for each in made.samples[:2]]
+    assert frames == [('', 'tracker'), ('A', 'other')]
+    assert [each.base for each in made.problem().sets] == ['base', 'base_A']
+    assert made.problem().world_frame == 'tracker'
 
 
 # Judging
@@ -268,7 +251,7 @@ def test_a_bumped_robot_is_noticed():
     made = session(samples())
     made.identify()
     bumped = TRUE.with_offsets({'elbow_joint.theta': 3e-3})
-    drive(made, UR5E.random_joints(8, np.random.default_rng(1)), [tracker(bumped)])
+    drive(made, 8, [tracker(bumped)])
     now, _ = made.validate()
     assert now.rms_mm > 0.5
 
@@ -278,7 +261,7 @@ def test_what_was_there_before_does_not_judge():
     made = session(samples(30))
     made.identify()
     made.remove_last()
-    drive(made, UR5E.random_joints(4, np.random.default_rng(1)), [tracker()])
+    drive(made, 4, [tracker()])
     now, _ = made.validate()
     assert now.count == 4
 
@@ -294,11 +277,6 @@ def test_the_calibration_of_another_robot_is_refused():
 def test_samples_on_a_target_that_the_calibration_does_not_know_are_no_judges():
     made = session(samples())
     made.identify()
-    _, kind, seen = tracker()
-    drive(
-        made,
-        UR5E.random_joints(3, np.random.default_rng(1)),
-        [(Source('x', target='new'), kind, seen)],
-    )
+    drive(made, 3, [(Source('x', target='new'), *tracker()[1:])])
     with pytest.raises(InputError, match='does not know'):
         made.validate()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tracked import BOTH, MAX_GAP, MS, add, at, filled, track
+from tracked import BOTH, MAX_GAP, MS, add, at, fill, filled, track
 
 from calib_ros.sampling.interpolation import MOVED
 from calib_ros.sampling.rows import Rows
@@ -204,11 +204,8 @@ def test_of_equal_stamps_one_sample_is_kept_and_not_by_arrival():
 def test_publishers_of_parts_make_one_arm():
     """Each is interpolated on its own, at its own rate and stamps."""
     made = track((True, True, False))
-    for ms in range(0, 500, 5):
-        add(made, (0, 2), ms * MS, np.array([1e-3 * ms, 1.0 - 1e-3 * ms]))
-    for ms in range(3, 500, 20):
-        add(made, (1,), ms * MS, np.array([-2e-3 * ms]))
-    made.sort()
+    fill(made, [(ms, (1e-3 * ms, 1.0 - 1e-3 * ms)) for ms in range(0, 500, 5)], (0, 2))
+    fill(made, [(ms, (-2e-3 * ms,)) for ms in range(3, 500, 20)], (1,))
     motion = at(made, 77, 201)
     np.testing.assert_allclose(
         motion.joints, [[0.077, -0.154, 0.923], [0.201, -0.402, 0.799]], atol=1e-12
@@ -227,33 +224,23 @@ def test_a_joint_that_nobody_names_is_missing():
 
 
 def test_of_two_publishers_of_a_joint_the_one_that_names_more_counts():
-    made = track()
-    for ms in range(0, 100, 10):
-        add(made, (1,), ms * MS, np.array([9.0]))
-        add(made, BOTH, ms * MS, np.array([1.0, 2.0]))
-    made.sort()
+    made = filled([(ms, (9.0,)) for ms in range(0, 100, 10)], (1,))
+    fill(made, [(ms, (1.0, 2.0)) for ms in range(0, 100, 10)])
     np.testing.assert_allclose(at(made, 55).joints, [[1.0, 2.0]])
 
 
 def test_a_publisher_that_falls_silent_holds_nothing_up_while_others_name_its_joints():
     """As a driver that publishes the gripper's and one joint of the arm once, at the start."""
-    made = track()
-    add(made, (1,), 10 * MS, np.array([0.0]))
-    for ms in range(10, 1000, 10):
-        add(made, BOTH, ms * MS, np.array([0.0, 0.0]))
-    made.sort()
+    made = filled([(10, (0.0,))], (1,))
+    fill(made, [(ms, (0.0, 0.0)) for ms in range(10, 1000, 10)])
     assert made.newest_ns == 990 * MS
     made.release(500 * MS)
     assert made.standing(1e-3, 0.1).tolist() == [[500 * MS, 990 * MS]]
 
 
 def test_a_publisher_that_falls_silent_stops_everything_where_nobody_else_names_its_joints():
-    made = track()
-    for ms in range(0, 1000, 10):
-        add(made, (0,), ms * MS, np.array([0.0]))
-        if ms <= 300:
-            add(made, (1,), ms * MS, np.array([0.0]))
-    made.sort()
+    made = filled([(ms, (0.0,)) for ms in range(0, 1000, 10)], (0,))
+    fill(made, [(ms, (0.0,)) for ms in range(0, 310, 10)], (1,))
     assert made.newest_ns == 300 * MS
     made.release(500 * MS)
     assert made.newest_ns == 300 * MS
