@@ -33,7 +33,7 @@ STATES = 200
 """Of the Markov chain; more change the run length by less than a hundredth (test_chart.py)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drift:
     """What a chart of one robot shows.
 

@@ -110,7 +110,7 @@ def test_an_image_tells_the_pose_of_a_board(seed, on_flange):
 def test_images_that_tell_no_pose_are_left_out():
     _, seen = scene(3, False, 4, noise=0.0, exact=True)
     index, corner = np.divmod(np.arange(len(seen)), len(POINTS))
-    line = (index == 1) & (corner >= 6)
+    line = (index == 1) & (corner // 6 != 1)
     few = (index == 2) & (corner >= 3)
     poses = board_poses(seen.select(~(line | few)), CAMERA.lens)
     first = np.flatnonzero(corner == 0)[[0, 3]]
