@@ -64,7 +64,7 @@ def identification_report(
             'Accuracy before and after',
             (
                 f'"Before" is {words.BEFORE}. Judged by {result.validated_by}. The interval is '
-                'that of the RMS error over poses like these, each configuration counted once.',
+                'that of the RMS error over poses like these, each pose counted once.',
                 'RMS (root mean square) is the usual size of the error. 1 mrad of orientation '
                 'moves the tip of a tool of 1 m by 1 mm.',
                 ISO_9283,
@@ -176,7 +176,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
             'is too small.',
         ),
         figures.against_noise(poses),
-        said=(f'In figures: {words.noise_in_words(result)}.', *words.chance_in_words(result)),
+        said=(words.noise_in_words(result), *words.chance_in_words(result)),
     )
     if result.outliers:
         yield _outliers(poses)
@@ -198,7 +198,7 @@ def _effects(result: Identification) -> Section:
     return Section(
         'effects',
         'Errors beyond geometry',
-        ('RMS position error on configurations left out, with and without each effect.',),
+        ('RMS position error on poses left out, with and without each effect.',),
         head=('effect', 'without [mm]', 'with it [mm]', 'used'),
         rows=tuple(
             (v.what, f'{v.rms_mm_before:.4f}', f'{v.rms_mm_after:.4f}', pays[v.pays])

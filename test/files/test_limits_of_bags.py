@@ -157,9 +157,9 @@ def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, r
 @pytest.mark.parametrize(
     ('cause', 'refused'),
     [
-        ('poses: zero stamp', True),
-        ('poses: later than lateness allows', True),
-        ('poses: same stamp twice', False),
+        ('measurements: zero stamp', True),
+        ('measurements: later than lateness allows', True),
+        ('measurements: same stamp twice', False),
         ('poses: NaN or infinite position', False),
     ],
 )

@@ -20,10 +20,10 @@ WIRE = StreamKey('distance', '', False, True, False)
 NOISE = 5e-5
 STOPS = np.array([[0.0, 0.0], [0.5, -0.4], [1.0, 0.3], [0.2, 0.9], [-0.6, 0.1]])
 MOVE = STAND = 1.0
-LATE = 'poses: later than lateness allows'
-MOVING = 'poses: the arm was moving'
-CALM = 'poses: the arm had just stopped'
-REST = 'poses: of a stop that is sampled already'
+LATE = 'measurements: later than lateness allows'
+MOVING = 'measurements: the arm was moving'
+CALM = 'measurements: the arm had just stopped'
+REST = 'measurements: of a stop that has its pose already'
 
 
 def place(joints):
@@ -172,7 +172,7 @@ def test_a_stop_that_is_too_short_is_no_sample():
     motion = tour()
     made = collector(shortest_stop=1.6)
     assert play(made, joint_events(motion, 9.5), pose_events(motion, 9.5)) == []
-    assert made.unused['poses: the stop was too short'] > 200
+    assert made.unused['measurements: the stop was too short'] > 200
 
 
 def test_of_a_long_stop_only_the_beginning_is_used():
@@ -191,7 +191,7 @@ def test_a_long_stop_is_sampled_while_it_lasts():
     made = collector(longest_stop=2.0)
     events = joint_events(motion, 4.0), pose_events(motion, 4.0)
     assert len(play(made, *events, finish=False)) == 1
-    assert made.state() == 'the arm stands and is sampled: move on'
+    assert made.state() == 'the pose is measured: move on'
 
 
 def test_a_measurement_while_the_arm_vibrates_is_left_out():
@@ -206,7 +206,7 @@ def test_a_measurement_while_the_arm_vibrates_is_left_out():
         events.append((time, POSE, int(stamps(time)), seen))
     samples = play(made, joint_events(motion, 9.5), events)
     assert len(samples) == 5
-    assert made.dropped['poses: still vibrating, or a spike'] > 20
+    assert made.dropped['measurements: still vibrating, or a spike'] > 20
     for sample, where in zip(samples, STOPS, strict=True):
         error = np.abs(sample.position - place(where[np.newaxis])[0]).max()
         assert error < 5.0 * NOISE / np.sqrt(sample.count)
@@ -221,7 +221,7 @@ def test_a_stop_at_which_the_target_moves_is_dropped_and_counted():
     ]
     assert play(made, joint_events(motion, 9.5), events) == []
     assert made.dropped == {
-        'poses: a stop that spreads more than the noise': pytest.approx(270, abs=10)
+        'measurements: a stop that spreads more than the noise': pytest.approx(270, abs=10)
     }
 
 
@@ -272,7 +272,7 @@ def test_in_triggered_mode_nothing_is_taken_unasked():
     motion = tour()
     made = collector(mode='triggered')
     assert play(made, joint_events(motion, 9.5), pose_events(motion, 9.5)) == []
-    assert set(made.unused) == {MOVING, 'poses: nobody asked for them'}
+    assert set(made.unused) == {MOVING, 'measurements: nobody asked for them'}
 
 
 def ask(times):
@@ -302,7 +302,7 @@ def test_a_capture_that_gives_nothing_says_why():
     made = collector(mode='triggered')
     assert made.capture() == (0, 'no joint states have come')
     play(made, joint_events(motion, 0.5), finish=False)
-    assert made.capture() == (0, 'no measurements have come since the last sample')
+    assert made.capture() == (0, 'no measurements have come since the last pose')
     play(
         made,
         joint_events(motion, 1.5, begin=0.5),
@@ -483,21 +483,21 @@ def test_a_joint_buffer_that_is_too_small_says_so(capacity):
     motion = tour()
     made = collector(joint_buffer=capacity)
     play(made, joint_events(motion, 4.5), pose_events(motion, 4.5))
-    assert made.notes['joint samples let go, the joint buffer was full'] > 0
+    assert made.notes['joint states let go, the joint buffer was full'] > 0
 
 
 def test_a_full_pose_buffer_drops_new_measurements_and_counts_them():
     motion = tour()
     made = collector(pose_buffer=10)
     play(made, joint_events(motion, 9.5), pose_events(motion, 9.5))
-    assert made.dropped['poses: pose buffer full'] > 300
+    assert made.dropped['measurements: pose buffer full'] > 300
 
 
 def test_samples_kept_are_bounded():
     motion = sweep(2, np.random.default_rng(2))
     made = collector(mode='continuous', pose_buffer=60, lateness=0.2)
     assert len(play(made, joint_events(motion, 5.0), pose_events(motion, 5.0))) == 60
-    assert made.dropped['poses: the memory for samples is full'] > 150
+    assert made.dropped['measurements: the memory for poses is full'] > 150
 
 
 # Targets without end

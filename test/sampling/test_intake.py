@@ -168,7 +168,7 @@ def test_numbers_that_stand_for_nothing_are_dropped(value, together):
         assert feed(session, part, STORE.deserialize_cdr) == []
     session.finish()
     dropped = session.account().dropped
-    assert dropped['poses: position beyond 1000 km'] == 30
+    assert dropped['measurements: position beyond 1000 km'] == 30
     assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 3
     assert len(session.samples) > 100
 

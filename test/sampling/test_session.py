@@ -138,7 +138,10 @@ def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     made.finish()
     expected.finish()
     if where:  # the first comes in the time in which the arm has just stopped
-        assert made.account().dropped['poses: in frame "stray", not in "tracker" as others'] == 1
+        assert (
+            made.account().dropped['measurements: in frame "stray", not in "tracker" as others']
+            == 1
+        )
     assert 'different frames' not in made.status()
     assert made.identify().accepted
     assert made.problem().world_frame == 'tracker'
@@ -161,7 +164,9 @@ def test_a_sample_in_a_stray_frame_goes_when_the_usual_one_is_known():
     made.problem()
     assert removed == [stray]
     assert stray not in made.samples
-    assert made.account().dropped == {'poses: in frame "stray", not in "tracker" as others': 1}
+    assert made.account().dropped == {
+        'measurements: in frame "stray", not in "tracker" as others': 1
+    }
     assert made.identify().accepted
 
 
@@ -187,9 +192,9 @@ def test_targets_that_were_measured_once_are_left_out():
     ]
     made = session(junk[:150], good, junk[150:])
     assert [len(each) for each in made.problem().sets] == [20]
-    assert '; 20 samples' in made.status()
+    assert '; 20 poses' in made.status()
     assert made.identify().accepted
-    left_out = 'samples left out, in another frame or of a target measured once'
+    left_out = 'poses left out, in another frame or of a target measured once'
     assert made.account().notes[left_out] == 300
     made.restore(samples(1, seed=0, start=1000, target='junk 0'))  # seen again
     assert len(made.problem().sets) == 2
@@ -205,8 +210,8 @@ def test_frames_without_end_are_not_remembered():
         message.header.frame_id = f'frame {k}' if k else 'line\nbreak'
         take(made, (TRACKER, POSE, message))
     dropped = made.account().dropped
-    assert dropped['poses: in a frame whose name cannot be printed'] == 1
-    assert dropped['poses: in one of more than 50 frames'] == 9
+    assert dropped['measurements: in a frame whose name cannot be printed'] == 1
+    assert dropped['measurements: in one of more than 50 frames'] == 9
 
 
 def test_samples_of_another_robot_are_not_restored():
@@ -382,12 +387,12 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
     drive(made, where + 0.1, [tracker()], start=end)
     made.finish()
     assert len(made.samples) == 3
-    assert made.account().unused['poses: the stop was too short'] > 0
+    assert made.account().unused['measurements: the stop was too short'] > 0
 
 
 def test_the_status_tells_how_far_it_is():
     made = session(samples(6))
-    assert made.status().startswith('waiting for joint states; 6 samples, ')
+    assert made.status().startswith('waiting for joint states; 6 poses, ')
     assert 'too few to tell how many it takes' in made.status()
     assert 'more' not in made.status()
     made.restore(samples(60, start=100))
@@ -422,7 +427,7 @@ def test_the_status_names_a_sample_that_does_not_fit():
     made = session(given[:45])
     assert 'does not fit' not in made.status()
     made.samples.append(replace(given[45], position=given[45].position + 0.01))
-    assert 'sample 46 does not fit the others' in made.status()
+    assert 'pose 46 does not fit the others' in made.status()
     made.remove_last()
     assert 'does not fit' not in made.status()
 
@@ -453,11 +458,11 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
 
 def test_the_status_is_never_an_error():
     only_judging = session(samples(10, validation=True))
-    assert '; 0 samples' in only_judging.status()
+    assert '; 0 poses' in only_judging.status()
     (one,) = samples(1)
     same_place = session([replace(one, stamp_ns=k) for k in range(1, 20)])
-    assert '; 19 samples' in same_place.status()
-    assert '; 0 samples' in CalibrationSession(UR5E).status()
+    assert '; 19 poses' in same_place.status()
+    assert '; 0 poses' in CalibrationSession(UR5E).status()
     assert CalibrationSession(UR5E).status('identifying') == (
-        'waiting for joint states; identifying; 0 samples'
+        'waiting for joint states; identifying; 0 poses'
     )
