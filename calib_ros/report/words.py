@@ -290,8 +290,8 @@ def chance_in_words(result: Identification) -> list[str]:
     if result.chance is None:
         return []
     return [
-        f'The chance that the improvement is only drift of the device: {100.0 * result.chance:.1f} '
-        '% (share of time-shifted residuals that are explained just as well).'
+        'The chance that the improvement is only drift of the device is '
+        f'{100.0 * result.chance:.1f} % (share of time-shifted residuals explained just as well).'
     ]
 
 
@@ -314,27 +314,18 @@ def priors_in_words(result: Identification) -> list[str]:
 
 
 def identifiability_in_words(result: Identification) -> list[str]:
-    """Return which parameters trade against which, which are weak, and the indices."""
-    lines = []
-    for name, partners in result.gauges.items():
-        if partners:
-            lines.append(
-                f'{name} cannot be told apart from {", ".join(partners)}: only their combination '
-                f'shows, and {name} keeps its nominal value'
-            )
-        else:
-            lines.append(f'{name}: no measured pose depends on it; it keeps its nominal value')
+    """Return how well the arm is known, which parameters are weak, and the indices."""
+    sigma = sigma_over_range(result)
+    lines = [
+        f'One sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
+        f'(median), {sigma["max"]:.3f} mm at most.',
+        f'Observability: {observability_in_words(result)}.',
+    ]
     weak = weakly_determined(result)
     if weak:
-        lines.append(f'weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}')
-    for first, second, value in result.correlated():
-        lines.append(f'{first} and {second} are correlated by {value:+.3f}')
-    sigma = sigma_over_range(result)
-    lines.append(
-        f'one sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
-        f'(median), {sigma["max"]:.3f} mm at most'
-    )
-    lines.append(f'observability {observability_in_words(result)}')
+        lines.append(
+            f'Weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}.'
+        )
     return lines
 
 
