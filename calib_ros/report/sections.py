@@ -31,13 +31,13 @@ ISO_9283 = (
 LABELS = (
     '',
     'poses',
-    'RMS error [mm]',
-    '95 % interval of it',
+    'RMS [mm]',
+    '95 % interval',
     'mean [mm]',
     'largest [mm]',
     'mean + 3 sigma [mm]',
-    'orientation, RMS [mrad]',
-    'corners, RMS [px]',
+    'RMS [mrad]',
+    'RMS [px]',
 )
 """Rows of the table of accuracy."""
 
@@ -142,7 +142,7 @@ def distribution(poses: Poses) -> Section:
         'How many poses are within an error',
         ('Outliers are left out. The further left a curve, the better.',),
         figures.cumulated(before, after),
-        height=340,
+        height=400,
     )
 
 

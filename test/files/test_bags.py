@@ -264,12 +264,12 @@ SKEW[0, 1] = 0.5
 ZERO = np.diag([1, 1, 1, 1, 1, 0])
 BAD_POSES = [
     (pose_stamped(0), 'measurements: zero stamp'),
-    (pose_stamped(105 * MS, (np.nan, 0, 0)), 'poses: NaN or infinite position'),
-    (pose_stamped(115 * MS, (0, 0, np.inf)), 'poses: NaN or infinite position'),
+    (pose_stamped(105 * MS, (np.nan, 0, 0)), 'measurements: NaN or infinite position'),
+    (pose_stamped(115 * MS, (0, 0, np.inf)), 'measurements: NaN or infinite position'),
     (pose_stamped(125 * MS, quat=(0, 0, 0, 0)), 'measurements: quaternion not of length 1'),
     (pose_stamped(135 * MS, quat=(0, 0, 0, 1.01)), 'measurements: quaternion not of length 1'),
     (pose_stamped(145 * MS, quat=(0, 0, np.nan, 1)), 'measurements: quaternion not of length 1'),
-    (point_stamped(155 * MS, (0, -np.inf, 0)), 'poses: NaN or infinite position'),
+    (point_stamped(155 * MS, (0, -np.inf, 0)), 'measurements: NaN or infinite position'),
     (transform_stamped(0), 'measurements: zero stamp'),
     (
         transform_stamped(165 * MS, child='a\nb'),

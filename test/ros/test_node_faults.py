@@ -237,7 +237,7 @@ def test_broken_messages_are_counted_by_cause(cell, recording):
         'joints: NaN or infinite joint value': 1,
         'joints: names and positions differ in number': 1,
         'joints: zero stamp': 1,
-        'poses: NaN or infinite position': 1,
+        'measurements: NaN or infinite position': 1,
         'measurements: quaternion not of length 1': 2,
     }
 

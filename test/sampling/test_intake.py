@@ -204,4 +204,4 @@ def test_an_error_in_a_batch_costs_no_other_message():
     session = CalibrationSession(ARM, on_sample=fail)
     (problem,) = feed(session, messages, STORE.deserialize_cdr)
     assert 'no room for a sample' in problem
-    assert session.received == {'joints': 2000, 'poses': 2000}
+    assert session.received == {'joints': 2000, 'measurements': 2000}
