@@ -20,18 +20,17 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
-RANK_TOLERANCE = 1e-8
-"""A column is dependent when less than this share of it is left after the columns before it."""
 FRAME_TOLERANCE = 1e-3
-"""The same for base and tool frames. Orientations that vary by a milliradian vary by no more than
-an arm's own errors: a tool that follows from them would be anywhere, kilometres away as well."""
+"""Least share of the column of a base or tool frame that is left after those before it.
+Orientations that vary by a milliradian vary by no more than an arm's own errors: a tool that
+follows from them would be anywhere, kilometres away as well."""
 
 
 def independent(
-    factor: FloatArray, names: Sequence[str], frame_tolerance: float = RANK_TOLERANCE
+    factor: FloatArray, names: Sequence[str], frame_tolerance: float = HALF_THE_DIGITS
 ) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
@@ -45,11 +44,11 @@ def independent(
     names : sequence of str
         Parameters, the most wanted first.
     frame_tolerance : float
-        Least share of a frame's column; of other columns RANK_TOLERANCE.
+        Least share of a frame's column; of other columns HALF_THE_DIGITS.
 
     """
     least = np.where(
-        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
+        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, HALF_THE_DIGITS
     ) * np.linalg.norm(factor, axis=0)
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
         return tuple(names)  # the diagonal is what is left of each

@@ -6,13 +6,15 @@ from __future__ import annotations
 
 from scipy import special
 
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS
+
 CONFIDENT = 0.95
 """Of intervals, and of gains: one in twenty is allowed to be chance."""
 CERTAIN = 0.99
 """Of what is held against a result, and where several tests are made."""
 SURE = 0.999
 """Of what changes the model or the noise: hundreds of tests are made in the life of a cell."""
-KNOWN = 1e9
+KNOWN = 1.0 / HALF_THE_DIGITS
 """Degrees of freedom that are as good as infinite."""
 
 

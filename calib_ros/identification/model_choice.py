@@ -24,7 +24,6 @@ from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
-from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN, SURE
@@ -34,7 +33,7 @@ from calib_ros.identification.validation import log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
 LEAST_GAIN = 0.005
 """Least decrease of the RMS error that is worth a group or a harmonic."""
@@ -181,7 +180,7 @@ class _Linear:
             rest = column - basis @ (basis.T @ column)
             rest -= basis @ (basis.T @ rest)
             size = float(np.linalg.norm(rest))
-            if size > 1e3 * RANK_TOLERANCE * float(np.linalg.norm(column)) and size > 0.0:
+            if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)) and size > 0.0:
                 basis = np.column_stack([basis, rest / size])
                 kept.append(name)
         return kept

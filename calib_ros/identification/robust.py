@@ -49,8 +49,6 @@ SUSPICIOUS = 1.2
 configuration share, may hide in them."""
 SHRUNK = 0.5
 """Ratio of half of the residuals from which a fit is another one, not a detail of the first."""
-NOISE_FREE = 1e-6
-"""Least scale [sigma]: below, residuals are rounding errors and no outliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +187,7 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
             known = ~np.isnan(length)
             if known.any():
                 scale = np.median(length[known]) / _median_length(part.shape[1])
-                size = np.where(known, length, 0.0) / max(scale, NOISE_FREE)
+                size = np.where(known, length, 0.0) / max(scale, STEP_TOLERANCE)  # else rounding
                 largest = np.maximum(largest, size[row])
         found.append(largest)
     return tuple(found)

@@ -36,6 +36,7 @@ from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import CERTAIN
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
@@ -44,7 +45,7 @@ NEAREST = 3
 MOST_STOPS = 400
 """Stops on which sizes are estimated; of more, every so many runs of a
 twentieth."""
-APART = 1e9
+APART = 4.0 * LARGEST
 """Distance of the stops of different sets, which are no neighbours."""
 
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from calib_ros.identification.leastsquares import ROUNDS, System, minimise
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
 STARTS = 500
 CONCENTRATIONS = 4
@@ -36,8 +36,6 @@ SEARCHED = 300
 follows takes all."""
 DRAWN = 0.5
 """Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
-RIDGE = np.sqrt(np.finfo(float).eps)
-"""Weight that keeps what a start leaves open where it is, against that of all samples."""
 
 
 def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
@@ -145,7 +143,7 @@ class _Linear:
         self._columns, extra = np.ascontiguousarray(columns * scale), extra * scale
         self._matrices = np.einsum('ncp,ncq->npq', self._columns, self._columns, optimize=True)
         self._gradients = np.einsum('ncp,nc->np', self._columns, self._residual)
-        self._matrix = extra.T @ extra + RIDGE * np.eye(len(names))
+        self._matrix = extra.T @ extra + HALF_THE_DIGITS * np.eye(len(names))
         self._gradient = extra.T @ offset
 
     def squares(self, masks: NDArray[np.bool_]) -> FloatArray:

@@ -35,9 +35,9 @@ from calib_ros.kinematics.chain import (
     Joint,
     JointType,
 )
-from calib_ros.kinematics.inverse import TOLERANCE
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
+from calib_ros.values import SAME
 
 DIGITS = 14
 """Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
@@ -158,7 +158,7 @@ def corrected_urdf(
     edited = with_origins(text, origins)
     found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
     q = arm.random_joints(1000, np.random.default_rng(0))
-    if np.abs(found.forward(q) - arm.forward(q)).max() > TOLERANCE:
+    if np.abs(found.forward(q) - arm.forward(q)).max() > SAME:
         raise ConfigError(
             f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '
             'that: let the tool frame be fitted instead, or add a fixed joint and a link'

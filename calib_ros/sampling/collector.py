@@ -199,7 +199,7 @@ class Collector:
         if not len(stands) or stands[-1, 1] < newest:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
-            return 'the pose is measured: move on'
+            return 'the arm stands and its pose is measured: move on'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:

@@ -31,10 +31,16 @@ from scipy import linalg
 from calib_ros.errors import CalibrationError
 from calib_ros.identification.configurations import configurations
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import Prior, System, normal_equations
+from calib_ros.identification.leastsquares import (
+    SMALL_STEP,
+    STEP_TOLERANCE,
+    Prior,
+    System,
+    normal_equations,
+)
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.robust import robust_fit, thorough_fit
+from calib_ros.identification.robust import OUTER, robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics.chain import Chain
@@ -45,8 +51,6 @@ from calib_ros.sampling.sample import Frames, Sample, collect
 
 WIDE = (0.01, 0.02)
 """Standard deviations [m, rad] of arm parameters before anything is measured."""
-FAR = 1e-3
-"""Step [m or rad] from which the linear model is made anew."""
 MOST_STEPS = 5
 START = 6
 """Configurations with which the frames can be found."""
@@ -58,10 +62,6 @@ GROWN = 1.2
 """Growth of the number of samples from which all of them are judged anew."""
 MOST_AT_ONCE = 4 * MOST_ANEW
 """Samples that one update adds at most; the rest waits for the next ones."""
-FAR_OFF = 7.0
-"""Distance [standard deviations] from which a sample is left out as suspicious."""
-LEAST_NOISE = 1e-3
-"""Smallest noise [sigma given] that residuals are taken to show."""
 LOOK = 100
 """Configurations at which the arm is to be accurate."""
 LITTLE = 0.35
@@ -182,7 +182,7 @@ class LiveEstimate:
     def _settle(self) -> None:
         """Move the point of linearisation to the estimate while that is far from it."""
         for _ in range(MOST_STEPS):
-            if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
+            if np.abs(self._step()).max() < SMALL_STEP or len(self._added) > MOST_ANEW:
                 break
             self._linearise(self._estimate())
 
@@ -248,7 +248,7 @@ class LiveEstimate:
             spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
             spread += np.eye(left.shape[1]) * noise * self._sigmas[0] ** 2
             size = (left * np.linalg.solve(spread, left[..., np.newaxis])[..., 0]).sum(axis=1)
-            for sample, far in zip(members, (size > FAR_OFF**2).tolist(), strict=True):
+            for sample, far in zip(members, (size > OUTER**2).tolist(), strict=True):
                 (self.suspicious if far else good).append(sample)
         return good
 
@@ -270,7 +270,7 @@ class LiveEstimate:
         """Return the covariance by the noise that the residuals show, and its variance."""
         left = max(self._cost - float(self._step() @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
-        noise = max(left / freedom, LEAST_NOISE**2) if freedom > 0 else 1.0
+        noise = max(left / freedom, STEP_TOLERANCE**2) if freedom > 0 else 1.0
         scale, matrix = self._scaled()
         return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
 

@@ -24,8 +24,9 @@ from calib_ros.sampling.sources import (
     parse_sources,
     short_type,
 )
-from calib_ros.sampling.transforms import SAME, STATIC, Links
+from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
+from calib_ros.values import SAME
 
 Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 """Returns the messages of a recording on some topics."""

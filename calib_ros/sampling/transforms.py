@@ -25,6 +25,7 @@ from calib_ros.sampling.messages import TRANSFORMS, Readings
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import Source, short_type
 from calib_ros.settings import Settings
+from calib_ros.values import SAME
 
 Pair: TypeAlias = tuple[str, str]
 """Names of the parent and the child frame of a link."""
@@ -33,8 +34,6 @@ STATIC = '_static'
 """What the name of the topic of links that stand still ends with."""
 HELD = Settings.pose_buffer
 """Transforms that wait for the frames between which they are."""
-SAME = 1e-9
-"""Numbers [m, rad] that differ by less are the same."""
 LISTED = 20
 """Links that are named when none of them was chosen."""
 

@@ -64,7 +64,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
             found = diagnostics[-1].status[0]
             assert found.level == DiagnosticStatus.ERROR
             assert f'{what} is broken' in found.message
-            assert (what != 'the status') == ('samples' in found.message)
+            assert (what != 'the status') == ('poses' in found.message)
             assert (what in ('the account', 'the figures')) == (not found.values)
             if what not in ('taking messages', 'the status'):
                 heard = len(status)
@@ -75,7 +75,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
         found = diagnostics[-1].status[0]
         assert found.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
         assert 'failed' not in found.message
-        assert 'samples' in found.message
+        assert 'poses' in found.message
         assert int(values_of(diagnostics[-1])['poses']) >= 8
 
 
