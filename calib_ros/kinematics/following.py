@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import ITERATIONS, LEVER, Aim, limits, solve_positive
+from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, transform
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, transform
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.shown import Shown
 
@@ -207,7 +207,7 @@ class Follower:
         x, caution, still = task.start, np.zeros(active.size), np.zeros(active.size, dtype=bool)
         error, columns = self._linearise(task, x, weight)
         iterations = 0
-        while iterations < ITERATIONS:
+        while iterations < ROUNDS:
             iterations += 1
             normal = np.einsum('ikb,jkb->ijb', columns, columns) + stiffness
             normal[self._diagonal] *= 1.0 + caution

@@ -8,11 +8,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cameras import Camera, before_camera, photograph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from measured import rows_of, write_csv
 
-from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.identification import Problem, identify

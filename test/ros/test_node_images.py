@@ -9,13 +9,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cameras import Camera, before_camera, photograph
 from ros_cell import START, Cell, header, joint_messages, stamp_ns
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from calib_ros.apply.simulation import Camera, before_camera, drive, faulty, photograph
 from calib_ros.apply.simulation import Cell as SimulatedCell
+from calib_ros.apply.simulation import drive, faulty
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
 from calib_ros.files.cameras import cameras_of, lens_in
