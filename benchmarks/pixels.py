@@ -20,12 +20,10 @@ from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-sys.path[:0] = [str(Path(__file__).resolve().parents[1] / 'test')]
 
 import numpy as np
-from cameras import Camera, before_camera, photograph
 
-from calib_ros.apply.simulation import Cell, faulty
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
 from calib_ros.errors import InputError
 from calib_ros.identification import identifiability
 from calib_ros.identification.identification import Problem, identify
@@ -105,6 +103,7 @@ def one_run(nominal, seed, on_flange, lens, images):
 
 def rendered_run(nominal, seed, images):
     """Return hits (P,), the RMS of residuals [px] and the error [mm] by rendered images."""
+    sys.path[:0] = [str(Path(__file__).resolve().parents[1] / 'test')]
     from photographs import rendered
 
     from calib_ros.files.boards import Board, observed

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
+from calib_ros.identification.identifiability import DEGENERATE
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
-
-FLAT = 1e-3
-"""Extent of points, of their largest one, up to which they are flat, or in line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +102,7 @@ def resect(observations: Observations, lens: Lens) -> BoardPoses:
     index = observations.images
     centre = observations.points.mean(axis=0)
     _, size, axes = np.linalg.svd(observations.points - centre, full_matrices=False)
-    if size[2] > FLAT * size[0]:
+    if size[2] > DEGENERATE * size[0]:
         raise InputError(
             'the points of a board must be in a plane: give each face of a body as a board of '
             'its own'
@@ -139,7 +137,7 @@ def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray
     outer = np.einsum('ni,nj->nij', rest, rest).reshape(-1, 9)
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins).reshape(-1, 3, 3))
-    return np.asarray((count >= 4) & (spread[:, 1] > FLAT**2 * spread[:, 2]))
+    return np.asarray((count >= 4) & (spread[:, 1] > DEGENERATE**2 * spread[:, 2]))
 
 
 def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:

@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
+from calib_ros.identification.identifiability import DEGENERATE, excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
@@ -301,5 +301,5 @@ def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
     if free:
         turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
     left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
-    known = sizes > FRAME_TOLERANCE * np.sqrt(len(turned))
+    known = sizes > DEGENERATE * np.sqrt(len(turned))
     return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))

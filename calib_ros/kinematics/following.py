@@ -193,7 +193,8 @@ class Follower:
 
         A step that raises the cost is not taken, and tried again with more damping, from a
         thousandth of the diagonal on (Marquardt 1963). Samples settle for a cost that does not
-        fall any more if told so; else they are given up when x is longer than 1.
+        fall any more if told so; else they are given up when x is longer than 1. `inverse.solve`
+        has neither D nor such an end, and stays within the limits instead.
 
         Returns
         -------

@@ -8,10 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cameras import Camera, before_camera, photograph
 from measured import rows_of, write_csv
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.identification import Problem, identify
@@ -111,7 +110,7 @@ def test_an_image_tells_the_pose_of_a_board(seed, on_flange):
 def test_images_that_tell_no_pose_are_left_out():
     _, seen = scene(3, False, 4, noise=0.0, exact=True)
     index, corner = np.divmod(np.arange(len(seen)), len(POINTS))
-    line = (index == 1) & (corner >= 6)
+    line = (index == 1) & (corner // 6 != 1)
     few = (index == 2) & (corner >= 3)
     poses = board_poses(seen.select(~(line | few)), CAMERA.lens)
     first = np.flatnonzero(corner == 0)[[0, 3]]
