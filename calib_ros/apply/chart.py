@@ -33,7 +33,7 @@ YEARS = 100.0
 """Time between false alarms of a robot, of one night each day, if nothing else is said."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drift:
     """What a chart of one robot shows.
 

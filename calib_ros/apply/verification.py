@@ -177,7 +177,7 @@ def verify(
     Raises
     ------
     InputError
-        For too few configurations, distances, a device or target that the calibration does not
+        For too few poses, distances, a device or target that the calibration does not
         know, or measurements far from all that was commanded.
 
     """
@@ -221,7 +221,7 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     count = len(moments)
     if count - lost < least:
         raise InputError(
-            f'{count} configurations were measured, at least {least + lost} are needed: five are '
+            f'{count} poses were measured, at least {least + lost} are needed: five are '
             'usual (calib_ros plan --iso9283)'
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
@@ -323,8 +323,7 @@ def in_words(found: Verification) -> str:
     before, after = found.comparison.figures
     share = 100.0 * found.confidence
     lines = [
-        f'position error [mm] of {after.count} measurements in {found.configurations} '
-        'configurations',
+        f'position error [mm] of {after.count} measurements at {found.configurations} poses',
         '              RMS     mean      max   mean + 3 sigma',
     ]
     for label, figures in (('before', before), ('after', after)):
@@ -344,7 +343,7 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the configurations [mm], of which there may be none."""
+    """Return the lines of a table of the poses [mm], of which there may be none."""
     lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
         again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
@@ -365,7 +364,7 @@ def remarks(found: Verification) -> list[str]:
         )
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
-        lines.append(f'{enough} configurations with the same RMS error would decide')
+        lines.append(f'{enough} poses with the same RMS error would decide')
     if found.tolerance is None and found.holds is False:
         lines.append(
             'the calibration does not hold any more: the error is larger than it was then. Was '

@@ -31,6 +31,7 @@ from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import BATCH, Deserialise, Stream, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.topics import Reading, check_joints, choose
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class Replayed:
             return (Reason(Rule.UNKNOWN_LOSS, text),)
         share = _share(self.recorded, self.read)
         lost = {'of the messages could not be read': (Rule.UNREADABLE, share)}
-        for name, all_of_them in (('joints', account.joint_states), ('poses', account.poses)):
+        for name, all_of_them in ((JOINTS, account.joint_states), (POSES, account.poses)):
             dropped = sum(
                 count
                 for cause, count in account.dropped.items()

@@ -53,7 +53,7 @@ def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
     failed = [*_of_the_fit(problem, found)]
     validation = found.validation
     if validation is None:
-        text = 'too few configurations to leave some out of the fit and test the result on them'
+        text = 'too few poses to leave some out of the fit and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
@@ -115,9 +115,9 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'the gain may be that of a drift, as of the tracker: moved in time against the joint '
-            f'values, residuals are explained as well in {100.0 * found.chance:.0f} % of the '
-            'shifts; measure the poses in random order, further apart, or more of them',
+            'the improvement may only be drift of the measuring device: time-shifted residuals '
+            f'are explained just as well in {100.0 * found.chance:.0f} % of cases; measure the '
+            'poses in random order, further apart, or more of them',
         )
     elif found.region is None:
         yield Reason(
@@ -144,7 +144,7 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
     if found.may_be_rounding:
         yield Reason(
             Rule.ROUNDING,
-            'the gain may be that of rounded joint values, which are alike in many poses: record '
+            'the improvement may only come from rounded joint values, alike in many poses: record '
             'them with more digits',
         )
     before, after = validation.figures

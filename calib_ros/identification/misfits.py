@@ -43,14 +43,14 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
     left = np.ptp(kept, axis=0) if len(kept) else np.zeros(len(names))
     for name, part, all_of_it in zip(names, left, whole, strict=True):
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
-            return f'{name} moves only in samples that were taken for gross errors: {ADVICE}'
+            return f'{name} moves only in poses that were taken for gross errors: {ADVICE}'
     shared, by_chance = _shared(problem, robust)
     if shared > 1 and by_chance < 1.0 - CERTAIN:
         return f'at {shared} stops all targets were taken for gross errors: {ADVICE}'
     order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
     joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
     if by_chance < 1.0 - SURE:
-        return f'samples that were taken for gross errors go with the values of {joint}: {ADVICE}'
+        return f'poses that were taken for gross errors go with the values of {joint}: {ADVICE}'
     return None
 
 

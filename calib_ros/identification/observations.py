@@ -238,12 +238,12 @@ class Observations(Shown):
         """Return the same pairs with other stamps (N,)."""
         return replace(self, stamps_ns=stamps_ns)
 
-    def earlier(self, delay: float) -> Observations:
+    def earlier(self, delay: float | None) -> Observations:
         """Return the same measurements with the joint values of a delay [s] before the stamps.
 
         By velocity and acceleration; without them the arm stood and nothing changes.
         """
-        if self.velocity is None:
+        if self.velocity is None or delay is None:
             return self
         more = np.full((len(self), 1), delay)
         if self.delay is not None:

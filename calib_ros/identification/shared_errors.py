@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that neighbouring configurations share.
+"""Errors that neighbouring poses share.
 
 A tracker drifts, and what a model lacks changes slowly over the joint space, so neighbours err
 alike and tell less than their number. Configurations are neighbours in succession or near each

@@ -98,7 +98,7 @@ class Step:
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         if self.stamp_ns < ROWS_NS and self.stamp_ns % 10**9 == 0:
             when = f'line {self.stamp_ns // 10**9}, without stamps the order of the rows is taken'
-        text = f'something moved at sample {self.sample + 1}'
+        text = f'something moved at pose {self.sample + 1}'
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':

@@ -164,7 +164,7 @@ class Collector:
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the joint states, of so many measurements."""
         needed = self.rests.needed(self.settings.still)
-        between = self.dropped[f'poses: {APART}']
+        between = self.dropped[f'measurements: {APART}']
         found = [
             None if needed is None else restless(needed, self.settings.still),
             sparse(between, measurements, self.settings.max_gap),
@@ -199,7 +199,7 @@ class Collector:
         if not len(stands) or stands[-1, 1] < newest:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
-            return 'the arm stands and is sampled: move on'
+            return 'the arm stands and its pose is measured: move on'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:
@@ -215,7 +215,7 @@ class Collector:
         if not newest:
             return 0, 'no joint states have come'
         if not (self.waiting.count or place):
-            return 0, 'no measurements have come since the last sample'
+            return 0, 'no measurements have come since the last pose'
         shortest = round(self.settings.shortest_stop * 1e9)
         if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
             return 0, (
@@ -272,7 +272,7 @@ class Collector:
         for rows in self.waiting.values():
             twice = rows.sort()
             if twice:
-                self.dropped['poses: same stamp twice'] += twice
+                self.dropped['measurements: same stamp twice'] += twice
 
     def _take_each(self, until: int, rounds: Sequence[int]) -> None:
         """Make a sample of every measurement up to a stamp of the joints, round by round."""
@@ -334,10 +334,10 @@ class Collector:
                 cause = self.track.causes(stamps[~inside])
                 self._count_causes(cause)
                 for k, count in Counter(numbers[~inside][cause == 0].tolist()).items():
-                    self.unused[f'poses: {plan.why[k]}'] += count
+                    self.unused[f'measurements: {plan.why[k]}'] += count
             early = inside & (stamps < calm[numbers])
             if early.any():
-                self.unused['poses: the arm had just stopped'] += int(early.sum())
+                self.unused['measurements: the arm had just stopped'] += int(early.sum())
             good = np.flatnonzero(inside & ~early)
             if len(good):
                 motion = self.track.at(stamps[good], standing=True)
@@ -346,7 +346,7 @@ class Collector:
             if len(good):
                 more = len(good) - len(np.unique(numbers[good]))
                 if key.images and more:
-                    self.unused['poses: of a stop of which one image is used'] += more
+                    self.unused['measurements: of a stop of which one image is used'] += more
                 numbers, stamps, values = numbers[good], rows.stamps[good], rows.values[good]
                 matched = Matched(key, numbers, stamps, values, motion, self.delay_ns)
                 found += self.maker.of_stops(matched, self.settings.sigma_position)
@@ -362,13 +362,13 @@ class Collector:
         for k, text in enumerate(CAUSES[1:], start=1):
             count = int((cause == k).sum())
             if count:
-                self.dropped[f'poses: {text}'] += count
+                self.dropped[f'measurements: {text}'] += count
 
     def _make_room(self) -> None:
         """Let go the older half of the samples of some joints; nothing may be held any longer."""
         self._round(self._complete_ns)
         if self.track.full:
-            self.notes['joint samples let go, the joint buffer was full'] += self.track.halve()
+            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
 
     def start_anew(self) -> None:
         """Go on after the clock jumped back: finish what came before, keep the samples."""

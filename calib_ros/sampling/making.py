@@ -27,8 +27,8 @@ QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
 ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]
 """A sample with the number of the round or the stop in which it was taken."""
-VIBRATING = 'poses: still vibrating, or a spike'
-RESTLESS = 'poses: a stop that spreads more than the noise'
+VIBRATING = 'measurements: still vibrating, or a spike'
+RESTLESS = 'measurements: a stop that spreads more than the noise'
 
 
 class Matched(NamedTuple):
@@ -173,10 +173,10 @@ class Maker:
         """Yield a sample of measurements (N, ROW_WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
-            self.dropped['poses: a sample with this stamp is there already'] += len(rows)
+            self.dropped['measurements: a pose with this stamp is there already'] += len(rows)
             return
         if len(known) >= self._capacity:
-            self.dropped['poses: the memory for samples is full'] += len(rows)
+            self.dropped['measurements: the memory for poses is full'] += len(rows)
             return
         known.add(stamp_ns)
         covariance = None

@@ -22,8 +22,8 @@ from calib_ros.sampling.intervals import intersection, standing, unheard, union
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
-APART = 'joint samples too far apart'
-CAUSES = ('', 'no joint sample before', 'no joint sample after', APART)
+APART = 'joint states too far apart'
+CAUSES = ('', 'no joint state before', 'no joint state after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
 
 

@@ -62,10 +62,10 @@ def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
     cell.spin_until(lambda: early)
     assert list(early[0].name) == list(UR.joint_names)
     assert np.isfinite(early[0].position).all()
-    cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'False')
+    cell.spin_until(lambda: values_of(diagnostics[-1])['enough poses'] == 'False')
     rest = topics(recording)
     cell.play({k: v[len(part(recording, 3)[k]) :] for k, v in rest.items()})
-    cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'True')
+    cell.spin_until(lambda: values_of(diagnostics[-1])['enough poses'] == 'True')
     assert float(values_of(diagnostics[-1])['expected [mm]']) < 0.1
     cell.spin_until(lambda: len({tuple(message.position) for message in early}) > 1)
     late = cell.listen(JointState, f'{NODE}/next_pose')
@@ -200,7 +200,7 @@ def test_a_trajectory_is_corrected(calibrated, corrected, truth):
     q, velocities, accelerations, times = path()
     message = trajectory(q, velocities, accelerations, times)
     said = send(calibrated, message)
-    assert said.startswith('50 of 50 samples corrected')
+    assert said.startswith('50 of 50 points corrected')
     assert 'sigma of the calibration at these poses: 0.0' in said
     assert 'does not know the orientation' not in said
     calibrated.spin_until(lambda: corrected)
