@@ -200,7 +200,7 @@ def test_a_trajectory_is_corrected(calibrated, corrected, truth):
     q, velocities, accelerations, times = path()
     message = trajectory(q, velocities, accelerations, times)
     said = send(calibrated, message)
-    assert said.startswith('50 of 50 samples corrected')
+    assert said.startswith('50 of 50 points corrected')
     assert 'sigma of the calibration at these poses: 0.0' in said
     assert 'does not know the orientation' not in said
     calibrated.spin_until(lambda: corrected)
