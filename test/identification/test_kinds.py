@@ -32,6 +32,14 @@ def between(chain, count, rng, base='base', tool='tool', noise=(0.0, 0.0), orien
     return replace(seen, base=base, tool=tool)
 
 
+def framed(rng, **reach):
+    """Return an arm with errors and more frames, each anywhere within its reach [m]."""
+    true = faulty(UR10E, Cell(), rng)
+    for name, size in reach.items():
+        true = true.with_frame(name, random_frame(rng, size))
+    return true
+
+
 def worst(found, unseen):
     """Return the largest error of position or distance [m], and of orientation [rad]."""
     left = residuals(found, unseen)
@@ -132,9 +140,7 @@ def test_distances_of_gross_error_are_named_and_do_no_harm(count, share, errors)
 
 def test_distances_and_poses_in_one_problem(rng):
     """The wire leaves from somewhere else than the tracker's origin, to another point."""
-    true = faulty(UR10E, Cell(), rng)
-    true = true.with_frame('base_wire', random_frame(rng, 2.0))
-    true = true.with_frame('tool_hook', random_frame(rng, 0.2))
+    true = framed(rng, base_wire=2.0, tool_hook=0.2)
     poses = between(true, 40, rng)
     lengths = wire(true, 60, rng, 'base_wire', 'tool_hook')
     result = identify(Problem(UR10E, poses, more=(lengths,)))
@@ -152,8 +158,7 @@ def test_distances_sharpen_what_few_poses_leave_open():
     errors = []
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        true = true.with_frame('base_wire', random_frame(rng, 2.0))
+        true = framed(rng, base_wire=2.0)
         poses = between(true, 12, rng, noise=NOISE)
         lengths = wire(true, 200, rng, 'base_wire', noise=NOISE[0])
         q = UR10E.random_joints(300, rng)
@@ -168,31 +173,18 @@ def test_distances_sharpen_what_few_poses_leave_open():
 
 @pytest.mark.parametrize('oriented', [True, False])
 def test_several_targets_on_one_flange(oriented, rng):
-    true = faulty(UR10E, Cell(), rng)
-    for name in ('tool_2', 'tool_3'):
-        true = true.with_frame(name, random_frame(rng, 0.3))
-    sets = [
-        between(true, 30, rng, tool=tool, oriented=oriented)
-        for tool in ('tool', 'tool_2', 'tool_3')
-    ]
+    true, tools = framed(rng, tool_2=0.3, tool_3=0.3), ('tool', 'tool_2', 'tool_3')
+    sets = [between(true, 30, rng, tool=each, oriented=oriented) for each in tools]
     result = identify(Problem(UR10E, sets[0], more=sets[1:]))
     assert result.rank == (30 + 2 * 6 if oriented else 27 + 2 * 3)
     assert not result.not_excited
-    assert_exact(
-        result.chain,
-        *(
-            between(true, 100, rng, tool=tool, oriented=oriented)
-            for tool in ('tool', 'tool_2', 'tool_3')
-        ),
-    )
+    unseen = [between(true, 100, rng, tool=each, oriented=oriented) for each in tools]
+    assert_exact(result.chain, *unseen)
 
 
 def test_three_points_on_one_flange_make_a_pose(rng):
     """Positions of several targets tell as much of the arm as full poses do."""
-    true = faulty(UR10E, Cell(), rng)
-    for name in ('tool_2', 'tool_3'):
-        true = true.with_frame(name, random_frame(rng, 0.3))
-    tools = ('tool', 'tool_2', 'tool_3')
+    true, tools = framed(rng, tool_2=0.3, tool_3=0.3), ('tool', 'tool_2', 'tool_3')
     sets = [between(true, 40, rng, tool=tool, oriented=False) for tool in tools]
     result = identify(Problem(UR10E, sets[0], more=sets[1:]))
     fitted = {name for name in result.names if not name.startswith(('base', 'tool'))}
@@ -202,7 +194,7 @@ def test_three_points_on_one_flange_make_a_pose(rng):
 
 @pytest.mark.parametrize('oriented', [True, False])
 def test_several_sessions_with_bases_of_their_own(oriented, rng):
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     first, second = (
         between(true, 40, rng, base=base, oriented=oriented) for base in ('base', 'base_B')
     )
@@ -216,9 +208,7 @@ def test_several_sessions_with_bases_of_their_own(oriented, rng):
 
 def test_both_ends_change_and_kinds_are_mixed(rng):
     """Session A by pose, B by position of another target, B by a wire to the first one."""
-    true = faulty(UR10E, Cell(), rng)
-    true = true.with_frame('base_B', random_frame(rng, 2.0))
-    true = true.with_frame('tool_2', random_frame(rng, 0.3))
+    true = framed(rng, base_B=2.0, tool_2=0.3)
 
     def sets(count):
         return [
@@ -236,9 +226,7 @@ def test_both_ends_change_and_kinds_are_mixed(rng):
 
 def test_sessions_need_not_come_in_the_order_of_the_frames(rng):
     """The first set knows nothing of the frames named base and tool."""
-    true = faulty(UR10E, Cell(), rng)
-    true = true.with_frame('base_B', random_frame(rng, 2.0))
-    true = true.with_frame('tool_2', random_frame(rng, 0.3))
+    true = framed(rng, base_B=2.0, tool_2=0.3)
     seen = between(true, 60, rng, 'base_B', 'tool_2')
     result = identify(Problem(UR10E, seen))
     assert result.rank == 30
@@ -253,13 +241,11 @@ def test_a_known_frame_of_a_second_session_is_kept(rng):
     result = identify(Problem(nominal, first, more=(second,)))
     np.testing.assert_array_equal(result.chain.frame('base_B').matrix, fixed.matrix)
     assert not any(name.startswith('base_B') for name in result.names)
-    assert_exact(
-        result.chain, *(between(true, 100, rng, base=base) for base in ('base', 'base_B'))
-    )
+    assert_exact(result.chain, *(between(true, 100, rng, base=b) for b in ('base', 'base_B')))
 
 
 def test_two_sessions_tell_more_than_one(rng):
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     first, second = (between(true, 40, rng, base=base, noise=NOISE) for base in ('base', 'base_B'))
     one = identify(Problem(UR10E, first, **SIGMAS))
     two = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
@@ -274,14 +260,14 @@ def test_two_sessions_tell_more_than_one(rng):
 
 def test_a_second_session_lends_the_first_what_it_lacks(rng):
     """Session A is too short to fit anything but its base: the arm comes from session B."""
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     few = between(true, 3, rng)
     result = identify(Problem(UR10E, few, more=(between(true, 60, rng, base='base_B'),)))
     assert_exact(result.chain, between(true, 100, rng))
 
 
 def test_held_out_poses_have_frames_too(rng):
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     first, second = (between(true, 40, rng, base=base, noise=NOISE) for base in ('base', 'base_B'))
     unseen = between(true, 30, rng, base='base_B', noise=NOISE)
     result = identify(Problem(UR10E, first, more=(second,), held_out=unseen))
