@@ -39,9 +39,8 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 EXPLAINED = 0.5
-"""Share of the squares of the residuals from which on something explains them."""
-SUSPECTED = 0.4
-"""The same at a stop near by, where not all are looked at first."""
+"""Share of the squares of the residuals from which on something explains them: most of them
+(benchmarks/harm.py)."""
 PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST_ASIDE = 3
@@ -99,7 +98,7 @@ class Step:
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         if self.stamp_ns < ROWS_NS and self.stamp_ns % 10**9 == 0:
             when = f'line {self.stamp_ns // 10**9}, without stamps the order of the rows is taken'
-        text = f'something moved at sample {self.sample + 1}'
+        text = f'something moved at pose {self.sample + 1}'
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':
@@ -125,7 +124,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     if not len(places):
         return None
     coarse = places[:: 1 + (len(places) - 1) // PLACES]
-    found = scan.best(coarse, SUSPECTED) if len(places) else None
+    found = scan.best(coarse, 0.5 * EXPLAINED)  # of a step near by
     if found is None:
         return None
     near = np.abs(places - found.stop) <= np.diff(coarse).max(initial=0)

@@ -158,7 +158,7 @@ def test_numbers_that_stand_for_nothing_are_dropped(value, together):
         assert feed(session, part, TYPESTORE.deserialize_cdr) == []
     session.finish()
     dropped = session.account().dropped
-    assert dropped['poses: position beyond 1000 km'] == 30
+    assert dropped['measurements: position beyond 1000 km'] == 30
     assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 3
     assert len(session.samples) > 100
 
@@ -194,4 +194,4 @@ def test_an_error_in_a_batch_costs_no_other_message():
     session = CalibrationSession(ARM, on_sample=fail)
     (problem,) = feed(session, messages, TYPESTORE.deserialize_cdr)
     assert 'no room for a sample' in problem
-    assert session.received == {'joints': 2000, 'poses': 2000}
+    assert session.received == {'joints': 2000, 'measurements': 2000}

@@ -79,7 +79,7 @@ def test_one_by_one_or_all_at_once_is_the_same(rng):
 
 def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
     """An update is short whatever waits, and in the end nothing has been left out."""
-    monkeypatch.setattr(live_module, 'MOST_ANEW', 40)
+    monkeypatch.setattr(live_module, 'SOME', 40)
     monkeypatch.setattr(live_module, 'MOST_AT_ONCE', 25)
     true = faulty(UR10E, Cell(), rng)
     samples = seen(true, 80, rng) + [
@@ -97,7 +97,7 @@ def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
 
 def test_what_it_does_not_begin_with_is_taken_next(rng, monkeypatch):
     """Of many samples of one target and few of another it begins with a part of the many."""
-    monkeypatch.setattr(live_module, 'MOST_ANEW', 60)
+    monkeypatch.setattr(live_module, 'SOME', 60)
     true = faulty(UR10E, Cell(), rng)
     samples = seen(true, 50, rng) + seen(true, 8, rng, start=100, target='other')
     live = LiveEstimate(session().problem_of)
