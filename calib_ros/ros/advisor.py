@@ -104,7 +104,7 @@ class Guide:
         wanted = self._session.settings.wanted_accuracy
         known = {} if estimate is None else {'expected [mm]': f'{1e3 * estimate.sigma:.4f}'}
         enough = estimate is not None and estimate.sigma <= wanted
-        return known | {'enough poses': enough, 'last trajectory': self._last_trajectory}
+        return known | {'enough samples': enough, 'last trajectory': self._last_trajectory}
 
     def advise(self) -> None:
         """Look for the next pose if there are samples that it was not looked for with."""
