@@ -27,7 +27,7 @@ from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 
 NAMED = 5
-"""Outliers that an answer names."""
+"""Outliers, or refused points of a program, that an answer names."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
 
