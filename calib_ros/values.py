@@ -22,6 +22,8 @@ LARGEST = 1e6
 none."""
 LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
+MOST_NAMES = 50
+"""What a cell has of each kind: joints of a chain, frames, targets, sets of joint names."""
 LONGEST_NAME = LONGEST // 2
 """Characters of a name, a number or an expression: a message has room for it and more."""
 

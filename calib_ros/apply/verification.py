@@ -38,6 +38,7 @@ from calib_ros.identification.configurations import configurations
 from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.levels import CONFIDENT, NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
@@ -45,7 +46,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
 NEEDED = 5
@@ -55,14 +56,8 @@ DECIDING = 10_000
 LOST = {'base': 2, 'tool': 1}
 """Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
 three; the turn of a tool does not move the target."""
-FAR = Compensator.largest_turn
-"""Distance [rad or m] from commanded joint values that no correction makes."""
 UNIT = (1e-3, 1e-3)
 """Sigmas [m, rad] that weigh all samples alike."""
-LISTED = 20
-"""Configurations up to which each is told of."""
-ONE_MOTION = 0.3
-"""Share of the error that is left without one common motion, below which that is suspected."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +150,7 @@ def verify(
     arm: Calibration,
     sets: Sequence[Observations],
     tolerance: float | None,
-    confidence: float = 0.95,
+    confidence: float = CONFIDENT,
     new_base: bool = False,
     commanded: FloatArray | None = None,
     new_tool: bool = False,
@@ -267,7 +262,7 @@ def _check(
 def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
     """Return the commanded joint values (N, n) that are nearest to those measured (N, n)."""
     away = np.abs(joints[:, np.newaxis] - commanded).max(axis=2)
-    far = np.flatnonzero(away.min(axis=1) > FAR)
+    far = np.flatnonzero(away.min(axis=1) > Compensator.largest_turn)  # more than is corrected
     if far.size:
         raise InputError(
             f'measurement {far[0] + 1} was taken {away.min(axis=1)[far[0]]:.3g} rad or m from '
@@ -375,7 +370,7 @@ def remarks(found: Verification) -> list[str]:
             'the calibration does not hold any more: the error is larger than it was then. Was '
             'the tracker, the target or the robot moved?'
         )
-    if found.common < ONE_MOTION:
+    if found.common < NEARER:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
             'the error would be left: was the measuring device moved? If it stands elsewhere on '

@@ -18,7 +18,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.trajectories import read_program
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import NAMED
+from calib_ros.shown import some
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -69,12 +69,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         )
     if result.refusals:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
-        named = result.refusals[:NAMED]
-        for refusal in named:
-            screen.warn(refusal.reason, source.places[refusal.sample])
-        if more := result.refusals[len(named) :]:
-            last = source.places[more[-1].sample]
-            screen.warn(f'{len(more)} more points, up to {last}', 'calib_ros')
+        for each in some([f'{source.places[r.sample]}: {r.reason}' for r in result.refusals]):
+            screen.warn(each, 'refused')
         return common.NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')

@@ -28,7 +28,7 @@ from calib_ros.files.salvage import (
 from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.sampling.account import Account
-from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
+from calib_ros.sampling.intake import BATCH, Deserialise, Stream, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
@@ -37,8 +37,6 @@ from calib_ros.sampling.topics import Reading, check_joints, choose
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
 
-BATCH = 2000
-"""Messages that are decoded at once."""
 ALLOW = 'take the rest all the same with --largest-loss'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|is there already')

@@ -26,17 +26,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from calib_ros.identification.levels import CERTAIN, CONFIDENT
+from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
-from calib_ros.identification.validation import Comparison, ParameterRow, log_gain
-
-WORSE = 0.01
-"""Growth of that error that counts, of the RMS; less is how metres happen to lie."""
-MOST_OUTLIERS = 0.35
-"""Share of outliers beyond which nothing is accepted."""
+from calib_ros.identification.validation import COUNTS, Comparison, ParameterRow, log_gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +134,7 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
         first, second = validation.figures_of_all
         pairs = (validation.before.position, validation.after.position)
         gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
-        if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
+        if second.mean_mm > first.mean_mm or gain < -max(limit, COUNTS):
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
                 f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '

@@ -35,9 +35,10 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
 SLOW = 3
-"""Cosines that are taken out of a series at most; no more than one for ten stops."""
+"""Cosines that are taken out of a series at most; no more than one for ten stops
+(benchmarks/drift.py)."""
 SHIFTS = 400
-"""Shifts that are tried at most; the first of them is none."""
+"""Shifts that are tried at most; the first of them is none (benchmarks/drift.py)."""
 
 
 @dataclass(frozen=True, eq=False)

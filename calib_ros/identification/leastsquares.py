@@ -37,8 +37,6 @@ MOST_ITERATIONS = 1000
 STALLED = 50
 """Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
 LEAST_FALL = 1e-3
-ROUNDS = 60
-"""Steps to a fixed point, which ends in far fewer unless it goes in circles."""
 DAMPED, UNDAMPED = 1e-6, 1e-12
 """Damping, of columns of unit length, with which it begins and below which it ends."""
 WELL_CONDITIONED = 1e-6 / np.finfo(float).eps

@@ -39,9 +39,8 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 EXPLAINED = 0.5
-"""Share of the squares of the residuals from which on something explains them."""
-SUSPECTED = 0.4
-"""The same at a stop near by, where not all are looked at first."""
+"""Share of the squares of the residuals from which on something explains them: most of them
+(benchmarks/harm.py)."""
 PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST_ASIDE = 3
@@ -125,7 +124,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     if not len(places):
         return None
     coarse = places[:: 1 + (len(places) - 1) // PLACES]
-    found = scan.best(coarse, SUSPECTED) if len(places) else None
+    found = scan.best(coarse, 0.5 * EXPLAINED)  # of a step near by
     if found is None:
         return None
     near = np.abs(places - found.stop) <= np.diff(coarse).max(initial=0)

@@ -22,15 +22,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.leastsquares import ROUNDS, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, FloatArray
 
 STARTS = 500
+"""As many as FAST-LTS has."""
 CONCENTRATIONS = 4
 """Concentration steps from every start; then only the BEST are followed to their end."""
 BEST = 10
+"""As many as FAST-LTS has."""
 RELINEARISATIONS = 5
+"""Times that the model is made anew at the best half at most (benchmarks/outliers.py)."""
 SEARCHED = 300
 """Samples that are searched, evenly spread over all, of each set a tenth at least; the fit that
 follows takes all."""

@@ -25,6 +25,9 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame
 
+COUNTS = 0.005
+"""Change of an RMS error that counts, of itself; less is how it happens to fall
+(benchmarks/real_robots.py)."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.parameter import LENS_KINDS
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.values import SAME
 
 
@@ -116,14 +116,14 @@ class Lens:
         target = np.ascontiguousarray(pixels.T)
         points = np.ones((3, len(pixels)))
         points[0], points[1] = (target[0] - self.cx) / self.fx, (target[1] - self.cy) / self.fy
-        for _ in range(20):
+        for _ in range(ROUNDS):
             seen, ((a, b, _), (c, d, _)) = self.project(points)
             size = a * d - b * c
             turned = size <= 0.0  # beyond the edge of the polynomial
             u, v = (target - seen) / np.where(turned, 1.0, size)
             step = np.where(turned, 0.0, [d * u - b * v, a * v - c * u])
             points[:2] += step
-            if np.abs(step).max(initial=0.0) < 1e-12:
+            if np.abs(step).max(initial=0.0) < ROUNDING:
                 break
         return np.asarray(points[:2].T)
 

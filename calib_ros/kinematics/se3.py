@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 FloatArray: TypeAlias = NDArray[np.float64]
+ROUNDS = 100
+"""Steps to a fixed point, which ends in far fewer unless there is none."""
 ROUNDING = 1e-12
 """Share of the whole from which on a number is more than rounding."""
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))

@@ -18,7 +18,7 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.texts import LARGEST_TEXT
@@ -28,7 +28,7 @@ MOVING = ('revolute', 'continuous', 'prismatic')
 TYPES = (*MOVING, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
 ENDS = ('lower', 'upper')
-MOST_LINKS = 10_000
+MOST_LINKS = 10 * MOST_ENTRIES
 """Links, and joints, of a URDF."""
 
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)

@@ -25,9 +25,8 @@ from calib_ros.kinematics.chain_file import dump_yaml
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
+from calib_ros.shown import some
 
-NAMED = 5
-"""Outliers, or refused points of a program, that an answer names."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
 
@@ -91,11 +90,9 @@ def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, in
     largest = sorted(outliers, key=lambda each: -each.size)
     words = [
         f'pose {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
-        for each in largest[:NAMED]
+        for each in largest
     ]
-    if len(largest) > NAMED:
-        words.append(f'and {len(largest) - NAMED} more')
-    return ', '.join(words)
+    return ', '.join(some(words))
 
 
 def weakly_determined(result: Identification) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import Estimate, barely_moved
-from calib_ros.sampling.slices import MANY
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.settings import Settings
 
 SHARE = 0.2
@@ -40,7 +40,7 @@ def restless(needed: float, still: float) -> Hint:
 
 def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
     """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
-    if between < MANY or between <= SHARE * measurements:
+    if between < NO_ACCIDENT or between <= SHARE * measurements:
         return None
     rate = f'{2.0 / max_gap:g} Hz or more'
     return Hint(

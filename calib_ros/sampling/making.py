@@ -24,7 +24,7 @@ from calib_ros.sampling.track import Motion
 
 DISTANCE, POSITION = slice(0, 1), slice(0, 3)
 QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
-WIDTH = COVARIANCE.stop
+ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]
 """A sample with the number of the round or the stop in which it was taken."""
 VIBRATING = 'measurements: still vibrating, or a spike'
@@ -34,7 +34,7 @@ RESTLESS = 'measurements: a stop that spreads more than the noise'
 class Matched(NamedTuple):
     """Measurements of one stream, in the order of their stamps, and the motion at these.
 
-    Numbers (N,) are those of their rounds or stops, values (N, WIDTH) are stamped late by a delay.
+    Numbers (N,) are of their rounds or stops, values (N, ROW_WIDTH) are stamped late by a delay.
     """
 
     key: StreamKey
@@ -170,7 +170,7 @@ class Maker:
         position: FloatArray,
         **more: Any,
     ) -> Iterator[Numbered]:
-        """Yield a sample of measurements (N, WIDTH), unless there is one or no room."""
+        """Yield a sample of measurements (N, ROW_WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
             self.dropped['measurements: a pose with this stamp is there already'] += len(rows)

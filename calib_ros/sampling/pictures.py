@@ -23,8 +23,9 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import board_poses, uncertainty
 from calib_ros.kinematics import se3
 from calib_ros.sampling.sample import Sample, View
+from calib_ros.texts import LARGEST_TABLE
 
-MOST_BYTES = 500_000_000
+MOST_BYTES = 5 * LARGEST_TABLE
 """Size of the images that are kept: six seconds of 30 Hz at 2 megapixels in grey."""
 MOST_WAITING = 4
 """Images that may wait to be looked at; an arm that stops so often that more come loses some."""

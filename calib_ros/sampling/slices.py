@@ -15,7 +15,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
 
 JOINTS, POSES = 'joints', 'measurements'
-MANY = 20
+NO_ACCIDENT = 20
 """So many messages that differ from the others are no accident."""
 SILENCE = 5.0
 """A joint or topic that was heard before and is silent for so long [s] is told."""

@@ -10,9 +10,9 @@ from collections.abc import Callable
 import numpy as np
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.names import MOST_NAMES
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import Slice, StreamKey
+from calib_ros.values import MOST_NAMES
 
 MOST_STREAMS = MOST_NAMES
 """Streams of measurements that are told apart: a tracker may number markers without end."""

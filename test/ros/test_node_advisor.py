@@ -62,10 +62,10 @@ def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
     cell.spin_until(lambda: early)
     assert list(early[0].name) == list(UR.joint_names)
     assert np.isfinite(early[0].position).all()
-    cell.spin_until(lambda: values_of(diagnostics[-1])['enough poses'] == 'False')
+    cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'False')
     rest = topics(recording)
     cell.play({k: v[len(part(recording, 3)[k]) :] for k, v in rest.items()})
-    cell.spin_until(lambda: values_of(diagnostics[-1])['enough poses'] == 'True')
+    cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'True')
     assert float(values_of(diagnostics[-1])['expected [mm]']) < 0.1
     cell.spin_until(lambda: len({tuple(message.position) for message in early}) > 1)
     late = cell.listen(JointState, f'{NODE}/next_pose')
@@ -286,17 +286,17 @@ WRONG = {
     'must be a finite number': lambda q: trajectory(q * np.nan),
     'has no positions': lambda q: JointTrajectory(joint_names=list(UR.joint_names)),
     'needs velocities as well': lambda q: trajectory(q, accelerations=q),
-    '6 points, at most 5 are taken': lambda q: trajectory(np.repeat(q[:1], 6, axis=0)),
+    '8 points, at most 7 are taken': lambda q: trajectory(np.repeat(q[:1], 8, axis=0)),
 }
 
 
 def test_trajectories_that_cannot_be_corrected_are_refused(calibrated, corrected, monkeypatch):
-    monkeypatch.setattr(guide_module, 'MOST_POINTS', 5)
+    monkeypatch.setattr(guide_module, 'MOST_POINTS', 7)
     for reason, make in WRONG.items():
         said = send(calibrated, make(path(5)[0]))
         assert said.startswith('refused: ')
         assert reason in said
-    many = path(5)[0]
+    many = path(7)[0]
     many[:, 4] = 0.0
     said = send(calibrated, trajectory(many))
     assert 'and 2 more' in said

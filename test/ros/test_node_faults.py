@@ -76,7 +76,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
         assert found.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
         assert 'failed' not in found.message
         assert 'poses' in found.message
-        assert int(values_of(diagnostics[-1])['poses']) >= 8
+        assert int(values_of(diagnostics[-1])['samples']) >= 8
 
 
 def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):

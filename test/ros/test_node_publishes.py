@@ -48,7 +48,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         status = diagnostics[0].status[0]
         assert (status.name, status.hardware_id) == ('calibration_node: calibration', 'A7')
         values = values_of(diagnostics[0])
-        assert values['poses'] == str(STOPS)
+        assert values['samples'] == str(STOPS)
         assert values['calibrated'] == 'True'
         assert values['dropped joints: same stamp twice'] == '2'
         assert values['last identification'].startswith('accepted')
