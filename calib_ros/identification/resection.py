@@ -16,19 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
+from calib_ros.identification.identifiability import DEGENERATE
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
-from calib_ros.kinematics.se3 import FloatArray
-
-FLAT = 1e-3
-"""Thickness of a board, of its size, up to which it is flat."""
-IN_LINE = 1e-2
-"""Width of points, of their length, up to which they are in line and tell no pose."""
-STEPS = 15
-SETTLED = 1e-4
-"""Fall of the squares below which an image has its pose."""
-DAMPING = 1e-9
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +104,7 @@ def resect(observations: Observations, lens: Lens) -> BoardPoses:
     index = observations.images
     centre = observations.points.mean(axis=0)
     _, size, axes = np.linalg.svd(observations.points - centre, full_matrices=False)
-    if size[2] > FLAT * size[0]:
+    if size[2] > DEGENERATE * size[0]:
         raise InputError(
             'the points of a board must be in a plane: give each face of a body as a board of '
             'its own'
@@ -147,7 +139,7 @@ def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray
     outer = np.einsum('ni,nj->nij', rest, rest).reshape(-1, 9)
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins).reshape(-1, 3, 3))
-    return np.asarray((count >= 4) & (spread[:, 1] > IN_LINE**2 * spread[:, 2]))
+    return np.asarray((count >= 4) & (spread[:, 1] > DEGENERATE**2 * spread[:, 2]))
 
 
 def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:
@@ -184,11 +176,14 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
 def _refined(
     poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
 ) -> BoardPoses:
-    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2)."""
+    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2).
+
+    Images that still move at once, each with its own damping; `leastsquares` solves one problem.
+    """
     count, few = np.bincount(index), np.arange(len(poses))
     poses, best, least = poses.copy(), poses.copy(), np.full(len(poses), np.inf)
-    damping, normal = np.full(len(poses), DAMPING), np.zeros((len(poses), 7, 7))
-    for _ in range(STEPS):
+    damping, normal = np.full(len(poses), ROUNDING), np.zeros((len(poses), 7, 7))
+    for _ in range(ROUNDS):
         these = np.isin(index, few)
         seen = _seen(lens, poses[few], np.searchsorted(few, index[these]), points[:, these])
         rows = np.empty((7, *seen.pixels.shape))
@@ -196,10 +191,10 @@ def _refined(
         rows[6] = pixels[these].T - seen.pixels
         found = image_products(rows, np.cumsum(count[few]) - count[few])
         fall = least[few] - found[:, 6, 6]
-        better, moving = fall > 0.0, ~(np.abs(fall) < SETTLED * least[few])
+        better, moving = fall > 0.0, ~(np.abs(fall) < HALF_THE_DIGITS * least[few])
         won = few[better]
         best[won], least[won], normal[won] = poses[won], found[better, 6, 6], found[better]
-        less = np.maximum(0.1 * damping[few], DAMPING)
+        less = np.maximum(0.1 * damping[few], ROUNDING)
         damping[few] = np.where(better, less, 100.0 * damping[few])
         few = few[moving]
         if not len(few):

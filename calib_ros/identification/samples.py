@@ -277,8 +277,7 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
 
     Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
     """
-    delay = chain.frame(observations.base).delay
-    then = observations if delay is None else observations.earlier(delay)
+    then = observations.earlier(chain.frame(observations.base).delay)
     distances = observations.distances
     position = np.empty((len(then), 3 if distances is None else 1))
     orientation = np.full((len(then), 3), np.nan)
@@ -307,8 +306,7 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
     """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m]."""
     camera = observations.camera
     lens = require_lens(chain.frame(camera).lens, camera)
-    delay = chain.frame(observations.base).delay
-    then = observations if delay is None else observations.earlier(delay)
+    then = observations.earlier(chain.frame(observations.base).delay)
     first = np.flatnonzero(np.diff(then.images, prepend=-1))
     assert then.pixels is not None
     assert then.points is not None

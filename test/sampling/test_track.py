@@ -6,36 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tracked import BOTH, MAX_GAP, MS, add, at, fill, filled, track
 
 from calib_ros.sampling.interpolation import MOVED
-from calib_ros.sampling.intervals import LAGS
 from calib_ros.sampling.rows import Rows
-from calib_ros.sampling.track import CAUSES, Track
-
-MS = 1_000_000
-MAX_GAP = 0.1
-BOTH = (0, 1)
-
-
-def track(revolute=(True, True), capacity=1000):
-    return Track(revolute, MAX_GAP, capacity)
-
-
-def add(made, columns, stamp_ns, values):
-    made.extend(columns, np.array([stamp_ns]), np.array([values], dtype=float))
-
-
-def filled(samples, columns=BOTH, **options):
-    """Return a track of samples (stamp [ms], values)."""
-    made = track(**options)
-    for ms, values in samples:
-        add(made, columns, round(ms * MS), np.array(values, dtype=float))
-    made.sort()
-    return made
-
-
-def at(made, *ms, **options):
-    return made.at(np.array([round(each * MS) for each in ms], dtype=np.int64), **options)
+from calib_ros.sampling.track import CAUSES
 
 
 def words(motion):
@@ -155,8 +130,6 @@ def test_angles_within_one_turn_are_as_good_as_those_that_count(seed):
 
 
 # Order of arrival
-
-
 # Few distinct stamps and values, so that equal stamps, hits and gaps are frequent.
 ticks = st.integers(1, 12).map(lambda k: 50 * k)
 numbers = st.sampled_from([-3.1, -1.0, 0.0, 0.5, 3.1])
@@ -231,11 +204,8 @@ def test_of_equal_stamps_one_sample_is_kept_and_not_by_arrival():
 def test_publishers_of_parts_make_one_arm():
     """Each is interpolated on its own, at its own rate and stamps."""
     made = track((True, True, False))
-    for ms in range(0, 500, 5):
-        add(made, (0, 2), ms * MS, np.array([1e-3 * ms, 1.0 - 1e-3 * ms]))
-    for ms in range(3, 500, 20):
-        add(made, (1,), ms * MS, np.array([-2e-3 * ms]))
-    made.sort()
+    fill(made, [(ms, (1e-3 * ms, 1.0 - 1e-3 * ms)) for ms in range(0, 500, 5)], (0, 2))
+    fill(made, [(ms, (-2e-3 * ms,)) for ms in range(3, 500, 20)], (1,))
     motion = at(made, 77, 201)
     np.testing.assert_allclose(
         motion.joints, [[0.077, -0.154, 0.923], [0.201, -0.402, 0.799]], atol=1e-12
@@ -254,142 +224,27 @@ def test_a_joint_that_nobody_names_is_missing():
 
 
 def test_of_two_publishers_of_a_joint_the_one_that_names_more_counts():
-    made = track()
-    for ms in range(0, 100, 10):
-        add(made, (1,), ms * MS, np.array([9.0]))
-        add(made, BOTH, ms * MS, np.array([1.0, 2.0]))
-    made.sort()
+    made = filled([(ms, (9.0,)) for ms in range(0, 100, 10)], (1,))
+    fill(made, [(ms, (1.0, 2.0)) for ms in range(0, 100, 10)])
     np.testing.assert_allclose(at(made, 55).joints, [[1.0, 2.0]])
 
 
 def test_a_publisher_that_falls_silent_holds_nothing_up_while_others_name_its_joints():
     """As a driver that publishes the gripper's and one joint of the arm once, at the start."""
-    made = track()
-    add(made, (1,), 10 * MS, np.array([0.0]))
-    for ms in range(10, 1000, 10):
-        add(made, BOTH, ms * MS, np.array([0.0, 0.0]))
-    made.sort()
+    made = filled([(10, (0.0,))], (1,))
+    fill(made, [(ms, (0.0, 0.0)) for ms in range(10, 1000, 10)])
     assert made.newest_ns == 990 * MS
     made.release(500 * MS)
     assert made.standing(1e-3, 0.1).tolist() == [[500 * MS, 990 * MS]]
 
 
 def test_a_publisher_that_falls_silent_stops_everything_where_nobody_else_names_its_joints():
-    made = track()
-    for ms in range(0, 1000, 10):
-        add(made, (0,), ms * MS, np.array([0.0]))
-        if ms <= 300:
-            add(made, (1,), ms * MS, np.array([0.0]))
-    made.sort()
+    made = filled([(ms, (0.0,)) for ms in range(0, 1000, 10)], (0,))
+    fill(made, [(ms, (0.0,)) for ms in range(0, 310, 10)], (1,))
     assert made.newest_ns == 300 * MS
     made.release(500 * MS)
     assert made.newest_ns == 300 * MS
     assert made.missing == ()
-
-
-# Standing
-
-
-def brute_standing(stamps, values, still, window, max_gap):
-    """Return the intervals by the definition, sample by sample, and the samples that stood."""
-    quiet, begins, intervals = [], [], []
-    start = 0
-    for k in range(len(stamps)):
-        if k and stamps[k] - stamps[k - 1] > max_gap:
-            start = k
-        calm, back = True, k
-        for lag in range(1, LAGS + 1):
-            wanted = stamps[k] - window * lag // LAGS
-            back = next(i for i in range(len(stamps)) if stamps[i] >= wanted)
-            back = max(min(back, k - 1), start)
-            calm = calm and np.abs(values[k] - values[back]).max() <= still
-        quiet.append(calm)
-        begins.append(stamps[back])
-        if calm and (k == start or not quiet[k - 1]):
-            begin = begins[k]
-            if intervals:
-                begin = max(begin, intervals[-1][1])
-            intervals.append([begin, stamps[k]])
-        elif calm:
-            intervals[-1][1] = stamps[k]
-    return [[begin, end] for begin, end in intervals if begin < end]
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_standing_is_what_its_definition_says(seed):
-    rng = np.random.default_rng(seed)
-    count = 120
-    stamps = np.cumsum(
-        rng.choice([5, 10, 10, 10, 15, 250], count, p=[0.2, 0.5, 0.1, 0.1, 0.08, 0.02])
-    )
-    moving = np.repeat(rng.random(count // 10) < 0.4, 10)
-    steps = moving[:, np.newaxis] * rng.normal(scale=2e-3, size=(count, 2))
-    values = np.cumsum(steps, axis=0) + rng.normal(scale=1e-4, size=(count, 2))
-    made = filled(zip(stamps.tolist(), values.tolist(), strict=True))
-    expected = brute_standing((stamps * MS).tolist(), values, 5e-4, 100 * MS, 100 * MS)
-    assert made.standing(5e-4, 0.1).tolist() == expected
-
-
-def test_a_stop_begins_when_the_joints_do_not_move_any_longer():
-    ramp = [(ms, (1e-3 * max(0, 300 - ms), 0.0)) for ms in range(0, 300, 2)]
-    stand = [(ms, (0.0, 0.0)) for ms in range(300, 800, 2)]
-    leave = [(ms, (0.0, 1e-3 * (ms - 800))) for ms in range(800, 1000, 2)]
-    ((begin, end),) = filled([*ramp, *stand, *leave]).standing(5e-4, 0.1).tolist()
-    assert abs(begin - 300 * MS) <= 4 * MS
-    assert abs(end - 800 * MS) <= 4 * MS
-
-
-def test_all_publishers_must_stand():
-    made = track()
-    for ms in range(0, 1000, 10):
-        add(made, (0,), ms * MS, np.array([max(0.0, 0.3 - 1e-3 * ms)]))
-        add(made, (1,), ms * MS, np.array([max(0.0, 1e-3 * ms - 0.7)]))
-    made.sort()
-    ((begin, end),) = made.standing(1e-3, 0.1).tolist()
-    assert abs(begin - 300 * MS) <= 20 * MS
-    assert abs(end - 700 * MS) <= 20 * MS
-
-
-@pytest.mark.parametrize('times', [[300], [100, 700], range(0, 1000, 250), range(300, 340, 10)])
-def test_a_publisher_that_is_heard_now_and_then_does_not_part_a_stop(times):
-    made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
-    for ms in times:
-        add(made, (1,), ms * MS, np.array([0.0]))
-    made.sort()
-    assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
-
-
-def test_of_two_publishers_of_a_joint_none_may_show_that_it_moves():
-    """As one that repeats what others published, some time later."""
-    made = filled((ms, (0.0, 0.0)) for ms in range(0, 1000, 10))
-    for ms in range(200, 800, 10):
-        add(made, (1,), ms * MS, np.array([max(0.0, 1e-4 * (ms - 500))]))
-    made.sort()
-    (begin, first), (second, end) = (np.array(made.standing(5e-4, 0.1)) // MS).tolist()
-    assert (begin, end) == (0, 990)
-    assert 500 <= first <= 510
-    assert 780 <= second <= 790
-
-
-def test_a_joint_that_nobody_shows_to_stand_does_not():
-    made = filled([(0, (0.0, 0.0)), (500, (0.0, 0.0))])
-    add(made, (1,), 250 * MS, np.array([0.0]))
-    for ms in range(0, 600, 10):
-        add(made, (0,), ms * MS, np.array([0.0]))
-    made.sort()
-    assert made.standing(5e-4, 0.1).tolist() == []
-
-
-def test_a_joint_that_stands_at_half_a_turn_stands(rng):
-    """A driver that counts within one turn reports it now as pi, now as -pi."""
-    angles = np.pi + rng.normal(scale=1e-5, size=100)
-    angles = (angles + np.pi) % (2.0 * np.pi) - np.pi
-    assert np.ptp(angles) > 6.0
-    made = filled([(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)])
-    assert made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]
-    assert filled(
-        [(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)], revolute=(False, True)
-    ).standing(5e-4, 0.1).tolist() != [[0, 990 * MS]]
 
 
 # Signs of the last moves

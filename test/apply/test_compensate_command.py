@@ -1,0 +1,260 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import copy
+import csv
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from commanded import ROBOTS, UR, UR_TRUE, regular
+
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.simulation import measure
+from calib_ros.cli.main import main
+from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.files.trajectories import read_program
+from calib_ros.files.waypoints import joints_csv
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import dump_chain
+
+TABLE = """label,q6,q5,q4,q3,q2,q1,speed
+pick, 0.1,0.7,-1.2,1.1,-1.4,1e-1,"1,5"
+place,0.2,0.8,-1.1,1.2,-1.3,0.3,
+"""
+
+
+def trajectory(q, names=UR.joint_names, **more):
+    """Return a message as `ros2 topic echo` prints it."""
+    rates = {'velocities': [], 'accelerations': [], 'effort': []} | more
+    points = [
+        {'positions': row, **copy.deepcopy(rates), 'time_from_start': {'sec': k, 'nanosec': 0}}
+        for k, row in enumerate(np.asarray(q).tolist())
+    ]
+    header = {'stamp': {'sec': 7, 'nanosec': 3}, 'frame_id': ''}
+    message = {'header': header, 'joint_names': list(names), 'points': points}
+    return yaml.safe_dump(message, sort_keys=False) + '---\n'
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(UR_TRUE, {'source': 'simulation'}))
+
+    def run(text, *arguments, suffix='.csv', chain='ur10e', out='out'):
+        (tmp_path / f'program{suffix}').write_text(text)
+        capsys.readouterr()
+        options = f'--chain {chain} --calibration calibration.yaml --out {out}{suffix}'.split()
+        status = main(['compensate', f'program{suffix}', *options, *map(str, arguments)])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_the_whole_way_from_identification_to_program(run, tmp_path, oriented):
+    """By positions of a target on the last axis alone the orientation is not known, and told so.
+
+    A long tool would be off.
+    """
+    rng = np.random.default_rng(1)
+    true = UR_TRUE.with_frame('tool', Frame(se3.transform(np.eye(3), np.array([0, 0, 0.01]))))
+    seen = measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4, oriented=oriented)
+    # what the data tell of the size of errors would do for the orientation, too
+    priors = {} if oriented else {'*_joint.*': 0.1}
+    found = identify(Problem(UR, seen, sigma_position=5e-5, priors=priors))
+    (tmp_path / 'result').mkdir()
+    (tmp_path / 'result' / 'calibration.yaml').write_text(Calibration.of(found).dump())
+    q = regular(UR, 30, seed=2)
+    status, said, err = run(joints_csv(q), '--calibration', 'result')
+    assert status == 0
+    assert 'sigma of the calibration at these poses: 0.' in said
+    assert ('does not know the orientation' in err) is not oriented
+    joints = np.loadtxt('out.csv', delimiter=',', skiprows=1)
+    frames = {'base': found.chain.base, 'tool': found.chain.tool}
+    wanted = replace(UR, **frames).forward(q)[:, :3, 3]
+    after, before = (
+        np.linalg.norm(true.forward(each)[:, :3, 3] - wanted, axis=1) for each in (joints, q)
+    )
+    assert np.sqrt(np.mean(after**2)) < 2e-4 < 1e-3 < before.max()
+
+
+def test_other_calibrations_are_refused(run, tmp_path):
+    """Of chains given the wrong way round the correction would double the error.
+
+    From a cousin a tenth of the poses could be corrected, by centimetres.
+    """
+    (tmp_path / 'nominal.yaml').write_text(dump_chain(UR))
+    status, _, err = run(TABLE, '--calibration', 'nominal.yaml', chain='calibration.yaml')
+    assert status == 1
+    assert 'is a chain, but no calibration' in err
+    record = {'accepted': True, 'nominal': nominal_document(ROBOTS['ur10'])}
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
+    status, _, err = run(TABLE)
+    assert status == 1
+    assert 'identified from another nominal chain' in err
+    assert not (tmp_path / 'out.csv').exists()
+
+
+def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
+    status, said, err = run(TABLE)
+    assert (status, err) == (0, '')
+    assert said.startswith('wrote out.csv: 2 of 2 samples corrected, by ')
+    assert 'largest error' in said
+    before, after = (
+        list(csv.DictReader((tmp_path / name).read_text().splitlines()))
+        for name in ('program.csv', 'out.csv')
+    )
+    assert [list(row) for row in after] == [list(row) for row in before]
+    for key in ('label', 'speed'):
+        assert [row[key] for row in after] == [row[key] for row in before]
+    columns = [f'q{k + 1}' for k in range(6)]
+    q, corrected = (
+        np.array([[float(row[key]) for key in columns] for row in rows])
+        for rows in (before, after)
+    )
+    expected = compensate(Compensator(UR, UR_TRUE), q).joints
+    np.testing.assert_allclose(corrected, expected, rtol=0, atol=1e-15)
+
+
+def test_a_trajectory_is_corrected_and_the_rest_kept(run, tmp_path):
+    q = regular(UR, 1) + 0.02 * np.arange(4)[:, None]
+    names = ['gripper', *UR.joint_names]
+    rates = {'velocities': [0.02] * 7, 'effort': [1.0] * 7}
+    given = trajectory(np.column_stack([np.ones(4), q]), names, **rates)
+    status, _, err = run(given, suffix='.yaml')
+    assert (status, err) == (0, '')
+    before = yaml.safe_load(given.removesuffix('---\n'))
+    after = yaml.safe_load((tmp_path / 'out.yaml').read_text())
+    result = compensate(Compensator(UR, UR_TRUE), q)
+    for k, corrected in enumerate(after['points']):
+        np.testing.assert_allclose(corrected['positions'], [1.0, *result.joints[k]], atol=1e-15)
+        speeds = np.array(corrected['velocities'])
+        assert speeds[0] == 0.02
+        assert 0.0 < np.abs(speeds[1:] - 0.02).max() < 1e-3
+        assert corrected['accelerations'] == []
+        corrected.update(positions=[], velocities=[])
+        before['points'][k].update(positions=[], velocities=[])
+    assert after == before
+    assert list(after) == list(before)
+
+
+@pytest.mark.parametrize('suffix', ['.csv', '.yaml', '.yml'])
+def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
+    q = np.random.default_rng(0).normal(size=(50, 6))
+    rates = {key: [0.1, 1e-05, 0, -2, 3, 4.5] for key in ('velocities', 'accelerations')}
+    given = trajectory(q, **rates)
+    if suffix == '.csv':
+        rows = [','.join([*map(repr, row[:2]), 'ä', *map(repr, row[2:])]) for row in q.tolist()]
+        given = '\n'.join(['q1,q2,note,q3,q4,q5,q6', *rows]) + '\n'
+    path, again = tmp_path / f'program{suffix}', tmp_path / f'again{suffix}'
+    path.write_text(given, encoding='utf-8')
+    source = read_program(path, UR.joint_names)
+    np.testing.assert_array_equal(source.program.positions, q)
+    assert len(source.places) == 50
+    text = source.text_with(source.program)
+    if suffix == '.csv':
+        assert text == given
+    else:
+        assert yaml.safe_load(text) == yaml.safe_load(given.removesuffix('---\n'))
+    again.write_text(text, encoding='utf-8')
+    assert read_program(again, UR.joint_names).text_with(source.program) == text
+
+
+def test_signs_in_a_table_are_the_approach(tmp_path):
+    path = tmp_path / 'program.csv'
+    path.write_text('q1,q2,s1,s2\n1,2,-0.5,0\n3,4,1,7\n')
+    program = read_program(path, ['a', 'b']).program
+    np.testing.assert_array_equal(program.approach, [[-1.0, 0.0], [1.0, 1.0]])
+
+
+@pytest.mark.parametrize(('suffix', 'force'), [('.csv', False), ('.yaml', True)])
+def test_nothing_is_written_when_a_sample_is_refused(run, tmp_path, suffix, force):
+    q = regular(UR, 3)
+    q[1, 4] = 0.0
+    q[2, 2] = 4.0
+    rows = [','.join(map(repr, row)) for row in q.tolist()]
+    table = '\n'.join(['q1,q2,q3,q4,q5,q6', '', *rows]) + '\n'
+    out = tmp_path / f'out{suffix}'
+    if force:
+        out.write_text('precious')
+    text = table if suffix == '.csv' else trajectory(q)
+    status, said, err = run(text, *(['--force'] if force else []), suffix=suffix)
+    assert (status, said) == (NOT_ACCEPTED, '')
+    first, second, third = err.splitlines()
+    assert first.startswith('calib_ros: nothing is written, 1 of 3 samples corrected')
+    places = ('line 4', 'line 5') if suffix == '.csv' else ('point 2', 'point 3')
+    assert second.startswith(f'{places[0]}: near a singularity')
+    assert third.startswith(f'{places[1]}: the command 4 of elbow_joint is beyond its limits')
+    assert out.read_text() == 'precious' if force else not out.exists()
+
+
+def test_options_reach_the_compensator(run):
+    q = regular(UR, 1)
+    q[0, 4] = 0.0
+    text = trajectory(q)
+    tolerant = ('--largest-orientation-error', 0.005, '--orientation-weight', 1e-3)
+    assert run(text, suffix='.yaml')[0] == NOT_ACCEPTED
+    assert run(text, '--largest-turn', 1e-5, *tolerant, suffix='.yaml')[0] == NOT_ACCEPTED
+    status, said, err = run(text, '--tool', 0.1, 0.2, 0.3, *tolerant, suffix='.yaml')
+    assert (status, err) == (0, '')
+    assert '1 corrected in part' in said
+
+
+def test_an_existing_file_is_kept_unless_forced(run, tmp_path):
+    out = tmp_path / 'out.csv'
+    out.write_text('precious')
+    status, said, err = run(TABLE)
+    assert (status, said) == (1, '')
+    assert 'out.csv exists already: choose another name or --force' in err
+    assert out.read_text() == 'precious'
+    assert run(TABLE, '--force')[0] == 0
+    assert out.read_text().startswith('label,q6')
+
+
+def test_a_program_is_not_compensated_in_place(run, tmp_path):
+    status, _, err = run(TABLE, '--force', out='program')
+    assert status == 1
+    assert 'compensated twice is wrong' in err
+    assert (tmp_path / 'program.csv').read_text() == TABLE
+
+
+ZEROS = np.zeros((2, 6))
+WRONG = [
+    ('.txt', 'x', 'must be a table'),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n', 'has no rows'),
+    ('.csv', 'q1,q2,q3,q4,q5\n1,2,3,4,5\n', 'has no column q6'),
+    ('.csv', 'q1,q2,q3,q4,q5,q6,q7\n1,0,0,1,0,1,0\n', 'q7, but the arm has 6 joints only'),
+    ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'several columns q1'),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a number, not ''"),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a number, not 'x'"),
+    ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,nan\n', 'q6 must be a number'),
+    ('.yaml', '[', 'is not valid YAML'),
+    ('.yaml', 2 * trajectory(ZEROS), 'must hold one YAML document, not 2'),
+    ('.yaml', 'a: 1', 'must be a trajectory_msgs/JointTrajectory'),
+    ('.yaml', "joint_names: [a]\npoints: ['...']", 'point 1 .*--full-length'),
+    ('.yaml', 'joint_names: [a]\npoints: [{positions: []}]', 'has no positions'),
+    ('.yaml', trajectory(np.zeros((2, 5))), 'positions must be a list of 6 numbers'),
+    ('.yaml', trajectory(ZEROS, 'abcdef'), 'unknown joint in the program'),
+    ('.yaml', trajectory(ZEROS, velocities=[True] * 6), 'finite number, not True'),
+    (
+        '.yaml',
+        trajectory(ZEROS).replace('velocities: []', 'velocities: [0,0,0,0,0,0]', 1),
+        'point 2: velocities must be a list of 6 numbers',
+    ),
+    ('.yaml', trajectory(ZEROS, accelerations=[0.0] * 6), 'needs velocities as well'),
+]
+
+
+@pytest.mark.parametrize(('suffix', 'text', 'complaint'), WRONG)
+def test_files_that_are_no_programs_are_refused(run, tmp_path, suffix, text, complaint):
+    status, said, err = run(text, suffix=suffix)
+    assert (status, said) == (1, '')
+    assert err.startswith('calib_ros: ')
+    assert re.search(complaint, err)
+    assert not (tmp_path / f'out{suffix}').exists()

@@ -1,0 +1,155 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from argparse import Namespace
+
+import numpy as np
+import pytest
+from surveyed import DOWN, TASK, calibrated, identified
+
+from calib_ros.apply import workspace
+from calib_ros.apply.placement import place, task_of
+from calib_ros.cli.workspace import _task
+from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.identification.calibration import MODELS
+from calib_ros.kinematics.se3 import exp_rotation, transform
+
+
+@pytest.fixture(scope='module')
+def placed():
+    """Return the placements of the task by the nominal model."""
+    return place(calibrated(), TASK, 'mean', 'nominal', cells=6)
+
+
+def wanted(chain, placements, which, task=TASK):
+    """Return where the task's poses are in the world, for the chain that commands the arm."""
+    turn = exp_rotation(np.array([0.0, 0.0, placements.turns[which]]))
+    frame = transform(turn, placements.positions[which])
+    return chain.frame('base').matrix @ frame @ task
+
+
+def true_errors(true, chain, placements, which):
+    """Return what the real arm misses when it goes to the joint values of a placement."""
+    there = true.forward(placements.joints[which])[:, :3, 3]
+    return np.linalg.norm(there - wanted(chain, placements, which)[:, :3, 3], axis=1)
+
+
+@pytest.mark.parametrize('aim', ['mean', 'worst'])
+def test_the_best_placement_beats_the_centre_on_the_true_arm(placed, aim):
+    """Commanded by the nominal model; what is expected comes true."""
+    true, _ = identified()
+    arm = calibrated()
+    found = placed if aim == 'mean' else place(arm, TASK, aim, 'nominal', cells=6)
+    over = np.mean if aim == 'mean' else np.max
+    best, centre = (
+        over(true_errors(true, arm.before, found, which)) for which in (found.best, found.centre)
+    )
+    assert found.errors[found.best] < 0.7 * found.errors[found.centre]
+    assert best < 0.7 * centre
+    for which, there in ((found.best, best), (found.centre, centre)):
+        expected = np.sqrt(found.errors[which] ** 2 - arm.residual**2)  # the arm has none
+        assert there == pytest.approx(expected, rel=0.15)
+
+
+def test_the_best_placement_of_a_corrected_arm_beats_the_centre():
+    """On the average over 20 calibrations of one arm, because only chance is left."""
+    best, centre = [], []
+    arm = calibrated(100)
+    found = place(arm, TASK, cells=6)
+    for seed in range(20):
+        true, result = identified(seed)
+        for which, errors in ((found.best, best), (found.centre, centre)):
+            joints = found.joints[which]
+            left = (result.chain.forward(joints) - true.forward(joints))[:, :3, 3]
+            errors.append((left**2).sum(axis=1).mean())
+    assert np.mean(best) < np.mean(centre)
+    for which, errors in ((found.best, best), (found.centre, centre)):
+        sigma = np.sqrt(np.mean(arm.sigma(found.joints[which]) ** 2))
+        assert np.sqrt(np.mean(errors)) == pytest.approx(sigma, rel=0.2)
+
+
+def test_the_joint_values_bring_the_arm_to_the_placed_task():
+    task = TASK[::4]
+    arm = calibrated()
+    for model in MODELS:
+        found = place(arm, task, 'mean', model, cells=4, turns=3)
+        chain = arm.commanded_by(model)
+        reached = ~np.isnan(found.errors)
+        assert 10 < reached.sum() < len(reached)
+        turned = int(np.flatnonzero(reached & (found.turns > 2.0))[0])
+        for which in (found.best, found.centre, turned):
+            np.testing.assert_allclose(
+                chain.forward(found.joints[which]), wanted(chain, found, which, task), atol=1e-8
+            )
+            again = arm.expected(found.joints[which], model).mean()
+            assert found.errors[which] == pytest.approx(again, rel=1e-12)
+        assert found.errors[found.best] == np.nanmin(found.errors)
+        assert len(np.unique(found.turns)) == 3
+        grid = slice(0, 4**3 * 3)  # what comes after it are refinements
+        there = found.positions[grid][reached[grid]]
+        distance = np.linalg.norm(found.positions[grid] - there.mean(axis=0), axis=1)
+        nearest = np.where(reached[grid], distance, np.inf).min()
+        assert distance[found.centre] == pytest.approx(nearest)
+
+
+def test_the_arm_goes_on_from_pose_to_pose():
+    """Round its base it turns its first joint and keeps its configuration."""
+    angle = np.radians(np.linspace(-150.0, 150.0, 40))
+    arc = np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), np.zeros(40)])
+    turns = exp_rotation(np.column_stack([np.zeros((40, 2)), angle]))
+    region = np.array([[-0.05, -0.05, 0.0], [0.05, 0.05, 0.3]])
+    found = place(calibrated(), transform(turns @ DOWN, arc), region=region, cells=3)
+    reached = ~np.isnan(found.errors)
+    moves = np.abs(np.diff(found.joints[reached], axis=1)).max(axis=(1, 2))
+    assert reached.mean() > 0.8
+    assert np.median(moves) < 0.3
+
+
+def test_placements_keep_to_the_region(placed):
+    region = np.array([[0.3, -0.4, 0.1], [0.8, 0.4, 0.5]])
+    found = place(calibrated(), TASK, 'mean', 'nominal', region, cells=4)
+    assert ((region[0] - 1e-9 <= found.positions) & (found.positions <= region[1] + 1e-9)).all()
+    assert (~np.isnan(found.errors)).mean() > 0.8
+    distance = np.linalg.norm(found.positions[found.centre] - region.mean(axis=0))
+    assert distance < np.linalg.norm(region[1] - region[0]) / 6  # half a step of the grid
+    assert placed.errors[placed.best] < found.errors[found.best]
+
+
+def test_a_finer_search_does_not_find_much_more():
+    region = np.array([[0.3, -0.5, -0.3], [1.0, 0.5, 0.5]])
+    coarse, fine = (
+        place(calibrated(), TASK[::3], 'mean', 'nominal', region, cells).errors for cells in (4, 8)
+    )
+    assert np.nanmin(coarse) < 1.1 * np.nanmin(fine)
+
+
+def test_a_task_out_of_reach_is_refused():
+    arm = calibrated()
+    far = TASK.copy()
+    far[0, 0, 3] = 10.0
+    with pytest.raises(InputError, match='reaches all 12 poses of the task at none'):
+        place(arm, far, cells=3)
+    for upper in ([0.2, 1.0, 1.0], [np.nan, 1.0, 1.0]):
+        with pytest.raises(InputError, match='give the lower corner first'):
+            place(arm, TASK, region=np.array([[0.3, -1.0, 0.0], upper]))
+    with pytest.raises(UnknownNameError, match='aim "least"'):
+        place(arm, TASK, 'least')
+
+
+def test_a_task_from_a_box_of_joint_values_is_reached_where_it_came_from():
+    arm = calibrated()
+    middle = np.array([0.2, -1.4, 1.6, -0.5, 1.0, 0.2])
+    q = middle + np.random.default_rng(0).uniform(-0.2, 0.2, (10, 6))
+    poses = workspace.in_base(arm.chain, q)
+    task = task_of(poses)
+    np.testing.assert_allclose(task[:, :3, 3].max(axis=0), -task[:, :3, 3].min(axis=0))
+    there = (poses - task)[0, :3, 3]
+    found = place(arm, task, region=np.array([there, there + 1e-9]), cells=1)
+    np.testing.assert_allclose(arm.chain.forward(found.joints[0]), arm.chain.forward(q), atol=1e-8)
+
+
+def test_a_box_of_joint_values_is_a_task():
+    box = (0, -1.6, 1.4, -0.6, 0.9, 0, 0.3, -1.3, 1.6, -0.4, 1.1, 0.4)
+    options = Namespace(task=None, joint_box=box, model='corrected')
+    task = _task(options, calibrated(), np.random.default_rng(0))
+    assert task.shape == (30, 4, 4)
+    np.testing.assert_allclose(task[:, :3, 3].max(axis=0), -task[:, :3, 3].min(axis=0))

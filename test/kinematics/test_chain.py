@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from calib_ros.kinematics.chain import Chain, Joint
+
+HALF = np.pi / 2
+
+
+def row_of(alphas, convention, types='rrrrrr'):
+    kinds = {'r': 'revolute', 'p': 'prismatic'}
+    rows = [
+        Joint(f'j{k + 1}', kinds[types[k]], a=0.3, alpha=alpha) for k, alpha in enumerate(alphas)
+    ]
+    return Chain('arm', convention, tuple(rows))
+
+
+@pytest.mark.parametrize(
+    ('alphas', 'convention', 'parallel'),
+    [
+        # A row leads from its axis to the next (standard) or from the one before (modified).
+        ((HALF, 0.0, 0.0, HALF, -HALF, 0.0), 'standard', ('j2', 'j3')),
+        ((0.0, HALF, 0.0, 0.0, HALF, -HALF), 'modified', ('j3', 'j4')),
+        ((0.0, 0.0), 'standard', ('j1',)),
+        ((0.0, 0.0), 'modified', ('j2',)),
+        ((HALF, np.pi, HALF), 'standard', ('j2',)),
+        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', ('j2',)),
+    ],
+)
+def test_parallel_by_convention_and_tilt(alphas, convention, parallel):
+    assert row_of(alphas, convention).parallel == parallel
+
+
+@pytest.mark.parametrize(
+    ('types', 'convention', 'parallel'),
+    [
+        ('rrr', 'standard', ('j1', 'j2')),
+        ('rpr', 'standard', ('j1', 'j2')),
+        ('rpp', 'standard', ('j1',)),
+        ('rpr', 'modified', ('j2', 'j3')),
+        ('rrp', 'modified', ('j2', 'j3')),
+        ('rpp', 'modified', ('j2',)),
+    ],
+)
+def test_rows_that_join_parallel_axes_are_found_unless_both_are_prismatic(
+    types, convention, parallel
+):
+    assert row_of((0.0, 0.0, 0.0), convention, types).parallel == parallel
+
+
+def test_a_nominal_beta_tilts_the_axis():
+    rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.2, 0.0]))
+    assert Chain('arm', 'standard', rows).parallel == ('j0',)

@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sessions import SIGMAS, UR5E, drive, samples, session, tracker
+from streams import (
+    joint_state,
+    of_joints,
+    take,
+)
+
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+# Settings and words
+
+
+def test_settings_change_without_losing_anything():
+    made = session(samples())
+    made.change(replace(made.settings, fixed=('*.alpha',)))
+    result = made.identify()
+    assert len(made.samples) == 30
+    assert {p.name for p in result.parameters if p.status == 'fixed'} == {
+        f'{name}.alpha' for name in UR5E.joint_names
+    }
+
+
+def test_the_way_of_a_stop_can_be_changed_while_it_runs():
+    made = CalibrationSession(UR5E, Settings(**SIGMAS))
+    where = UR5E.random_joints(3, np.random.default_rng(1))
+    end = drive(made, where, [tracker()])
+    made.finish()
+    made.change(replace(made.settings, shortest_stop=2.0))
+    drive(made, where + 0.1, [tracker()], start=end)
+    made.finish()
+    assert len(made.samples) == 3
+    assert made.account().unused['measurements: the stop was too short'] > 0
+
+
+def test_the_status_tells_how_far_it_is():
+    made = session(samples(6))
+    assert made.status().startswith('waiting for joint states; 6 poses, ')
+    assert 'too few to tell how many it takes' in made.status()
+    assert 'more' not in made.status()
+    made.restore(samples(60, start=100))
+    assert 'mm expected' in made.status()
+    made.change(replace(made.settings, wanted_accuracy=1e-2))
+    assert 'enough for the accuracy wanted' in made.status()
+    made.change(replace(made.settings, wanted_accuracy=1e-6))
+    assert 'more expected for 0.001 mm' in made.status()
+
+
+@pytest.mark.parametrize(
+    ('model', 'advice'),
+    [('geometric', 'set model to auto, more'), ('ratio', 'is the target firm? More')],
+)
+def test_no_forecast_where_what_is_left_is_not_noise(rng, model, advice):
+    """Errors that the model lacks do not average out."""
+    given = [
+        replace(each, position=each.position + 1e-3 * np.sin(7.0 * each.joints[:3]))
+        for each in samples(60)
+    ]
+    made = session(given, loss='none', model=model)
+    assert re.search(rf'{re.escape(advice)} will not help: what is left is 1\d x', made.status())
+    assert 'expected for' not in made.status()
+    made.change(replace(made.settings, sigma_position=1e-3))  # it is the noise of the device
+    assert 'more expected for 0.1 mm' in made.status()
+    as_noisy = session([replace(each, spread=1e-3) for each in given], loss='none', model=model)
+    assert 'more expected for 0.1 mm' in as_noisy.status()
+
+
+def test_the_status_names_a_sample_that_does_not_fit():
+    given = samples(50)
+    made = session(given[:45])
+    assert 'does not fit' not in made.status()
+    made.samples.append(replace(given[45], position=given[45].position + 0.01))
+    assert 'pose 46 does not fit the others' in made.status()
+    made.remove_last()
+    assert 'does not fit' not in made.status()
+
+
+def test_the_status_names_joints_that_hardly_moved():
+    given = samples(10)
+    joints = [np.array([*each.joints[:5], 0.01 * k]) for k, each in enumerate(given)]
+    made = session([replace(each, joints=q) for each, q in zip(given, joints, strict=True)])
+    assert 'hardly moved so far: wrist_3_joint' in made.status()
+
+
+def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
+    """Of two drivers that each name some joints one has died."""
+    made = session()
+    come = []
+    for k in range(200):
+        stamp = 1_700_000_000_000_000_000 + k * 50_000_000
+        come.append(of_joints(joint_state(stamp, UR5E.joint_names[:4], [0.0] * 4)))
+        if k < 50:
+            come.append(of_joints(joint_state(stamp, UR5E.joint_names[4:], [0.0] * 2)))
+    take(made, *come[:110])
+    assert 'the arm stands' in made.status()
+    take(made, *come[110:])
+    assert made.status().startswith(
+        'nothing can be sampled: no joint states of wrist_2_joint, wrist_3_joint come any more'
+    )
+
+
+def test_the_status_is_never_an_error():
+    only_judging = session(samples(10, validation=True))
+    assert '; 0 poses' in only_judging.status()
+    (one,) = samples(1)
+    same_place = session([replace(one, stamp_ns=k) for k in range(1, 20)])
+    assert '; 19 poses' in same_place.status()
+    assert '; 0 poses' in CalibrationSession(UR5E).status()
+    assert CalibrationSession(UR5E).status('identifying') == (
+        'waiting for joint states; identifying; 0 poses'
+    )
