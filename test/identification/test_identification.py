@@ -131,10 +131,10 @@ def test_fixed_parameters_stay_nominal():
 def test_too_few_pairs_say_how_many_are_needed():
     rng = np.random.default_rng(13)
     seen = measure(UR10E, UR10E.random_joints(4, rng), rng)
-    with pytest.raises(TooFewObservationsError, match=r'4 measured configurations .* at least 5'):
+    with pytest.raises(TooFewObservationsError, match=r'^4 measured .* at least 5'):
         identify(Problem(UR10E, seen))
     same = seen.select(np.zeros(50, dtype=int))
-    with pytest.raises(TooFewObservationsError, match='1 measured configurations'):
+    with pytest.raises(TooFewObservationsError, match=r'^1 measured'):
         identify(Problem(UR10E, same))
 
 
