@@ -209,14 +209,6 @@ def test_the_report_says_what_is_shared_and_what_follows():
     assert 'share no error' in noise_in_words(quiet)
 
 
-@pytest.mark.parametrize('count', [2, 7, 8])
-def test_few_poses_do_no_harm(count):
-    *_, seen = measured_arm(10, count)
-    priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
-    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
-    assert result.noise.shared == ()
-
-
 def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     """Against the same traces of whole matrices."""
     rng = np.random.default_rng(0)
