@@ -16,7 +16,7 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -147,11 +147,15 @@ class Compensation(Solution):
 
 
 def compensate(
-    compensator: Compensator, joints: FloatArray, approach: FloatArray | None = None
+    compensator: Compensator,
+    joints: FloatArray,
+    approach: FloatArray | None = None,
+    heard: Callable[[float], None] | None = None,
 ) -> Compensation:
     """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
 
-    `approach` (N, n) holds the signs of the velocities before, for backlash.
+    `approach` (N, n) holds the signs of the velocities before, for backlash;
+    `heard` is called with the share that is done.
 
     Raises
     ------
@@ -165,11 +169,11 @@ def compensate(
         raise InputError(f'joint values must have the shape (N, {count}), not {command.shape}')
     bad = np.flatnonzero(~np.isfinite(command).all(axis=1))
     if bad.size:
-        raise InputError(f'joint values of sample {bad[0]} are not all finite numbers')
+        raise InputError(f'joint values of point {bad[0]} are not all finite numbers')
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
-    solution = follower.solve(command, approach)
+    solution = follower.solve(command, approach, heard=heard)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))
@@ -180,7 +184,7 @@ def compensate(
 def in_words(compensator: Compensator, result: Compensation) -> str:
     """Return the largest correction and the errors before and after, in a line."""
     kept = np.asarray(~np.isnan(result.joints).any(axis=1))
-    text = f'{np.count_nonzero(kept)} of {len(kept)} samples corrected'
+    text = f'{np.count_nonzero(kept)} of {len(kept)} points corrected'
     if not kept.any():
         return text
     size = np.abs(result.correction[kept]).max(axis=0)

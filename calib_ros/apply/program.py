@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,11 +19,12 @@ from calib_ros.apply.compensation import (
     too_fast,
 )
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 
-NUDGE = 0.01
-"""Step of the differences for velocities, in units of the largest correction."""
+NUDGE = HALF_THE_DIGITS**0.25
+"""Step of the differences, in units of the largest correction: second ones of what is right by
+half the digits lose least so."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,11 +52,13 @@ class Program(Shown):
     approach: FloatArray | None = None
 
 
-def compensate_program(compensator: Compensator, program: Program) -> tuple[Program, Compensation]:
-    """Return a program with corrected joint values, and what became of each sample.
+def compensate_program(
+    compensator: Compensator, program: Program, heard: Callable[[float], None] | None = None
+) -> tuple[Program, Compensation]:
+    """Return a program with corrected joint values, and what became of each point.
 
     Velocities and accelerations follow the corrected path; times stay. Joints that are not of the
-    arm stay as they are. Refused samples are NaN.
+    arm stay as they are. Refused points are NaN; `heard` is called with the share that is done.
 
     Raises
     ------
@@ -66,7 +69,7 @@ def compensate_program(compensator: Compensator, program: Program) -> tuple[Prog
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]
     approach = approaches(positions) if program.approach is None else program.approach
-    result = compensate(compensator, positions, approach)
+    result = compensate(compensator, positions, approach, heard)
     if program.velocities is None:
         return replace(program, positions=_put(program.positions, columns, result.joints)), result
     given = program.accelerations

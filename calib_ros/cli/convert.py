@@ -62,7 +62,8 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
     for note in notes:
         screen.warn(note, 'note')
     write_file(options.out, text, overwrite=options.force)
-    screen.say(f'wrote {options.out}: {len(columns.lines)} rows of {text.partition(chr(10))[0]}')
+    header = text.partition('\n')[0].replace(',', ', ')
+    screen.say(f'wrote {options.out}: {len(columns.lines)} rows of {header}')
     return 0
 
 
@@ -96,7 +97,7 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:
-        raise InputError(f'{options.bag} gives no samples ({session.account()})')
+        raise InputError(f'{options.bag} gives no poses ({session.account()})')
     write_file(options.csv, table_text(samples, len(chain.joints)), overwrite=options.force)
     for warning in read.warnings:
         screen.warn(warning)

@@ -18,7 +18,7 @@ from calib_ros.files.rows import Row
 
 
 def _add_fleet(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.fleet.watch import YEARS
+    from calib_ros.apply.chart import YEARS
 
     add = parser.add_argument
     add('plant', type=Path, metavar='PLANT', help='plant.yaml: the robots (docs/fleet.md)')

@@ -40,7 +40,7 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
 
 def _add_simulation(parser: argparse._ArgumentGroup) -> None:
     add = parser.add_argument
-    add('--poses', type=int, default=60, metavar='N', help='configurations to measure')
+    add('--poses', type=int, default=60, metavar='N', help='poses to measure')
     add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
     common.add_storage(parser)
 

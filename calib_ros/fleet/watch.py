@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
+from calib_ros.apply.chart import YEARS
 from calib_ros.files.rows import Row
 from calib_ros.identification.changes import (
     Columns,
@@ -45,8 +46,6 @@ from calib_ros.kinematics.se3 import FloatArray
 
 LAGS = (1, 2, 4, 8)
 """Nights that a change is looked for in: a large one shows at once, a small one after some."""
-YEARS = 100.0
-"""Time between false alarms of a robot, of one night each day."""
 
 
 @dataclass(frozen=True, eq=False)

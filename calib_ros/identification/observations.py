@@ -34,7 +34,7 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     'points': (3,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
-POSES = 200
+SOME_POSES = 200
 """Poses that stand for many: random ones for the joint range, even ones for those measured."""
 
 
@@ -157,7 +157,7 @@ class Observations(Shown):
         The joint values (N, n) are those of the image, the `points` (N, 3) [m] those of the board
         that are seen at `pixels` (N, 2).
         """
-        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
+        plain = cls.from_arrays(joints, np.broadcast_to(np.zeros(3), (len(joints), 3)))
         stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
         return replace(
             plain,
@@ -178,14 +178,18 @@ class Observations(Shown):
         """Return the pairs chosen by a mask, by indices or a slice; they have been checked."""
         chosen = object.__new__(Observations)
         vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
-        vars(chosen).update({name: array[mask] for name, array in self._arrays().items()})
+        count = len(self.stamps_ns[mask])
+        for name, array in self._arrays().items():
+            alike = array.strides[0] == 0  # what all pairs share stays one row
+            few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
+            vars(chosen)[name] = few
         if 'configurations' in vars(self):  # takes longer to find than all the rest
             _, vars(chosen)['configurations'] = np.unique(
                 self.configurations[mask], return_inverse=True
             )
         return chosen
 
-    def spread(self, most: int = POSES) -> Observations:
+    def spread(self, most: int = SOME_POSES) -> Observations:
         """Return every so many pairs, at most so many."""
         step = 1 + len(self) // most
         return self if step == 1 else self.select(np.arange(0, len(self), step))
@@ -238,12 +242,12 @@ class Observations(Shown):
         """Return the same pairs with other stamps (N,)."""
         return replace(self, stamps_ns=stamps_ns)
 
-    def earlier(self, delay: float) -> Observations:
+    def earlier(self, delay: float | None) -> Observations:
         """Return the same measurements with the joint values of a delay [s] before the stamps.
 
         By velocity and acceleration; without them the arm stood and nothing changes.
         """
-        if self.velocity is None:
+        if self.velocity is None or delay is None:
             return self
         more = np.full((len(self), 1), delay)
         if self.delay is not None:

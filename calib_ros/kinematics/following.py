@@ -19,7 +19,7 @@ Arrays inside are laid out (component, sample), as in `jacobian.py`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import ITERATIONS, LEVER, Aim, limits, solve_positive
+from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, transform
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, transform
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.shown import Shown
 
@@ -123,14 +123,23 @@ class Follower:
         self._diagonal = np.diag_indices(len(unit))
 
     def solve(
-        self, joints: FloatArray, approach: FloatArray | None = None, bounded: bool = True
+        self,
+        joints: FloatArray,
+        approach: FloatArray | None = None,
+        bounded: bool = True,
+        heard: Callable[[float], None] | None = None,
     ) -> Solution:
-        """Return the changes for commands (N, n), within the limits of the joints if bounded."""
+        """Return the changes for commands (N, n), within the limits of the joints if bounded.
+
+        `heard` is called with the share that is done.
+        """
         parts = []
         for start in range(0, len(joints), BLOCK):
             rows = slice(start, start + BLOCK)
             came = None if approach is None else np.ascontiguousarray(approach[rows].T)
             parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
+            if heard is not None:
+                heard(min(1.0, rows.stop / len(joints)))
         names = [each.name for each in fields(Solution)]
         found = {name: [getattr(part, name) for part in parts] for name in names}
         iterations = max(found.pop('iterations'))
@@ -193,7 +202,8 @@ class Follower:
 
         A step that raises the cost is not taken, and tried again with more damping, from a
         thousandth of the diagonal on (Marquardt 1963). Samples settle for a cost that does not
-        fall any more if told so; else they are given up when x is longer than 1.
+        fall any more if told so; else they are given up when x is longer than 1. `inverse.solve`
+        has neither D nor such an end, and stays within the limits instead.
 
         Returns
         -------
@@ -207,7 +217,7 @@ class Follower:
         x, caution, still = task.start, np.zeros(active.size), np.zeros(active.size, dtype=bool)
         error, columns = self._linearise(task, x, weight)
         iterations = 0
-        while iterations < ITERATIONS:
+        while iterations < ROUNDS:
             iterations += 1
             normal = np.einsum('ikb,jkb->ijb', columns, columns) + stiffness
             normal[self._diagonal] *= 1.0 + caution

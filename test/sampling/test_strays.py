@@ -22,7 +22,7 @@ from streams import (
 
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.slices import JOINTS, MANY, POSES, Piece, Slice, StreamKey
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
 from calib_ros.sampling.strays import Gate
 from calib_ros.settings import Settings
 
@@ -120,7 +120,7 @@ def test_measurements_may_come_long_before_their_joint_states():
 def test_every_message_passes_is_held_back_or_is_counted(messages):
     passed, gate = through(messages)
     assert len(passed) + count(gate) == len(messages)
-    assert max(gate.held(JOINTS), gate.held(POSES)) < MANY
+    assert max(gate.held(JOINTS), gate.held(POSES)) < NO_ACCIDENT
 
 
 @given(
@@ -206,7 +206,8 @@ def test_two_stray_stamps_cost_two_messages(rng, mode, off):
     found = session_of([*given[:962], *stray, *given[962:]], mode=mode)
     assert_same_samples(expected, found)
     cause = 'stamp far from those before and after'
-    kinds = {f'{"joints" if hasattr(each, "position") else "poses"}: {cause}' for each in stray}
+    of = ['joints' if hasattr(each, 'position') else 'measurements' for each in stray]
+    kinds = {f'{kind}: {cause}' for kind in of}
     assert {key for key in found.account().dropped if cause in key} == kinds
     others = {key: n for key, n in found.account().dropped.items() if cause not in key}
     assert others == expected.account().dropped
