@@ -23,10 +23,6 @@ from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
-LARGEST_LOSS = 0.1
-"""Share of the messages of a bag that may be lost. As many fewer samples at random make standard
-deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
-
 
 @dataclass(frozen=True, eq=False)
 class Loaded:

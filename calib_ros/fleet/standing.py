@@ -16,7 +16,8 @@ from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, results
-from calib_ros.fleet.watch import YEARS, Watched, watch
+from calib_ros.fleet.watch import Watched, watch
+from calib_ros.settings import YEARS
 
 State: TypeAlias = Literal['changed', 'worse', 'unreadable', 'refused', 'beyond tolerance', 'fine']
 STATES: tuple[State, ...] = get_args(State)

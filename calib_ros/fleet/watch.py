@@ -42,11 +42,10 @@ from calib_ros.identification.changes import (
 from calib_ros.identification.levels import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import YEARS
 
 LAGS = (1, 2, 4, 8)
 """Nights that a change is looked for in: a large one shows at once, a small one after some."""
-YEARS = 100.0
-"""Time between false alarms of a robot, of one night each day."""
 
 
 @dataclass(frozen=True, eq=False)
