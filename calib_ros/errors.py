@@ -74,7 +74,7 @@ class TooFewObservationsError(InputError):
         self.configurations = configurations
         self.needed = needed
         super().__init__(
-            f'{configurations} measured configurations are too few, at least {needed} are '
+            f'{configurations} measured poses are too few, at least {needed} are '
             f'needed: {why}; measure more poses or fix parameters'
         )
 

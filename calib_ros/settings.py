@@ -22,13 +22,14 @@ MODELS: tuple[Model, ...] = get_args(Model)
 """By which an arm is commanded."""
 STORAGES = ('mcap', 'sqlite3')
 """Of bags."""
-LARGEST_LOSS = 0.1
-"""Share of the messages of a bag that may be lost. As many fewer samples at random make standard
-deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
+EXCEPTION = 0.1
+"""Share of a whole up to which it is the exception. So many samples fewer, at random, make
+standard deviations 5 % larger, less than their own uncertainty; more may be a part of the
+workspace."""
 GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
 YEARS = 100.0
-"""Time between false alarms of a robot, of one night each day."""
+"""Time between false alarms of a robot, of one night each day, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')
 """How samples are taken."""
 STARTUP = (
@@ -73,17 +74,17 @@ class Settings:
         0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
     )
     max_gap: float = _setting(
-        0.1, 'longest time between the two joint samples that bracket a pose [s]', 0.0
+        0.1, 'longest time between the two joint states that bracket a measurement [s]', 0.0
     )
     joint_buffer: int = _setting(
-        200_000, 'joint samples that may wait; the older half is let go when it is full', 2
+        200_000, 'joint states that may wait; the older half is let go when it is full', 2
     )
     pose_buffer: int = _setting(
-        50_000, 'measurements that may wait, and samples kept, of each source', 1
+        50_000, 'measurements that may wait, and poses kept, of each source', 1
     )
     mode: str = _setting(
         'dwell',
-        'dwell (each stop of the arm becomes a sample), continuous (each measurement does, moving '
+        'dwell (each stop of the arm becomes a pose), continuous (each measurement does, moving '
         'or not) or triggered (one by each call of ~/capture)',
     )
     still: float = _setting(
@@ -92,7 +93,7 @@ class Settings:
     settle: float = _setting(
         0.1, 'time after a stop in which it is not measured yet: vibration [s]', 0.0
     )
-    shortest_stop: float = _setting(0.2, 'a shorter stop is no sample [s]', 0.0)
+    shortest_stop: float = _setting(0.2, 'a shorter stop is no pose [s]', 0.0)
     longest_stop: float = _setting(5.0, 'of a longer stop only the beginning is used [s]', 0.0)
     lateness: float = _setting(
         1.0, 'how much later than joint states of the same stamp measurements may come [s]', 0.0

@@ -14,6 +14,17 @@ import numpy as np
 
 from calib_ros.errors import ConfigError
 
+NAMED = 5
+"""Things of a kind that a sentence names."""
+LISTED = 20
+"""Things of a kind that a table or a longer text lists."""
+
+
+def some(words: Sequence[str], most: int = NAMED) -> list[str]:
+    """Return the first of some words, and how many more there are."""
+    more = len(words) - most
+    return [*words[:most], f'and {more} more'] if more > 0 else list(words)
+
 
 class Shown:
     """A dataclass whose fields are shown in brief: arrays by shape, long values by their size."""

@@ -15,11 +15,15 @@ from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
+SAME = 1e-9
+"""Lengths [m] and angles [rad] that differ by less are the same."""
 LARGEST = 1e6
 """Largest number [m or rad] that is measured or set; some devices send the largest float for
 none."""
 LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
+MOST_NAMES = 50
+"""What a cell has of each kind: joints of a chain, frames, targets, sets of joint names."""
 LONGEST_NAME = LONGEST // 2
 """Characters of a name, a number or an expression: a message has room for it and more."""
 
@@ -110,8 +114,8 @@ def covariance_faults(covariances: NDArray[np.float64]) -> NDArray[np.str_]:
     refuse((variances <= 0.0).any(axis=1), 'not positive definite')
     full[found != ''] = np.eye(6)
     sigmas = np.sqrt(np.diagonal(full, axis1=1, axis2=2))
-    believed = (sigmas >= 1e-9) & (sigmas <= LARGEST)
-    refuse(~believed.all(axis=1), f'with a sigma not within 1e-09 and {LARGEST:g}')
+    believed = (sigmas >= SAME) & (sigmas <= LARGEST)
+    refuse(~believed.all(axis=1), f'with a sigma not within {SAME:g} and {LARGEST:g}')
     normed = full / sigmas[:, :, np.newaxis] / sigmas[:, np.newaxis, :]
     mixed = np.flatnonzero((normed * (1.0 - np.eye(6))).any(axis=(1, 2)))
     definite = np.ones(len(found), dtype=bool)

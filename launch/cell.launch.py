@@ -6,7 +6,7 @@
 
 The node, robot_state_publisher with the URDF, RViz, an aggregator of diagnostics, and the driver
 of the measuring device, whose topic of poses is remapped. A node that was killed is started again
-and goes on with its samples; one that ended by itself is not.
+and goes on with its poses; one that ended by itself is not.
 """
 
 import sys

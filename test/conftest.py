@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import gc
 import os
 import shutil
 import tempfile
@@ -30,6 +31,10 @@ def rng():
 def no_signs_of_life(monkeypatch):
     """Keep lines that tell how long a command takes, on a busy machine, from its output."""
     monkeypatch.setattr('calib_ros.cli.screen.EVERY_S', 1e6)
+
+
+def pytest_collection_finish():
+    gc.freeze()  # thousands of tests need not be looked at again by every collection
 
 
 def pytest_unconfigure():

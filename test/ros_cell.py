@@ -193,7 +193,7 @@ class Cell:
         queue = []
         for topic, messages in streams.items():
             publisher = self.publisher(type(messages[0]), topic, reliability)
-            stream = 'joints' if isinstance(messages[0], JointState) else 'poses'
+            stream = 'joints' if isinstance(messages[0], JointState) else 'measurements'
             late = 0 if stream == 'joints' else late_ns
             queue += [(stamp_ns(m) + late, stream, publisher, m) for m in messages]
         if jitter is not None:

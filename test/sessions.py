@@ -25,12 +25,17 @@ UR5E = load_chain('ur5e')
 TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))
 
 
-def samples(count=30, seed=5, true=TRUE, start=0, **more):
-    rng = np.random.default_rng(seed)
-    joints = UR5E.random_joints(count, rng)
-    seen = measure(true, joints, rng, *NOISE)
-    rows = enumerate(zip(joints, seen.positions, seen.rotations, strict=True), start + 1)
+def seen(true, count, rng, oriented=True, start=0, **more):
+    """Return samples of a true chain at random configurations."""
+    joints = true.random_joints(count, rng)
+    found = measure(true, joints, rng, *NOISE, oriented=oriented)
+    turns = found.rotations if oriented else [None] * count
+    rows = enumerate(zip(joints, found.positions, turns, strict=True), start + 1)
     return [Sample(k, q, position=p, rotation=r, **more) for k, (q, p, r) in rows]
+
+
+def samples(count=30, seed=5, true=TRUE, **more):
+    return seen(true, count, np.random.default_rng(seed), **more)
 
 
 def session(*given, **settings):
@@ -61,8 +66,8 @@ def drive(made, configurations, sources, start=0.0, rate=25.0):
 def tracker(true=TRUE, seed=3):
     rng = np.random.default_rng(seed)
 
-    def seen(stamp, row):
+    def message(stamp, row):
         found = measure(true, row[np.newaxis], rng, *NOISE)
         return pose(stamp, found.positions[0], found.rotations[0])
 
-    return TRACKER, POSE, seen
+    return TRACKER, POSE, message

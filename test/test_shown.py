@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Public values on a screen."""
 
+import importlib
+import pkgutil
 import re
 import sys
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.shown import Shown
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
@@ -53,6 +56,7 @@ def test_without_pandas_that_is_said(monkeypatch):
 def test_a_notebook_shows_the_verdict_and_its_reasons():
     refused = replace(RESULT, refusals=(Reason(Rule.GAIN, 'no <b>gain'),))
     assert 'accepted</strong>' in RESULT._repr_html_()
+    assert f'{1e3 * RESULT.parameters[0].half_width():.4f}' in RESULT._repr_html_()
     shown = refused._repr_html_()
     assert 'not accepted' in shown
     assert 'no &lt;b&gt;gain' in shown
@@ -60,6 +64,24 @@ def test_a_notebook_shows_the_verdict_and_its_reasons():
 
 def test_arrays_are_told_by_their_shape():
     assert 'joints=float64[200, 6]' in repr(SEEN)
+
+
+def test_values_are_frozen_and_those_of_arrays_equal_themselves_alone():
+    """Comparison of arrays has no truth value, and what has changed since cannot be a key."""
+    found = set()
+    for module in pkgutil.walk_packages(calib_ros.__path__, 'calib_ros.'):
+        if module.name.split('.')[1] not in ('kinematics', 'identification', 'apply'):
+            continue
+        for value in vars(importlib.import_module(module.name)).values():
+            if not (isinstance(value, type) and is_dataclass(value)):
+                continue
+            found.add(value)
+            assert value.__dataclass_params__.frozen, value
+            if any('Array' in str(field.type) for field in fields(value)):
+                assert value.__eq__ is object.__eq__, value
+            if issubclass(value, Shown):
+                assert value.__repr__ is Shown.__repr__, value
+    assert len(found) > 50
 
 
 def test_names_of_others_stay_text_in_html():

@@ -14,9 +14,6 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 
-MOST_DRAWS = 1000
-"""Draws per candidate after which a measurable region is said to be out of reach."""
-
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
@@ -81,9 +78,15 @@ class Visibility:
 
 
 def draw_candidates(
-    design: Design, count: int, rng: np.random.Generator, visibility: Visibility | None = None
+    design: Design,
+    count: int,
+    rng: np.random.Generator,
+    visibility: Visibility | None = None,
+    tries: int = 1000,
 ) -> FloatArray:
     """Draw joint values (count, n) within the limits at which the target can be measured.
+
+    The region is out of reach where so many `tries` for each do not find them.
 
     Raises
     ------
@@ -94,7 +97,7 @@ def draw_candidates(
     found = np.zeros((0, len(design.chain.joints)))
     drawn = 0
     while len(found) < count:
-        if drawn > MOST_DRAWS * count:
+        if drawn > tries * count:
             raise InputError(
                 f'the target can be measured at {len(found)} of {drawn} random poses only, '
                 f'{count} candidates are wanted: widen box and cone, or give a file of candidates'

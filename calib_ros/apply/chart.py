@@ -26,14 +26,13 @@ from scipy import optimize, special
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import YEARS
 
 SLOPES = (0.5, 2.0)
 """References k: shifts of one and of four standard deviations show soonest."""
-STATES = 200
-"""Of the Markov chain; more change the run length by less than a hundredth (test_chart.py)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drift:
     """What a chart of one robot shows.
 
@@ -57,7 +56,7 @@ class Drift:
     since: tuple[int, ...]
 
 
-def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) -> Drift:
+def drift(rms: Sequence[float], freedom: Sequence[float], years: float = YEARS) -> Drift:
     """Look for nights from which on an arm is worse.
 
     Parameters
@@ -100,14 +99,17 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float = 100.0) 
     return Drift(scores, shares, tuple(alarms), tuple(since))
 
 
-def run_length(slope: float, height: float) -> float:
-    """Return after how many normal values a one-sided CUSUM exceeds a height, on average."""
-    width = 2.0 * height / (2 * STATES - 1)
-    middles = width * np.arange(STATES)
+def run_length(slope: float, height: float, states: int = 200) -> float:
+    """Return after how many normal values a one-sided CUSUM exceeds a height, on average.
+
+    More states of the Markov chain change it by less than a hundredth (test_chart.py).
+    """
+    width = 2.0 * height / (2 * states - 1)
+    middles = width * np.arange(states)
     upper = middles[np.newaxis] - middles[:, np.newaxis] + 0.5 * width + slope
     stays = special.ndtr(upper)
     stays[:, 1:] -= special.ndtr(upper[:, 1:] - width)
-    return float(np.linalg.solve(np.eye(STATES) - stays, np.ones(STATES))[0])
+    return float(np.linalg.solve(np.eye(states) - stays, np.ones(states))[0])
 
 
 @cache

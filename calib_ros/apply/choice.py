@@ -27,15 +27,11 @@ from scipy import linalg
 from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import CRITERIA, Criterion
 
 Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """Returns the worth (N,) of candidates from information (P, P) and their rows (N, m, P)."""
-
-RIDGE = 1e-9
-"""Information about everything, in that of an average candidate, that keeps M invertible; and the
-least relative gain of an exchange, so that exchanges come to an end."""
 
 
 def choose(
@@ -95,7 +91,7 @@ class _Pick:
 
     def __init__(self, space: Candidates, apart: float) -> None:
         self._joints, self._rows = space.joints, space.rows
-        self._start = space.known + RIDGE * np.eye(len(space.known))
+        self._start = space.known + HALF_THE_DIGITS * np.eye(len(space.known))  # invertible
         self._apart = apart
         self._near: list[NDArray[np.bool_]] = []
         self._blocked = np.zeros(len(space.rows), dtype=np.intp)
@@ -134,7 +130,7 @@ class _Pick:
             self.information = self.information - information_of(self._rows[old])
             worth = np.where(self._blocked > 0, -np.inf, score(self.information, self._rows))
             new = int(worth.argmax())
-            if worth[new] - worth[old] > RIDGE * abs(worth[old]):
+            if worth[new] - worth[old] > HALF_THE_DIGITS * abs(worth[old]):
                 changed = True
             else:
                 new = old
@@ -207,7 +203,7 @@ def efficiency(
     (Kiefer and Wolfowitz 1960) bounds what the candidates with the steepest slopes would bring.
     """
     space = Candidates(design, candidates)
-    ridge = RIDGE * np.eye(len(space.known))
+    ridge = HALF_THE_DIGITS * np.eye(len(space.known))
     root = _root(space.known + information_of(space.rows[chosen]) + ridge)
     slope = root @ root.T
     if task is not None:

@@ -162,7 +162,7 @@ def compensate(
         raise InputError(f'joint values must have the shape (N, {count}), not {command.shape}')
     bad = np.flatnonzero(~np.isfinite(command).all(axis=1))
     if bad.size:
-        raise InputError(f'joint values of sample {bad[0]} are not all finite numbers')
+        raise InputError(f'joint values of point {bad[0]} are not all finite numbers')
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
@@ -177,7 +177,7 @@ def compensate(
 def in_words(compensator: Compensator, result: Compensation) -> str:
     """Return the largest correction and the errors before and after, in a line."""
     kept = np.asarray(~np.isnan(result.joints).any(axis=1))
-    text = f'{np.count_nonzero(kept)} of {len(kept)} samples corrected'
+    text = f'{np.count_nonzero(kept)} of {len(kept)} points corrected'
     if not kept.any():
         return text
     size = np.abs(result.correction[kept]).max(axis=0)

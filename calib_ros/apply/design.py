@@ -22,15 +22,12 @@ from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.sampling.live import Estimate
 from calib_ros.shown import Shown
 
 ASSUMED_TOOL = (0.1, 0.1, 0.1)
 """Where the target is taken to be [m] in the flange's frame when nothing is known about it."""
-UNDETERMINED = 1e-7
-"""A direction of the parameters with less information, in that of an average candidate, is not
-determined."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -168,8 +165,8 @@ def accuracy(design: Design, joints: FloatArray, task: FloatArray) -> FloatArray
     each = np.swapaxes(space.rows, 1, 2) @ space.rows
     values, vectors = np.linalg.eigh(space.known + np.cumsum(each, axis=0))
     along = np.einsum('npk,pq,nqk->nk', vectors, space.of_task(task), vectors, optimize=True)
-    squares = (along / np.maximum(values, UNDETERMINED)).sum(axis=1)
-    return np.where(values[:, 0] < UNDETERMINED, np.inf, np.sqrt(squares))
+    squares = (along / np.maximum(values, HALF_THE_DIGITS)).sum(axis=1)
+    return np.where(values[:, 0] < HALF_THE_DIGITS, np.inf, np.sqrt(squares))
 
 
 def predicted(design: Design, task: FloatArray) -> float:

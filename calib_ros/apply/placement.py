@@ -25,11 +25,6 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import AIMS, Aim, Model
 from calib_ros.shown import Shown
 
-STARTS = 6
-"""Configurations from which the first pose of a task is solved."""
-KNOWN_POSES = 20_000
-"""Random configurations among which they are looked for."""
-
 
 def task_of(poses: FloatArray) -> FloatArray:
     """Return poses (K, 4, 4) in a frame at their middle, whose axes stay as they are."""
@@ -74,6 +69,8 @@ def place(
     cells: int = 9,
     turns: int = 1,
     refinements: int = 4,
+    starts: int = 6,
+    drawn: int = 20_000,
 ) -> Placements:
     """Find the placement of a task with the least expected error.
 
@@ -94,6 +91,9 @@ def place(
         Points of the grid along each axis, and turns about the vertical, evenly spread.
     refinements : int
         Times that the grid is halved about the best placement.
+    starts, drawn : int
+        Configurations from which the first pose of the task is solved, and random ones among
+        which they are looked for.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def place(
         When the region is empty, or the arm reaches all poses of the task nowhere in it.
 
     """
-    search = _Search(arm, task, aim, model)
+    search = _Search(arm, task, aim, model, starts, drawn)
     corners = search.within(region)
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
     axes.append(2.0 * np.pi * np.arange(turns) / turns)
@@ -136,13 +136,22 @@ def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArr
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad]."""
 
-    def __init__(self, arm: Calibration, task: FloatArray, aim: Aim, model: Model) -> None:
+    def __init__(
+        self,
+        arm: Calibration,
+        task: FloatArray,
+        aim: Aim,
+        model: Model,
+        starts: int,
+        drawn: int,
+    ) -> None:
         if aim not in AIMS:
             raise UnknownNameError('aim', aim, AIMS)
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
+        self._starts = starts
         self._chain = arm.commanded_by(model)
         self._base = self._chain.frame('base').matrix
-        self._known = self._chain.random_joints(KNOWN_POSES, np.random.default_rng(0))
+        self._known = self._chain.random_joints(drawn, np.random.default_rng(0))
         poses = in_base(self._chain, self._known)
         self._tree = cKDTree(_features(poses))
         self._reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
@@ -164,7 +173,7 @@ class _Search:
         frames = se3.transform(se3.exp_rotation(turns), placements[:, :3])
         poses = frames[:, np.newaxis] @ self._task
         joints, reached = self._follow(poses)
-        errors = np.full((len(placements), STARTS), np.nan)
+        errors = np.full((len(placements), self._starts), np.nan)
         expected = self._arm.expected(joints[reached].reshape(-1, joints.shape[-1]), self._model)
         expected = expected.reshape(-1, len(self._task))
         errors[reached] = (np.mean if self._aim == 'mean' else np.max)(expected, axis=1)
@@ -173,11 +182,11 @@ class _Search:
         return errors[index, best], joints[index, best]
 
     def _follow(self, poses: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """Return joint values (M, STARTS, K, n) for poses (M, K, 4, 4), and which reach them."""
+        """Return joint values (M, S, K, n) for poses (M, K, 4, 4), and which reach them."""
         count, length = poses.shape[:2]
-        _, nearest = self._tree.query(_features(poses[:, 0]), STARTS)
-        joints = np.full((count, STARTS, length, self._known.shape[1]), np.nan)
-        reached = np.ones((count, STARTS), dtype=bool)
+        _, nearest = self._tree.query(_features(poses[:, 0]), self._starts)
+        joints = np.full((count, self._starts, length, self._known.shape[1]), np.nan)
+        reached = np.ones((count, self._starts), dtype=bool)
         start = self._known[nearest]
         for k in range(length):
             placement, branch = np.nonzero(reached)

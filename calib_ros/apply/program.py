@@ -19,11 +19,12 @@ from calib_ros.apply.compensation import (
     too_fast,
 )
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 
-NUDGE = 0.01
-"""Step of the differences for velocities, in units of the largest correction."""
+NUDGE = HALF_THE_DIGITS**0.25
+"""Step of the differences, in units of the largest correction: second ones of what is right by
+half the digits lose least so."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

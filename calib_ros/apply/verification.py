@@ -38,6 +38,7 @@ from calib_ros.identification.configurations import configurations
 from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
+from calib_ros.identification.levels import CONFIDENT, NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
@@ -45,7 +46,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import Shown
+from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
 NEEDED = 5
@@ -55,14 +56,8 @@ DECIDING = 10_000
 LOST = {'base': 2, 'tool': 1}
 """Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
 three; the turn of a tool does not move the target."""
-FAR = Compensator.largest_turn
-"""Distance [rad or m] from commanded joint values that no correction makes."""
 UNIT = (1e-3, 1e-3)
 """Sigmas [m, rad] that weigh all samples alike."""
-LISTED = 20
-"""Configurations up to which each is told of."""
-ONE_MOTION = 0.3
-"""Share of the error that is left without one common motion, below which that is suspected."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +150,7 @@ def verify(
     arm: Calibration,
     sets: Sequence[Observations],
     tolerance: float | None,
-    confidence: float = 0.95,
+    confidence: float = CONFIDENT,
     new_base: bool = False,
     commanded: FloatArray | None = None,
     new_tool: bool = False,
@@ -182,7 +177,7 @@ def verify(
     Raises
     ------
     InputError
-        For too few configurations, distances, a device or target that the calibration does not
+        For too few poses, distances, a device or target that the calibration does not
         know, or measurements far from all that was commanded.
 
     """
@@ -226,7 +221,7 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     count = len(moments)
     if count - lost < least:
         raise InputError(
-            f'{count} configurations were measured, at least {least + lost} are needed: five are '
+            f'{count} poses were measured, at least {least + lost} are needed: five are '
             'usual (calib_ros plan --iso9283)'
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
@@ -267,7 +262,7 @@ def _check(
 def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
     """Return the commanded joint values (N, n) that are nearest to those measured (N, n)."""
     away = np.abs(joints[:, np.newaxis] - commanded).max(axis=2)
-    far = np.flatnonzero(away.min(axis=1) > FAR)
+    far = np.flatnonzero(away.min(axis=1) > Compensator.largest_turn)  # more than is corrected
     if far.size:
         raise InputError(
             f'measurement {far[0] + 1} was taken {away.min(axis=1)[far[0]]:.3g} rad or m from '
@@ -328,8 +323,7 @@ def in_words(found: Verification) -> str:
     before, after = found.comparison.figures
     share = 100.0 * found.confidence
     lines = [
-        f'position error [mm] of {after.count} measurements in {found.configurations} '
-        'configurations',
+        f'position error [mm] of {after.count} measurements at {found.configurations} poses',
         '              RMS     mean      max   mean + 3 sigma',
     ]
     for label, figures in (('before', before), ('after', after)):
@@ -349,7 +343,7 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the configurations [mm], of which there may be none."""
+    """Return the lines of a table of the poses [mm], of which there may be none."""
     lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
         again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
@@ -370,13 +364,13 @@ def remarks(found: Verification) -> list[str]:
         )
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
-        lines.append(f'{enough} configurations with the same RMS error would decide')
+        lines.append(f'{enough} poses with the same RMS error would decide')
     if found.tolerance is None and found.holds is False:
         lines.append(
             'the calibration does not hold any more: the error is larger than it was then. Was '
             'the tracker, the target or the robot moved?'
         )
-    if found.common < ONE_MOTION:
+    if found.common < NEARER:
         lines.append(
             f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
             'the error would be left: was the measuring device moved? If it stands elsewhere on '

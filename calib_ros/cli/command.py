@@ -57,7 +57,7 @@ GROUPS = {
         'workspace': 'map errors over the workspace, and place a task where they are least',
     },
     'Convert files': {
-        'bag2csv': 'write the samples of a bag as a table',
+        'bag2csv': 'write the poses of a bag as a table',
         'csv2bag': 'write a table of measured poses as a bag',
         'import': 'write a table of others as one of ours',
     },

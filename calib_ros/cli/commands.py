@@ -12,7 +12,7 @@ from calib_ros.cli.command import Command
 from calib_ros.settings import (
     AIMS,
     CRITERIA,
-    LARGEST_LOSS,
+    EXCEPTION,
     MODELS,
     YEARS,
     Limits,
@@ -45,7 +45,7 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
 
 def _add_simulation(parser: argparse._ArgumentGroup) -> None:
     add = parser.add_argument
-    add('--poses', type=int, default=60, metavar='N', help='configurations to measure')
+    add('--poses', type=int, default=60, metavar='N', help='poses to measure')
     add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
     common.add_storage(parser)
 
@@ -141,7 +141,7 @@ def _add_identify(parser: argparse.ArgumentParser) -> None:
     common.add_each(
         group,
         float,
-        ('--largest-loss', 'SHARE', LARGEST_LOSS, loss),
+        ('--largest-loss', 'SHARE', EXCEPTION, loss),
         ('--socket-distance', 'M', None, 'between two sockets of a place, 0.05 if not given'),
         ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
     )

@@ -69,7 +69,7 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:
-        raise InputError(f'{options.bag} gives no samples ({session.account()})')
+        raise InputError(f'{options.bag} gives no poses ({session.account()})')
     write_file(options.csv, table_text(samples, len(chain.joints)), overwrite=options.force)
     for warning in read.warnings:
         screen.warn(warning)

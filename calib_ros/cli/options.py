@@ -27,7 +27,7 @@ SETTINGS = {
     'how the device measures': ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'frame_id'),
     'what is not accepted': ('largest_length', 'largest_angle', 'largest_error'),
     'bags: what is read': ('joint_topics', 'sources', 'joint_names', 'delay'),
-    'bags: how samples are taken': (
+    'bags: how poses are taken': (
         *('mode', 'still', 'settle', 'shortest_stop', 'longest_stop', 'max_gap', 'lateness'),
         *('joint_buffer', 'pose_buffer', 'wanted_accuracy'),
     ),
@@ -36,7 +36,7 @@ SETTINGS = {
 OF_BAGS = (
     *SETTINGS['how the device measures'],
     *SETTINGS['bags: what is read'],
-    *SETTINGS['bags: how samples are taken'],
+    *SETTINGS['bags: how poses are taken'],
 )
 """Settings by which samples are made of a bag."""
 

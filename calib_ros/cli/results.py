@@ -81,9 +81,9 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     before, after = (result.validation or result.fitted).figures
     proof = '' if result.validation else '; on the poses fitted, which proves nothing'
-    samples = f'{len(result.fitted.judged)}'
+    poses = f'{len(result.fitted.judged)} fitted'
     if result.outliers:
-        samples += f', {len(result.outliers)} outliers carry no weight'
+        poses += f', {len(result.outliers)} of them outliers without weight'
     fitted = f'{result.rank} parameters'
     if result.chain.effects:
         fitted += f', {len(result.chain.effects)} of them effects'
@@ -98,7 +98,7 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
         valid = result.region.in_words().removeprefix('valid ')
     return (
         ('robot', f'{result.chain.name}, {fitted} fitted'),
-        ('samples', samples),
+        ('poses', poses),
         ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm{proof}'),
         second,
         ('judged by', result.validated_by),

@@ -95,7 +95,7 @@ def show(found: Verification, screen: Screen) -> None:
     screen.title(*TITLES[found.verdict])
     screen.table(
         (
-            ('measured', f'{after.count} times in {found.configurations} configurations'),
+            ('measured', f'{after.count} times at {found.configurations} poses'),
             ('position error', f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm'),
             ('largest', f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm'),
             ('orientation error', orientation),
@@ -108,7 +108,7 @@ def show(found: Verification, screen: Screen) -> None:
         )
     )
     if found.each:
-        screen.say('\n'.join(['position error [mm] by configuration', *each_in_words(found)]))
+        screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
     for remark in remarks(found):
         screen.bullet(remark)
 
@@ -127,5 +127,5 @@ def _sets(
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     fitted, held_out = collect(session.usable, sigmas)
     if not (fitted or held_out):
-        raise InputError(f'{options.measured} gives no samples: {session.account()}')
+        raise InputError(f'{options.measured} gives no poses: {session.account()}')
     return (*fitted, *held_out), read.warnings, False

@@ -34,7 +34,7 @@ class Archive:
     ) -> None:
         self.folder = folder
         self.error = ''
-        """Why samples are in memory only; empty while all are in the journal."""
+        """Why poses are in memory only; empty while all are in the journal."""
         self._robot = re.sub(r'[^\w.-]', '_', robot)
         self._joints = joints
         self._configuration = configuration
@@ -48,14 +48,14 @@ class Archive:
                 pass
         except OSError as err:
             raise InputError(
-                f'samples cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
+                f'poses cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
                 'in which files can be written'
             ) from err
 
     @property
     def trouble(self) -> str:
         """Return in words that samples would be lost by now; empty while all are on the disk."""
-        return f'samples are in memory only: {self.error}; ' if self.error else ''
+        return f'poses are in memory only: {self.error}; ' if self.error else ''
 
     @property
     def journal(self) -> Path | None:
@@ -99,7 +99,7 @@ class Archive:
         self.write()
         if self._waiting:
             raise InputError(
-                f'samples are in memory only and would be lost: {self.error}; make room, or start '
+                f'poses are in memory only and would be lost: {self.error}; make room, or start '
                 'the node again with another data_dir'
             )
         old = self.journal

@@ -28,16 +28,15 @@ from calib_ros.files.salvage import (
 from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.sampling.account import Account
-from calib_ros.sampling.intake import Deserialise, Stream, feed, links_of
+from calib_ros.sampling.intake import BATCH, Deserialise, Stream, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.topics import Reading, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
 
-BATCH = 2000
-"""Messages that are decoded at once."""
 ALLOW = 'take the rest all the same with --largest-loss'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|is there already')
@@ -72,7 +71,7 @@ class Replayed:
             return (Reason(Rule.UNKNOWN_LOSS, text),)
         share = _share(self.recorded, self.read)
         lost = {'of the messages could not be read': (Rule.UNREADABLE, share)}
-        for name, all_of_them in (('joints', account.joint_states), ('poses', account.poses)):
+        for name, all_of_them in ((JOINTS, account.joint_states), (POSES, account.poses)):
             dropped = sum(
                 count
                 for cause, count in account.dropped.items()

@@ -74,7 +74,7 @@ def decimals(
     if width == LONGEST:
         read &= digits[:, 0] < 100  # the integer has 18 digits at most
     found = whole.view(np.int64) / SIGNED[place]
-    large = np.flatnonzero(whole > 2**53)
+    large = np.flatnonzero(read & (whole > 2**53))
     found[large], sure = _nearest(whole[large].view(np.int64), SIGNED[place[large]])
     read[large] &= sure
     return found, read

@@ -39,9 +39,8 @@ from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, 
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import csv_text
+from calib_ros.values import SAME
 
-EXACT = 1e-9
-"""Largest difference [m, and in rotation matrices] of an export that is called exact."""
 FILES = (
     *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
     *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
@@ -255,7 +254,7 @@ def _read_csv(text: str, form: Chain) -> Chain:
 def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: float) -> Export:
     """Return a file that, read back, gives the poses (N, 4, 4) that are wanted."""
     difference = float(np.abs(again - wanted).max())
-    if not difference <= EXACT:
+    if not difference <= SAME:
         raise ExportError(
             f'{name}, read back, differs from the calibration by {difference:.3g} m or more in '
             'rotation: it is not written'

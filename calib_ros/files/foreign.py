@@ -32,8 +32,8 @@ from calib_ros.files.sheets import Sheet, read_sheet
 from calib_ros.files.turns import finished
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf import MOST_JOINTS
 from calib_ros.texts import csv_text
+from calib_ros.values import MOST_NAMES
 
 MEASURED = (*POSITION, 'distance')
 UNITS = {
@@ -115,7 +115,7 @@ class _Table:
         self, path: Path, layout: Layout, chain: Chain | None, joints: bool, alone: bool = False
     ) -> None:
         self._path, self._layout, self._chain = path, layout, chain
-        most = MOST_JOINTS if chain is None else len(chain.joints)
+        most = MOST_NAMES if chain is None else len(chain.joints)
         self._ours = {
             ours: theirs
             for ours, theirs in layout.columns.items()
@@ -262,7 +262,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
     """Return what each name in a header stands for when nothing is said."""
     found: dict[str, str] = {}
     if joints:
-        count = MOST_JOINTS if chain is None else len(chain.joints)
+        count = MOST_NAMES if chain is None else len(chain.joints)
         found = {f'{letter}{k}': f'{letter}{k}' for letter in 'qsva' for k in range(1, count + 1)}
         if chain is not None:
             found |= {name: f'q{k + 1}' for k, name in enumerate(chain.joint_names)}

@@ -83,7 +83,7 @@ class Journal:
         written = os.write(self._file, data)
         if written < len(data):  # the disk is full: no half row may stay
             os.ftruncate(self._file, begin)
-            raise OSError(f'{self.path}: the disk is full, the sample was not written')
+            raise OSError(f'{self.path}: the disk is full, the pose was not written')
 
 
 def _last_line(file: int, size: int) -> int:

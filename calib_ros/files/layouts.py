@@ -20,9 +20,8 @@ import numpy as np
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.kinematics.chain_file import shared_files
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf import MOST_JOINTS
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import LONGEST_NAME
+from calib_ros.values import LONGEST_NAME, MOST_NAMES
 
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""
@@ -257,7 +256,7 @@ def parse_columns(text: str) -> dict[str, str]:
             raise ConfigError(f'columns are given as OURS=THEIRS,..., not "{part.strip()}"')
         if re.fullmatch(r'[qsva]\*', ours):
             found |= {
-                f'{ours[0]}{k}': theirs.replace('*', str(k)) for k in range(1, MOST_JOINTS + 1)
+                f'{ours[0]}{k}': theirs.replace('*', str(k)) for k in range(1, MOST_NAMES + 1)
             }
         else:
             found[ours] = theirs

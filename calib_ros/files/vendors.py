@@ -25,7 +25,6 @@ import numpy as np
 
 from calib_ros.errors import ConfigError
 from calib_ros.files.export import (
-    EXACT,
     Export,
     anywhere,
     checked,
@@ -42,6 +41,7 @@ from calib_ros.kinematics.chain_file import dump_yaml, table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.kinematics.urdf_tree import parse_urdf
+from calib_ros.values import SAME
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def _layout(
     form = converted(arm, 'modified')
     places = origins(form)
     if vendor.end is None:  # the flange of the table is the last frame
-        return (places[:-1], arm) if np.allclose(places[-1], np.eye(4), atol=EXACT) else None
+        return (places[:-1], arm) if np.allclose(places[-1], np.eye(4), atol=SAME) else None
     # The vendor has what the table calls d of the last joint behind it.
     last = form.joints[-1]
     shift = np.eye(4)

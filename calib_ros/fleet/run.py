@@ -30,7 +30,7 @@ from calib_ros.fleet.work import Outcome, Task, sources, work
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
 SPAN = 2.0
 """Time [s] that a piece of several tasks takes: much to dask's 4 ms for it, little to lose."""
-PATIENCE = 60.0
+ANSWER_S = 60.0
 """Time [s] for a scheduler and its first worker to answer."""
 DASK = {
     'distributed.worker.profile.enabled': False,
@@ -191,8 +191,8 @@ def _client(cluster: Cluster) -> Iterator[Any]:
                 )
             )
         try:
-            client = stack.enter_context(Client(where, set_as_default=False, timeout=PATIENCE))
-            client.wait_for_workers(1, timeout=PATIENCE)
+            client = stack.enter_context(Client(where, set_as_default=False, timeout=ANSWER_S))
+            client.wait_for_workers(1, timeout=ANSWER_S)
         except (OSError, TimeoutError, ValueError) as err:
             raise LostError(f'no workers at {cluster.address or "this machine"}: {err}') from err
         others = {each for each in client.run(_version).values() if each != calib_ros.__version__}

@@ -26,17 +26,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from calib_ros.identification.levels import CERTAIN, CONFIDENT
+from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
-from calib_ros.identification.validation import Comparison, ParameterRow, log_gain
-
-WORSE = 0.01
-"""Growth of that error that counts, of the RMS; less is how metres happen to lie."""
-MOST_OUTLIERS = 0.35
-"""Share of outliers beyond which nothing is accepted."""
+from calib_ros.identification.validation import COUNTS, Comparison, ParameterRow, log_gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +53,7 @@ def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
     failed = [*_of_the_fit(problem, found)]
     validation = found.validation
     if validation is None:
-        text = 'too few configurations to leave some out of the fit and test the result on them'
+        text = 'too few poses to leave some out of the fit and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
@@ -120,9 +115,9 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'the gain may be that of a drift, as of the tracker: moved in time against the joint '
-            f'values, residuals are explained as well in {100.0 * found.chance:.0f} % of the '
-            'shifts; measure the poses in random order, further apart, or more of them',
+            'the improvement may only be drift of the measuring device: time-shifted residuals '
+            f'are explained just as well in {100.0 * found.chance:.0f} % of cases; measure the '
+            'poses in random order, further apart, or more of them',
         )
     elif found.region is None:
         yield Reason(
@@ -139,7 +134,7 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
         first, second = validation.figures_of_all
         pairs = (validation.before.position, validation.after.position)
         gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
-        if second.mean_mm > first.mean_mm or gain < -max(limit, WORSE):
+        if second.mean_mm > first.mean_mm or gain < -max(limit, COUNTS):
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
                 f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
@@ -149,7 +144,7 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
     if found.may_be_rounding:
         yield Reason(
             Rule.ROUNDING,
-            'the gain may be that of rounded joint values, which are alike in many poses: record '
+            'the improvement may only come from rounded joint values, alike in many poses: record '
             'them with more digits',
         )
     before, after = validation.figures

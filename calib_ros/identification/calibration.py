@@ -28,6 +28,7 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification import records
 from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.identification import Identification
+from calib_ros.identification.levels import ALIKE
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.region import Region, region_of_record
@@ -46,8 +47,6 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
 
-HOLDS = 1.5
-"""Largest RMS error of new poses, in that of the calibration, at which nothing has changed."""
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
 
@@ -201,7 +200,7 @@ class Calibration(Shown):
 
     def holds(self, rms: float) -> bool | None:
         """Tell whether the RMS error [m] of new poses agrees with the one before, if known."""
-        return None if self.residual is None else rms <= HOLDS * self.residual
+        return None if self.residual is None else rms <= ALIKE * self.residual
 
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that it was fitted to, as far as that is known."""

@@ -32,16 +32,17 @@ from scipy import linalg, special
 
 from calib_ros.identification.evidence import SPREAD
 from calib_ros.identification.levels import CONFIDENT, chance_of
-from calib_ros.identification.observations import POSES
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 
 FALSE = 0.005
-"""Probability of claiming a change of an arm that has not changed."""
+"""Probability of claiming a change of an arm that has not changed
+(benchmarks/recalibration.py)."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
 way costs half a unit of the evidence's logarithm."""
@@ -49,8 +50,6 @@ MOST_CHANGES = 3
 """Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
 """Kinds in the order in which they are named where two of a joint do the same."""
-GAUGE = 1e-6
-"""Share of the motion by a parameter that others leave if it is a gauge freedom beside them."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -226,7 +225,9 @@ class Columns:
     ) -> None:
         arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
         mapped, left = gauged(chain, names, arm, free=not frames)
-        seen = (left < GAUGE) & (np.abs(mapped).max(axis=0, initial=0.0) > GAUGE)
+        seen = (left < HALF_THE_DIGITS) & (
+            np.abs(mapped).max(axis=0, initial=0.0) > HALF_THE_DIGITS
+        )
         self._columns = {n: c for n, c, yes in zip(arm, mapped.T, seen, strict=True) if yes}
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
@@ -260,7 +261,7 @@ class Columns:
 def _alike(first: FloatArray, second: FloatArray) -> bool:
     """Tell whether two parameters do the same."""
     size = float(np.linalg.norm(first) * np.linalg.norm(second))
-    return bool(abs(first @ second) > (1.0 - GAUGE) * size)
+    return bool(abs(first @ second) > (1.0 - HALF_THE_DIGITS) * size)
 
 
 def gauged(
@@ -272,7 +273,7 @@ def gauged(
     others does, at poses all over the joint range; the second (K,) the share of it that is left.
     """
     rng = np.random.default_rng(0)
-    q = chain.random_joints(POSES, rng)
+    q = chain.random_joints(SOME_POSES, rng)
     frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
     columns = list(dict.fromkeys([*frames, *names, *others]))
     rows = ErrorModel(chain, columns).jacobian(q, rng.choice([-1.0, 1.0], q.shape))

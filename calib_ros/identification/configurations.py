@@ -12,19 +12,17 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from calib_ros.identification.levels import TELLING
 from calib_ros.kinematics.se3 import FloatArray
 
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
 SCATTER = 0.02
-"""Distance [rad or m] up to which visits of one configuration may scatter."""
+"""Distance [rad or m] up to which visits of one configuration may scatter (benchmarks/harm.py)."""
 GAP = 5.0
 """Ratio of the distance of configurations to that of the visits of one."""
-WIDEST = 2.0
+EXTENT = 2.0
 """Size of a configuration's visits in units of the longest step between them."""
-FEWEST = 8
-"""Configurations from which on their distances tell what a visit is, or who is near; so many
-nearest ones are looked at."""
 
 
 def distinct(numbers: NDArray[np.intp]) -> int:
@@ -73,10 +71,10 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
     """
     count = len(place)
     apart = np.arange(count)
-    if count < FEWEST or not len(_pairs(place, SCATTER)):
+    if count < TELLING or not len(_pairs(place, SCATTER)):
         return apart
     far, near = cKDTree(place).query(
-        place, k=range(2, 2 + min(FEWEST, count - 1)), distance_upper_bound=GAP * SCATTER
+        place, k=range(2, 2 + min(TELLING, count - 1)), distance_upper_bound=GAP * SCATTER
     )
     first, which = np.nonzero(np.isfinite(far))
     graph = _graph(far[first, which], first, near[first, which], count)
@@ -89,7 +87,7 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
         number, label = connected_components(links, directed=False)
         middle = np.stack([np.bincount(label, row) for row in place.T]) / np.bincount(label)
         extent = np.linalg.norm(place - middle.T[label], axis=1).max()
-        if number >= FEWEST and extent <= WIDEST * reach:
+        if number >= TELLING and extent <= EXTENT * reach:
             return np.asarray(label, dtype=np.intp)
     return apart
 

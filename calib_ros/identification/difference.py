@@ -27,7 +27,6 @@ from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import (
     FALSE,
-    GAUGE,
     MOST_CHANGES,
     Columns,
     Explanation,
@@ -41,13 +40,13 @@ from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.levels import CONFIDENT, chance_of
-from calib_ros.identification.observations import POSES, Observations
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 
 
@@ -181,7 +180,9 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
     predicted = _predicted(chain, names)
-    draws = np.random.default_rng(0).multivariate_normal(change, square, 10 * POSES, method='eigh')
+    draws = np.random.default_rng(0).multivariate_normal(
+        change, square, 10 * SOME_POSES, method='eigh'
+    )
     squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)
     return Difference(
         names,
@@ -211,7 +212,7 @@ def _in_parameters_of(
     arm = [Parameter(n) for n in dict.fromkeys(every) if not chain.owns_frame(n)]
     independent = structurally_independent(chain, [*frames, *arm])
     names = tuple(Parameter(name) for name in independent if name in arm)
-    joints = chain.random_joints(POSES, np.random.default_rng(0))
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     poses = other.forward(joints)
     seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     start = replace(chain, base=other.base, tool=other.tool)
@@ -232,7 +233,7 @@ def _in_names(
     if others:
         change[:, others] = gauged(chain, names, [mine[k] for k in others], free=True)[0]
     whole = change @ square @ change.T
-    unknown = np.abs(change).max(axis=1) < GAUGE
+    unknown = np.abs(change).max(axis=1) < HALF_THE_DIGITS
     sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]
     return np.asarray(whole + np.diag(unknown * np.square(sizes)))
 
@@ -251,7 +252,7 @@ def _chance(told: Told, freedom: float, explained: int = 0) -> float:
 
 def _predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
     """Return V (P, P) [m^2]: d^T V d is the mean squared difference of positions by d."""
-    joints = chain.random_joints(POSES, np.random.default_rng(0))
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
     rows = ErrorModel(chain, [*frames, *names]).jacobian(joints)[:, :3]
     flat = rows.reshape(-1, rows.shape[2])

@@ -29,18 +29,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.leastsquares import System
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
 SLOW = 3
-"""Cosines that are taken out of a series at most; no more than one for ten stops."""
+"""Cosines that are taken out of a series at most; no more than one for ten stops
+(benchmarks/drift.py)."""
 SHIFTS = 400
-"""Shifts that are tried at most; the first of them is none."""
-SINGULAR = 1e-10
-"""Eigenvalue of scaled normal equations from which a direction counts."""
+"""Shifts that are tried at most; the first of them is none (benchmarks/drift.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +109,7 @@ class Shifts:
                 whole = np.linalg.norm(series, axis=(1, 2))
                 slow = slow_cosines(len(begins))
                 series -= series @ slow.T @ slow
-                rounding = np.linalg.norm(series, axis=(1, 2)) <= RANK_TOLERANCE * whole
+                rounding = np.linalg.norm(series, axis=(1, 2)) <= HALF_THE_DIGITS * whole
                 series[rounding] = 0.0
                 products[-1] += self._sampled(_correlated(series, circle))
                 parts.append(series.reshape(len(series), -1))
@@ -207,7 +205,7 @@ def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
     """
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-300))
     sizes, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    good = sizes > SINGULAR
+    good = sizes > ROUNDING
     return np.asarray(scale[:, np.newaxis] * vectors[:, good] / np.sqrt(sizes[good]))
 
 

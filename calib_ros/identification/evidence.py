@@ -37,21 +37,22 @@ import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from calib_ros.identification.leastsquares import ROUNDS, Normal, System, normal_equations
+from calib_ros.identification.leastsquares import Normal, System, normal_equations
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.shown import Shown
 
 BENDING = ('gravity', 'compliance', 'backlash')
 TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, **dict.fromkeys(BENDING, 3e-4)}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
-"""Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation)."""
+"""Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
+benchmarks/harm.py)."""
 TAILS = 3.0
-"""Degrees of freedom of the prior."""
+"""Degrees of freedom of the prior (benchmarks/harm.py)."""
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, whether they are fitted or not."""
 SHOWN, REFUTED = 1.35, 3.0

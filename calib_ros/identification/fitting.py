@@ -24,6 +24,7 @@ from calib_ros.identification.leastsquares import (
     minimise,
     triangular_factor,
 )
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.robust import Robust, reweighted, thorough_fit
@@ -34,11 +35,9 @@ from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 
 SOME = 500
-"""Pairs that are enough for a first fit."""
+"""Pairs that are enough for a first fit, or for a linear model of them."""
 FOLLOWED = 2.0
 """Part of what it lacks that the geometric model does not follow: one over this."""
-HELD = 0.05
-"""Share of a parameter's variance that is its prior's from which on the prior is fitted with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +220,9 @@ def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> boo
     """Tell whether priors that the data have told would change a fit without them."""
     if problem.learned is not None or problem.model.effects:
         return True
-    return any(posterior.held(name) > HELD for name in names if name not in problem.given)
+    return any(
+        posterior.held(name) > 1.0 - CONFIDENT for name in names if name not in problem.given
+    )
 
 
 def _require_enough(problem: Problem, names: Sequence[str]) -> None:

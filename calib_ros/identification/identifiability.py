@@ -20,18 +20,18 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
-RANK_TOLERANCE = 1e-8
-"""A column is dependent when less than this share of it is left after the columns before it."""
-FRAME_TOLERANCE = 1e-3
-"""The same for base and tool frames. Orientations that vary by a milliradian vary by no more than
-an arm's own errors: a tool that follows from them would be anywhere, kilometres away as well."""
+DEGENERATE = 1e-3
+"""Share of the largest extent up to which there is none: of points of a board, of the column of a
+base or tool frame that those before it leave. Orientations that vary by a milliradian vary by no
+more than an arm's own errors: a tool that follows from them would be anywhere, kilometres away as
+well."""
 
 
 def independent(
-    factor: FloatArray, names: Sequence[str], frame_tolerance: float = RANK_TOLERANCE
+    factor: FloatArray, names: Sequence[str], frame_tolerance: float = HALF_THE_DIGITS
 ) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
@@ -45,11 +45,11 @@ def independent(
     names : sequence of str
         Parameters, the most wanted first.
     frame_tolerance : float
-        Least share of a frame's column; of other columns RANK_TOLERANCE.
+        Least share of a frame's column; of other columns HALF_THE_DIGITS.
 
     """
     least = np.where(
-        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, RANK_TOLERANCE
+        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, HALF_THE_DIGITS
     ) * np.linalg.norm(factor, axis=0)
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
         return tuple(names)  # the diagonal is what is left of each
@@ -68,7 +68,7 @@ def independent(
 
 def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that measured poses determine: frames by more than arms' errors."""
-    return independent(factor, names, FRAME_TOLERANCE)
+    return independent(factor, names, DEGENERATE)
 
 
 @dataclass(frozen=True)
@@ -213,10 +213,6 @@ class Uncertainty(Shown):
             return np.asarray(1.0 / np.tensordot(1.0 / self.freedom, shares**2, axes=1))
 
 
-TRADE = 1e-4
-"""Least share of a parameter in a trade to be named."""
-
-
 def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
     """Return, for each parameter that was left out, the fitted ones that it trades against.
 
@@ -230,7 +226,7 @@ def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dic
     scaled = matrix[fitted] / sizes[fitted, np.newaxis]
     basis, columns = (scaled[:, part] / sizes[part] for part in (fitted, left_out))
     shares = np.abs(np.linalg.lstsq(basis, columns, rcond=None)[0])
-    strong = (shares > TRADE * shares.max(axis=0, initial=0.0)).T
+    strong = (shares > DEGENERATE * shares.max(axis=0, initial=0.0)).T
     partners: dict[str, list[str]] = {name: [] for name in names if name not in set(kept)}
     for k, marks in zip(left_out, strong, strict=True):
         partners[names[k]] = [names[j] for j, yes in zip(fitted, marks, strict=True) if yes]

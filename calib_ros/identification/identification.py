@@ -81,7 +81,7 @@ class Identification(Shown):
         Fitted parameters and their covariance for the noise found in the residuals.
     fitted, validation : Comparison
         Residuals on the fitted pairs and on pairs that were not fitted. The latter is None when
-        there are too few configurations to hold any out.
+        there are too few poses to hold any out.
     validated_by : str
         How the pairs of `validation` were held out.
     noise : Noise

@@ -37,12 +37,10 @@ MOST_ITERATIONS = 1000
 STALLED = 50
 """Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
 LEAST_FALL = 1e-3
-ROUNDS = 60
-"""Steps to a fixed point, which ends in far fewer unless it goes in circles."""
 DAMPED, UNDAMPED = 1e-6, 1e-12
 """Damping, of columns of unit length, with which it begins and below which it ends."""
-WELL_CONDITIONED = 1e9
-"""Condition of the scaled normal matrix up to which a covariance from it has 6 digits or more."""
+WELL_CONDITIONED = 1e-6 / np.finfo(float).eps
+"""Condition of the scaled normal matrix up to which a covariance from it has 6 digits."""
 SEPARATION_SIGMA = 1e-5
 """Standard deviation [m] of a known distance between sockets."""
 SMALL_STEP = 1e-3

@@ -6,13 +6,25 @@ from __future__ import annotations
 
 from scipy import special
 
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS
+
 CONFIDENT = 0.95
 """Of intervals, and of gains: one in twenty is allowed to be chance."""
 CERTAIN = 0.99
 """Of what is held against a result, and where several tests are made."""
 SURE = 0.999
 """Of what changes the model or the noise: hundreds of tests are made in the life of a cell."""
-KNOWN = 1e9
+ALIKE = 1.5
+"""Ratio of two RMS errors up to which they are of one size (benchmarks/recalibration.py)."""
+NEARER = 0.3
+"""Ratio of two errors from which what leaves the smaller one explains clearly more
+(benchmarks/mistakes.py)."""
+MOST_OUTLIERS = 0.35
+"""Share of gross errors beyond which nothing is believed: half of the samples must tell the
+rest."""
+TELLING = 8
+"""Values from which on their spread tells anything: it is known to a quarter, (2 n)^-1/2."""
+KNOWN = 1.0 / HALF_THE_DIGITS
 """Degrees of freedom that are as good as infinite."""
 
 

@@ -23,10 +23,9 @@ from calib_ros.identification.levels import CERTAIN, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import EXCEPTION
 
-LEFT = 0.1
-"""Share of a joint's range that is left without outliers, up to which only they move it."""
-FEWEST, LEAST_STOPS = 4, 50
+LEAST_OUTLIERS, LEAST_STOPS = 4, 50
 """Outliers and stops from which on they are compared with the values of joints."""
 ADVICE = (
     'what a device does wrong knows nothing of the joints, the arm does what the model lacks. Look'
@@ -44,15 +43,15 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
     kept = joints[~robust.outliers]
     left = np.ptp(kept, axis=0) if len(kept) else np.zeros(len(names))
     for name, part, all_of_it in zip(names, left, whole, strict=True):
-        if all_of_it > 10.0 * STILL and part < LEFT * all_of_it:
-            return f'{name} moves only in samples that were taken for gross errors: {ADVICE}'
+        if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
+            return f'{name} moves only in poses that were taken for gross errors: {ADVICE}'
     shared, by_chance = _shared(problem, robust)
     if shared > 1 and by_chance < 1.0 - CERTAIN:
         return f'at {shared} stops all targets were taken for gross errors: {ADVICE}'
     order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
     joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
     if by_chance < 1.0 - SURE:
-        return f'samples that were taken for gross errors go with the values of {joint}: {ADVICE}'
+        return f'poses that were taken for gross errors go with the values of {joint}: {ADVICE}'
     return None
 
 
@@ -84,7 +83,7 @@ def _with_a_joint(
     begins = np.flatnonzero(np.diff(number, prepend=-1))
     off = np.bincount(number, outliers) > 0.5 * np.bincount(number)
     names = problem.chain.joint_names
-    if len(begins) < LEAST_STOPS or not FEWEST <= off.sum() <= len(off) - FEWEST:
+    if len(begins) < LEAST_STOPS or not LEAST_OUTLIERS <= off.sum() <= len(off) - LEAST_OUTLIERS:
         return '', 1.0
     turning = np.array([joint.type == 'revolute' for joint in problem.chain.joints])
     angle = joints[begins]

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from calib_ros.identification.acceptance import MOST_OUTLIERS
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
+from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -40,15 +40,9 @@ if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
 
 TRIED = 48
-"""Samples of a set, spread evenly, by which suspects are tried."""
-NEARER = 0.3
-"""Ratio of the typical errors from which a suspect is named, or another is not named with it."""
-ALIKE = 1.5
-"""Ratio of the typical errors of suspects that explain the same: the most usual are named."""
+"""Samples of a set, spread evenly, by which suspects are tried (benchmarks/mistakes.py)."""
 POLISHED = 6
-"""Suspects that are polished."""
-MEANINGLESS = 0.25
-"""Share of the spread of the positions from which an error explains nothing."""
+"""Suspects that are polished (benchmarks/mistakes.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +126,7 @@ def explained(problem: Problem) -> Explained | None:
     largest = problem.largest_error + LEVER * problem.largest_angle / 3.0
     if best.error > min(largest, NEARER * given.error):
         return None
-    if best.share > min(NEARER * given.share, MEANINGLESS):
+    if best.share > NEARER * min(given.share, 1.0):
         return None
     named = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
     lowest = min(each.rank for each in named)

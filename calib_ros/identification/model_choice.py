@@ -24,20 +24,17 @@ from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
-from calib_ros.identification.identifiability import RANK_TOLERANCE
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN, SURE
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
-from calib_ros.identification.validation import log_gain
+from calib_ros.identification.validation import COUNTS, log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
-LEAST_GAIN = 0.005
-"""Least decrease of the RMS error that is worth a group or a harmonic."""
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
 COMPARED = 3000
@@ -181,7 +178,7 @@ class _Linear:
             rest = column - basis @ (basis.T @ column)
             rest -= basis @ (basis.T @ rest)
             size = float(np.linalg.norm(rest))
-            if size > 1e3 * RANK_TOLERANCE * float(np.linalg.norm(column)) and size > 0.0:
+            if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)) and size > 0.0:
                 basis = np.column_stack([basis, rest / size])
                 kept.append(name)
         return kept
@@ -193,7 +190,7 @@ class _Linear:
         for dealing in range(len(self._folds)):
             before, after = (self._left_out(n, dealing) for n in (chosen, [*chosen, *new]))
             gain, limit = log_gain(before, after, self._groups, SURE)
-            pays = pays and gain > max(limit, LEAST_GAIN)
+            pays = pays and gain > max(limit, COUNTS)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
         if pays and self._shifts is not None:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN

@@ -34,7 +34,7 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     'points': (3,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
-POSES = 200
+SOME_POSES = 200
 """Poses that stand for many: random ones for the joint range, even ones for those measured."""
 
 
@@ -185,7 +185,7 @@ class Observations(Shown):
             )
         return chosen
 
-    def spread(self, most: int = POSES) -> Observations:
+    def spread(self, most: int = SOME_POSES) -> Observations:
         """Return every so many pairs, at most so many."""
         step = 1 + len(self) // most
         return self if step == 1 else self.select(np.arange(0, len(self), step))
@@ -238,12 +238,12 @@ class Observations(Shown):
         """Return the same pairs with other stamps (N,)."""
         return replace(self, stamps_ns=stamps_ns)
 
-    def earlier(self, delay: float) -> Observations:
+    def earlier(self, delay: float | None) -> Observations:
         """Return the same measurements with the joint values of a delay [s] before the stamps.
 
         By velocity and acceleration; without them the arm stood and nothing changes.
         """
-        if self.velocity is None:
+        if self.velocity is None or delay is None:
             return self
         more = np.full((len(self), 1), delay)
         if self.delay is not None:

@@ -239,7 +239,10 @@ class _Arm:
         return cls(chain, named, covariance + _wandered(named, years, growth))
 
     def solved(self, system: System) -> _Found:
-        """Return the mean change given the new poses, relinearised until it stands still."""
+        """Return the mean change given the new poses, relinearised until it stands still.
+
+        What is known before is a whole covariance, where `leastsquares` takes single sigmas.
+        """
         change = np.zeros(len(self.names))
         for _ in range(4):  # of changes by millimetres the second moves nothing any more
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))

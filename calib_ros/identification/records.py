@@ -15,7 +15,7 @@ from calib_ros.errors import ConfigError
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import POSES, Observations
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
@@ -180,7 +180,7 @@ def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: st
     known = _known(record, where)
     if {'base', 'tool'} & set(known):
         return replace(nominal, **parse_frames(known, f'{where}: calibration.nominal'))
-    joints = nominal.random_joints(POSES, np.random.default_rng(0))
+    joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
     poses = chain.forward(joints)
     wanted = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     start = replace(

@@ -29,7 +29,7 @@ from calib_ros.errors import UnknownNameError
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.levels import KNOWN
-from calib_ros.identification.observations import POSES, Observations
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.records import damaged, packed, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
@@ -39,8 +39,9 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 RISK = 0.02
-"""Probability at which a calibration may make the arm worse over the poses of a shell."""
-SHELL = POSES // 20
+"""Probability at which a calibration may make the arm worse over the poses of a shell
+(benchmarks/harm.py)."""
+SHELL = SOME_POSES // 20
 """Random configurations of a shell."""
 
 
@@ -163,8 +164,8 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
     ends = sets[0]
-    measured = np.concatenate([each.spread(POSES // 2).joints for each in sets])
-    drawn = posterior.chain.random_joints(POSES, np.random.default_rng(0))
+    measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
+    drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
     near, far = np.split(judge.sigma, [len(measured)])
     limit = float(near.max())

@@ -16,19 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
+from calib_ros.identification.identifiability import DEGENERATE
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
-from calib_ros.kinematics.se3 import FloatArray
-
-FLAT = 1e-3
-"""Thickness of a board, of its size, up to which it is flat."""
-IN_LINE = 1e-2
-"""Width of points, of their length, up to which they are in line and tell no pose."""
-STEPS = 15
-SETTLED = 1e-4
-"""Fall of the squares below which an image has its pose."""
-DAMPING = 1e-9
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +102,7 @@ def resect(observations: Observations, lens: Lens) -> BoardPoses:
     index = observations.images
     centre = observations.points.mean(axis=0)
     _, size, axes = np.linalg.svd(observations.points - centre, full_matrices=False)
-    if size[2] > FLAT * size[0]:
+    if size[2] > DEGENERATE * size[0]:
         raise InputError(
             'the points of a board must be in a plane: give each face of a body as a board of '
             'its own'
@@ -145,7 +137,7 @@ def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray
     outer = np.einsum('ni,nj->nij', rest, rest).reshape(-1, 9)
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins).reshape(-1, 3, 3))
-    return np.asarray((count >= 4) & (spread[:, 1] > IN_LINE**2 * spread[:, 2]))
+    return np.asarray((count >= 4) & (spread[:, 1] > DEGENERATE**2 * spread[:, 2]))
 
 
 def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:
@@ -182,26 +174,29 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
 def _refined(
     poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
 ) -> BoardPoses:
-    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2)."""
+    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2).
+
+    All images at once, each with its own damping, where `leastsquares` solves one problem.
+    """
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     count = np.bincount(index)
     best, least = poses.copy(), np.full(len(poses), np.inf)
-    damping = np.full(len(poses), DAMPING)
+    damping = np.full(len(poses), ROUNDING)
     step_from = (np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6)))
     rows = np.empty((7, 2, len(index)))
-    for _ in range(STEPS):
+    for _ in range(ROUNDS):
         seen = _seen(lens, poses, index, points)
         seen.by_twist(rows[:6])
         rows[6] = pixels.T - seen.pixels
         normal = products_of(rows, begins)
         better = normal[:, 6, 6] < least
-        settled = least - normal[:, 6, 6] < SETTLED * least
+        settled = least - normal[:, 6, 6] < HALF_THE_DIGITS * least
         least = np.where(better, normal[:, 6, 6], least)
         best[better] = poses[better]
         step_from[0][better], step_from[1][better] = normal[better, :6, :6], normal[better, :6, 6]
         if settled.all():
             break
-        damping = np.where(better, np.maximum(0.1 * damping, DAMPING), 100.0 * damping)
+        damping = np.where(better, np.maximum(0.1 * damping, ROUNDING), 100.0 * damping)
         scale = np.sqrt(np.maximum(np.einsum('mpp->mp', step_from[0]), 1e-300))
         scaled = step_from[0] / (scale[:, :, np.newaxis] * scale[:, np.newaxis])
         scaled += damping[:, np.newaxis, np.newaxis] * np.eye(6)

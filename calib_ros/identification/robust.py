@@ -30,27 +30,27 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.errors import UnknownNameError
-from calib_ros.identification.leastsquares import ROUNDS, STEP_TOLERANCE, Fit, System, minimise
+from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
 INNER, OUTER = 5.0, 7.0
 """Distances [scale] at which a sample begins to lose weight, and has none left. Of Gaussian
 errors in three directions 2 of 100,000 lie beyond the first."""
-OUTLIER = 6.0
-"""Distance beyond which a sample is named as an outlier."""
+OUTLIER = 0.5 * (INNER + OUTER)
+"""Distance beyond which a sample is named as an outlier: where it has lost half of its weight."""
 MANY = 20_000
-"""Samples that tell which of them are gross errors, a sample in ten thousand aside."""
+"""Samples that tell which of them are gross errors, a sample in ten thousand aside
+(benchmarks/end_to_end.py)."""
 SUSPICIOUS = 1.2
 """Ratio of residuals to those expected from which gross errors, or errors that the samples of a
-configuration share, may hide in them."""
+configuration share, may hide in them (benchmarks/outliers.py)."""
 SHRUNK = 0.5
-"""Ratio of half of the residuals from which a fit is another one, not a detail of the first."""
-NOISE_FREE = 1e-6
-"""Least scale [sigma]: below, residuals are rounding errors and no outliers."""
+"""Ratio of half of the residuals from which a fit is another one, not a detail of the first
+(benchmarks/outliers.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +189,7 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
             known = ~np.isnan(length)
             if known.any():
                 scale = np.median(length[known]) / _median_length(part.shape[1])
-                size = np.where(known, length, 0.0) / max(scale, NOISE_FREE)
+                size = np.where(known, length, 0.0) / max(scale, STEP_TOLERANCE)  # else rounding
                 largest = np.maximum(largest, size[row])
         found.append(largest)
     return tuple(found)

@@ -19,9 +19,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, special
 
 from calib_ros.identification.leastsquares import owners, stacked
+from calib_ros.identification.levels import CERTAIN
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -31,18 +33,14 @@ from calib_ros.kinematics.se3 import FloatArray
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
 """Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are wanted."""
 WIDER = 5
-"""How many times as wide a step must not fit as well."""
-EXACT = 1e-3
+"""How many times as wide a step must not fit as well (benchmarks/harm.py)."""
+WHOLE = 1e-3
 """Share of a step by which multiples of it may be off."""
-FEW = 0.5
-"""Values of a joint beside the number of stops, up to which they repeat."""
-LOOKED_AT = 150
-"""Samples that are looked at; of more, evenly spread ones."""
 USUAL = (5e-4, 1e-3)
 """Errors [m, rad] of an arm, whose size is found."""
 RATIOS = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 NOISES = np.geomspace(0.2, 20.0, 15)
-DECIDED = 4.0
+DECIDED = float(special.logit(CERTAIN))
 """Logarithm of the ratio of evidences from which on a gain is the arm's."""
 
 
@@ -72,14 +70,14 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 def _step(values: FloatArray) -> float:
     """Return the step that different values (N,) are multiples of; zero where there is none."""
     few = values[:3, np.newaxis] / STEPS
-    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < EXACT, STEPS).tolist()
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < WHOLE, STEPS).tolist()
     step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
     wider = _are_multiples(values, WIDER * step) if step else True
     return 0.0 if wider or len(np.unique(values)) < 3 else step
 
 
 def _are_multiples(values: FloatArray, step: float) -> bool:
-    return bool(np.abs(values / step - np.round(values / step)).max() < EXACT)
+    return bool(np.abs(values / step - np.round(values / step)).max() < WHOLE)
 
 
 def may_be_rounding(
@@ -94,14 +92,14 @@ def may_be_rounding(
     `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
     of rounded joints, and `good` (N,) tells which samples of each set are no outliers.
     """
-    share = -(-sum(map(len, problem.sets)) // LOOKED_AT)
+    share = -(-sum(map(len, problem.sets)) // SOME_POSES)
     pairs = zip(problem.sets, good, strict=True)
     sets = [each.select(np.flatnonzero(which)[::share]) for each, which in pairs]
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
     for number, joint in enumerate(problem.chain.joints):
         value, level = np.unique(joints[:, number], return_inverse=True)
-        if joint.name in steps and len(value) <= FEW * len(joints):
+        if joint.name in steps and 2 * len(value) <= len(joints):
             levels[joint.driven] = level
     if not levels:
         return False

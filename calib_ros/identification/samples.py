@@ -261,8 +261,7 @@ def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArra
 
 
 def _residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
-    delay = chain.frame(observations.base).delay
-    then = observations if delay is None else observations.earlier(delay)
+    then = observations.earlier(chain.frame(observations.base).delay)
     distances = observations.distances
     position = np.empty((len(then), 3 if distances is None else 1))
     orientation = np.full((len(then), 3), np.nan)
@@ -292,8 +291,7 @@ def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray
     """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m]."""
     camera = observations.camera
     lens = require_lens(chain.frame(camera).lens, camera)
-    delay = chain.frame(observations.base).delay
-    then = observations if delay is None else observations.earlier(delay)
+    then = observations.earlier(chain.frame(observations.base).delay)
     first = np.flatnonzero(np.diff(then.images, prepend=-1))
     assert then.pixels is not None
     assert then.points is not None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that neighbouring configurations share.
+"""Errors that neighbouring poses share.
 
 A tracker drifts, and what a model lacks changes slowly over the joint space, so neighbours err
 alike and tell less than their number. Configurations are neighbours in succession or near each
@@ -31,20 +31,20 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from calib_ros.identification.configurations import FEWEST
 from calib_ros.identification.leastsquares import Fit, System
-from calib_ros.identification.levels import CERTAIN
+from calib_ros.identification.levels import CERTAIN, TELLING
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
-NEAREST = 3
-"""Neighbours in joint space of each configuration that are tested."""
+NEARBY = 3
+"""Neighbours in joint space of each configuration that are tested (benchmarks/drift.py)."""
 MOST_STOPS = 400
 """Stops on which sizes are estimated; of more, every so many runs of a
 twentieth."""
-APART = 1e9
+ELSEWHERE = 4.0 * LARGEST
 """Distance of the stops of different sets, which are no neighbours."""
 
 
@@ -98,9 +98,9 @@ class _Stops:
             first = np.flatnonzero(np.diff(self.time) == 1.0)
             second = first + 1
         else:
-            far, nearest = cKDTree(self.place).query(self.place, k=NEAREST + 1)
-            first, second = np.repeat(np.arange(count), NEAREST + 1), nearest.ravel()
-            good = (first != second) & (far.ravel() < APART / 2)
+            far, nearest = cKDTree(self.place).query(self.place, k=NEARBY + 1)
+            first, second = np.repeat(np.arange(count), NEARBY + 1), nearest.ravel()
+            good = (first != second) & (far.ravel() < ELSEWHERE / 2)
             first, second = first[good], second[good]
         ends = (np.append(first, second), np.append(second, first))
         links = csr_array((np.ones(2 * len(first)), ends), shape=(count, count))
@@ -120,7 +120,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     share = max(1, -(-total // MOST_STOPS))
     few = _gather(fit.chain, names, system, share, MOST_STOPS // 20)
     correlations = dict.fromkeys(kinds, 0.0)
-    if len(few) < FEWEST:
+    if len(few) < TELLING:
         return Shared(**correlations, found=(), middles={})
     extra, _ = system.extra_rows(fit.chain, names)
     forms = _Forms(few, extra)
@@ -304,8 +304,8 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
             parts[part].append(rows)
         q = few.observations.joints[begins]
         turned = [np.cos(q[:, circular]), np.sin(q[:, circular]), q[:, ~circular]]
-        places.append(np.column_stack([*turned, np.full(len(q), APART * number)]))
-        times.append(numbers[begins] + APART * number)
+        places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
+        times.append(numbers[begins] + ELSEWHERE * number)
         counts.append(count)
     if not counts:
         return _Stops([], np.zeros(0), np.zeros((0, 0)), np.zeros(0))

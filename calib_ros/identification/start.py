@@ -25,25 +25,24 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.identification.identifiability import FRAME_TOLERANCE, excited
+from calib_ros.identification.identifiability import DEGENERATE, excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
-from calib_ros.identification.observations import POSES, Observations
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
 from calib_ros.identification.samples import Samples, residual_arrays
+from calib_ros.identification.trimmed import STARTS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
-PLANE_AND_TOOL = 14
-"""Touches of a plane, one more than unknowns, from which they tell tool and plane at once."""
-DRAWS, DRAWN = 500, 8
-"""How many starts a place by distances has, and from how many samples, of 4 unknowns."""
+FOR_A_PLACE = 8
+"""Samples from which a place by distances is drawn, of 4 unknowns."""
 ONE_ORIENTATION = 0.9999
 """Ratio of the leading singular values from which orientations are one, within 0.01 rad."""
-CONVINCING = 0.03
+GOOD = 0.03
 """A start is taken without a search when its RMS error is below this share of the spread."""
 
 
@@ -71,7 +70,7 @@ def start_frames(
         alone = replace(observations, base='base', tool='tool')
         if observations.pixels is not None:
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
-            share = -(-(int(alone.images[-1]) + 1) // POSES)
+            share = -(-(int(alone.images[-1]) + 1) // SOME_POSES)
             alone = board_poses(alone.select(alone.images % share == 0), lens)
         view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
         for key, name in ends.items():
@@ -101,7 +100,7 @@ def _start_one(
         return chain
     if observations.socket:
         return _in_socket(chain, observations)
-    index = np.unique(np.linspace(0, len(observations) - 1, POSES).round().astype(int))
+    index = np.unique(np.linspace(0, len(observations) - 1, SOME_POSES).round().astype(int))
     subset = observations.select(index)
     system = System((Samples(subset, sigma_position, sigma_orientation),))
     arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
@@ -129,7 +128,7 @@ def _start_one(
             error = _typical_error(fitted, subset)
             if error < best_error:
                 best, best_error = fitted, error
-        if best_error <= CONVINCING * spread:
+        if best_error <= GOOD * spread:
             break
     return robust_fit(best, determined, system, loss).fit.chain
 
@@ -175,9 +174,9 @@ def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iter
     assert observations.distances is not None
     base, tool = chain.frame('base'), chain.frame('tool')
     tips = [tool.matrix[:3, 3]]
-    if not tool.fixed and len(arm) >= PLANE_AND_TOOL:
-        turned = arm[:, :3, :3].reshape(-1, 9)
-        columns = np.column_stack([arm[:, :3, 3], turned, np.ones(len(arm))])
+    turned = arm[:, :3, :3].reshape(-1, 9)
+    columns = np.column_stack([arm[:, :3, 3], turned, np.ones(len(arm))])
+    if not tool.fixed and len(columns) > columns.shape[1]:  # one touch more than unknowns
         least = np.linalg.svd(columns, full_matrices=False)[2][-1]
         normal = least[:3]
         tips.append(normal @ least[3:12].reshape(3, 3) / max(float(normal @ normal), 1e-12))
@@ -211,13 +210,15 @@ def _trilaterated(
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
     chosen = np.arange(len(points))
-    if robust and len(points) > DRAWN:
-        draws = np.random.default_rng(0).random((DRAWS, len(points))).argsort(axis=1)[:, :DRAWN]
+    if robust and len(points) > FOR_A_PLACE:
+        draws = (
+            np.random.default_rng(0).random((STARTS, len(points))).argsort(axis=1)[:, :FOR_A_PLACE]
+        )
         found = (np.linalg.pinv(columns[draws]) @ wanted[draws, np.newaxis])[:, :3, 0]
         lengths = np.linalg.norm(points + found[:, np.newaxis], axis=2)
         misfits = np.abs(lengths - observations.distances)
         best = misfits[np.argmin(np.median(misfits, axis=1))]
-        chosen = np.argsort(best)[: max(len(points) // 2, DRAWN)]
+        chosen = np.argsort(best)[: max(len(points) // 2, FOR_A_PLACE)]
     matrix = np.eye(4)
     matrix[:3, 3] = np.linalg.lstsq(columns[chosen], wanted[chosen], rcond=None)[0][:3]
     return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
@@ -300,5 +301,5 @@ def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
     if free:
         turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
     left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
-    known = sizes > FRAME_TOLERANCE * np.sqrt(len(turned))
+    known = sizes > DEGENERATE * np.sqrt(len(turned))
     return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))

@@ -27,20 +27,20 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.configurations import stops
-from calib_ros.identification.drift import SINGULAR, inverse_root, slow_cosines
+from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
+from calib_ros.identification.leastsquares import STEP_TOLERANCE
 from calib_ros.identification.levels import SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.identification.robust import NOISE_FREE, Robust, weights_of
+from calib_ros.identification.robust import Robust, weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 EXPLAINED = 0.5
-"""Share of the squares of the residuals from which on something explains them."""
-SUSPECTED = 0.4
-"""The same at a stop near by, where not all are looked at first."""
+"""Share of the squares of the residuals from which on something explains them: most of them
+(benchmarks/harm.py)."""
 PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST_ASIDE = 3
@@ -98,7 +98,7 @@ class Step:
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         if self.stamp_ns < ROWS_NS and self.stamp_ns % 10**9 == 0:
             when = f'line {self.stamp_ns // 10**9}, without stamps the order of the rows is taken'
-        text = f'something moved at sample {self.sample + 1}'
+        text = f'something moved at pose {self.sample + 1}'
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':
@@ -124,7 +124,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     if not len(places):
         return None
     coarse = places[:: 1 + (len(places) - 1) // PLACES]
-    found = scan.best(coarse, SUSPECTED) if len(places) else None
+    found = scan.best(coarse, 0.5 * EXPLAINED)  # of a step near by
     if found is None:
         return None
     near = np.abs(places - found.stop) <= np.diff(coarse).max(initial=0)
@@ -207,14 +207,14 @@ class _Scan:
             size = scale[:, columns]
             own = matrix[:, columns][:, :, columns] * size[:, :, np.newaxis] * size[:, np.newaxis]
             values, axes = np.linalg.eigh(own)
-            good = values > SINGULAR
+            good = values > ROUNDING
             rank = good.sum(axis=1)
             along = np.einsum('bij,bi->bj', axes, size * vector[:, columns]) * good
             inverse = 1.0 / np.where(good, values, 1.0)
             equations = self._equations[list(group.sets)].sum()
             freedom = equations * (1.0 - self._fitted / self._equations.sum())
             left = self._left[list(group.sets)].sum()
-            if left <= NOISE_FREE**2 * equations or freedom <= rank.max() + 1.0:
+            if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
             share = np.minimum((along**2 * inverse).sum(axis=1) / left, 1.0 - 1e-12)
             k = int(np.argmax(share))

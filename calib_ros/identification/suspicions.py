@@ -28,9 +28,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
+from calib_ros.identification.evidence import SCALE
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise, stacked
-from calib_ros.identification.mistakes import NEARER
+from calib_ros.identification.levels import NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -48,10 +49,12 @@ if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
 
 CHANCE = 1e-4
-"""Probability of a scale as significant in an arm whose offsets only scatter."""
-LEAST_SCALE = 5e-5
+"""Probability of a scale as significant in an arm whose offsets only scatter
+(benchmarks/harm.py)."""
+LEAST_SCALE = 0.5 * SCALE
+"""Of a device of which it is told: half of what those of good ones scatter by."""
 LARGEST_SCALE = 1e-3
-"""Growth of an arm by 40 degrees, if all of it is of aluminium."""
+"""Growth of an arm by 40 degrees, if all of it is of aluminium (23 ppm a degree)."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths that are tried."""
 ANOTHER = (2e-3, 5e-3)

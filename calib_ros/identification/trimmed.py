@@ -22,22 +22,23 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.leastsquares import ROUNDS, System, minimise
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, FloatArray
 
 STARTS = 500
+"""As many as FAST-LTS has."""
 CONCENTRATIONS = 4
 """Concentration steps from every start; then only the BEST are followed to their end."""
 BEST = 10
+"""As many as FAST-LTS has."""
 RELINEARISATIONS = 5
+"""Times that the model is made anew at the best half at most (benchmarks/outliers.py)."""
 SEARCHED = 300
 """Samples that are searched, evenly spread over all, of each set a tenth at least; the fit that
 follows takes all."""
 DRAWN = 0.5
 """Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
-RIDGE = np.sqrt(np.finfo(float).eps)
-"""Weight that keeps what a start leaves open where it is, against that of all samples."""
 
 
 def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
@@ -145,7 +146,7 @@ class _Linear:
         self._columns, extra = np.ascontiguousarray(columns * scale), extra * scale
         self._matrices = np.einsum('ncp,ncq->npq', self._columns, self._columns, optimize=True)
         self._gradients = np.einsum('ncp,nc->np', self._columns, self._residual)
-        self._matrix = extra.T @ extra + RIDGE * np.eye(len(names))
+        self._matrix = extra.T @ extra + HALF_THE_DIGITS * np.eye(len(names))
         self._gradient = extra.T @ offset
 
     def squares(self, masks: NDArray[np.bool_]) -> FloatArray:

@@ -25,6 +25,9 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame
 
+COUNTS = 0.005
+"""Change of an RMS error that counts, of itself; less is how it happens to fall
+(benchmarks/real_robots.py)."""
 SPARE = 6
 """Equations that a fit to a part of the configurations must have to spare."""
 
@@ -204,14 +207,14 @@ def validate(
             if explained is not None:
                 judged |= explained
             comparison = replace(comparison, judged=judged)
-        text = f'{len(comparison.judged)} held-out samples'
+        text = f'{len(comparison.judged)} held-out poses'
         if repeated.any():
-            text += f', of which {repeated.sum()} at fitted configurations decide nothing'
+            text += f'; {repeated.sum()} of them decide nothing: measured at fitted poses again'
         return comparison, text
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
-    said = ', because all held-out samples are at such' if len(repeated) else ''
+    said = ', because all held-out poses were fitted too' if len(repeated) else ''
     return _cross_validate(problem, before, after, names, robust, said)
 
 
@@ -231,7 +234,7 @@ def _cross_validate(
     )
     folds = _folds(problem, names, count, rows)
     if folds < 2:
-        return None, 'nothing: too few configurations to leave any out'
+        return None, 'nothing: too few poses to leave any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     chains = zip(
@@ -242,7 +245,7 @@ def _cross_validate(
     first, second = left_out(chains, problem.sets, groups, numbers)
     return (
         Comparison(first, second, ~robust.outliers),
-        f'{folds}-fold cross-validation over {count} distinct configurations{said}',
+        f'{folds}-fold cross-validation over {count} different poses{said}',
     )
 
 

@@ -27,9 +27,16 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS, Parameter
-from calib_ros.kinematics.urdf import MOST_JOINTS, chain_from_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.texts import parse_yaml
-from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, parse_name, parse_number, parse_numbers
+from calib_ros.values import (
+    LARGEST,
+    MOST_NAMES,
+    QUATERNION_TOLERANCE,
+    parse_name,
+    parse_number,
+    parse_numbers,
+)
 
 CHAIN_KEYS = (
     *('name', 'convention', 'joints', 'parallel', 'base', 'tool', 'frames', 'effects', 'gravity'),
@@ -105,8 +112,8 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
-    if len(rows) > MOST_JOINTS:
-        raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_JOINTS}')
+    if len(rows) > MOST_NAMES:
+        raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_NAMES}')
     parallel = content.get('parallel')
     if parallel is not None and not (isinstance(parallel, list) and _texts(parallel)):
         raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')

@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import ITERATIONS, LEVER, Aim, limits, solve_positive
+from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, transform
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, transform
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.shown import Shown
 
@@ -193,7 +193,8 @@ class Follower:
 
         A step that raises the cost is not taken, and tried again with more damping, from a
         thousandth of the diagonal on (Marquardt 1963). Samples settle for a cost that does not
-        fall any more if told so; else they are given up when x is longer than 1.
+        fall any more if told so; else they are given up when x is longer than 1. `inverse.solve`
+        has neither D nor such an end, and stays within the limits instead.
 
         Returns
         -------
@@ -207,7 +208,7 @@ class Follower:
         x, caution, still = task.start, np.zeros(active.size), np.zeros(active.size, dtype=bool)
         error, columns = self._linearise(task, x, weight)
         iterations = 0
-        while iterations < ITERATIONS:
+        while iterations < ROUNDS:
             iterations += 1
             normal = np.einsum('ikb,jkb->ijb', columns, columns) + stiffness
             normal[self._diagonal] *= 1.0 + caution

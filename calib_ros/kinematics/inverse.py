@@ -23,13 +23,11 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray
+from calib_ros.values import SAME
 
 LEVER = 0.3
 """Length [m] at which a turn counts as much as a shift."""
-TOLERANCE = 1e-9
-"""A pose is reached when it is missed by less [m, and rad times LEVER]."""
-ITERATIONS = 100
 DAMPING = (1e-12, 1e-6, 1e3)
 """Least damping, the first one, and that beyond which no step helps [m^2]."""
 
@@ -65,6 +63,9 @@ def solve(
 ) -> Inverse:
     """Return the joint values near a start that bring the target to wanted poses.
 
+    Thousands of small problems at once, array by array, where `leastsquares` solves one of many
+    samples: each has its own damping.
+
     Parameters
     ----------
     chain : Chain
@@ -92,8 +93,8 @@ def solve(
     least, first, most = DAMPING
     damping = np.full(len(poses), first)
     diagonal = np.diag_indices(len(q))
-    for _ in range(ITERATIONS):
-        (active,) = np.nonzero((size > TOLERANCE) & (damping < most))
+    for _ in range(ROUNDS):
+        (active,) = np.nonzero((size > SAME) & (damping < most))
         if not active.size:
             break
         own = columns[:, :, active]
@@ -112,7 +113,7 @@ def solve(
         q.T,
         np.linalg.norm(error[:3], axis=0),
         np.linalg.norm(error[3:], axis=0) / LEVER,
-        size <= TOLERANCE,
+        size <= SAME,
     )
 
 

@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.parameter import LENS_KINDS
-from calib_ros.kinematics.se3 import FloatArray
-
-NEAREST = 1e-6
-"""Depth [m] up to which a point is taken to be in front of the camera."""
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+from calib_ros.values import SAME
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Lens:
 
         What is behind the camera is seen as at the side, so that a fit finds its way back.
         """
-        inverse = 1.0 / np.maximum(points[2], NEAREST)
+        inverse = 1.0 / np.maximum(points[2], SAME)
         x, y = points[0] * inverse, points[1] * inverse
         across, along, both = x * x, y * y, x * y
         square = across + along
@@ -92,7 +90,7 @@ class Lens:
         """Put the derivatives (K, 2, B) of the pixels of points by parameters of the lens."""
         if not kinds:
             return
-        plane = points[:2] / np.maximum(points[2], NEAREST)
+        plane = points[:2] / np.maximum(points[2], SAME)
         across, along = plane * plane
         square = across + along
         focal = np.array([[self.fx], [self.fy]])
@@ -118,14 +116,14 @@ class Lens:
         target = np.ascontiguousarray(pixels.T)
         points = np.ones((3, len(pixels)))
         points[0], points[1] = (target[0] - self.cx) / self.fx, (target[1] - self.cy) / self.fy
-        for _ in range(20):
+        for _ in range(ROUNDS):
             seen, ((a, b, _), (c, d, _)) = self.project(points)
             size = a * d - b * c
             turned = size <= 0.0  # beyond the edge of the polynomial
             u, v = (target - seen) / np.where(turned, 1.0, size)
             step = np.where(turned, 0.0, [d * u - b * v, a * v - c * u])
             points[:2] += step
-            if np.abs(step).max(initial=0.0) < 1e-12:
+            if np.abs(step).max(initial=0.0) < ROUNDING:
                 break
         return np.asarray(points[:2].T)
 

@@ -16,10 +16,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 FloatArray: TypeAlias = NDArray[np.float64]
+ROUNDS = 100
+"""Steps to a fixed point, which ends in far fewer unless there is none."""
 ROUNDING = 1e-12
 """Share of the whole from which on a number is more than rounding."""
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))
-"""An error whose square is rounding: after such a Newton step nothing is left."""
+"""A share whose square is rounding: after such a Newton step nothing is left, and a column of
+which no more is left depends on those before it."""
 
 
 def transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:

@@ -35,15 +35,13 @@ from calib_ros.kinematics.chain import (
     Joint,
     JointType,
 )
-from calib_ros.kinematics.inverse import TOLERANCE
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
+from calib_ros.values import MOST_NAMES, SAME
 
-DIGITS = 14
+DIGITS = np.finfo(float).precision - 1
 """Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
-MOST_JOINTS = 50
-"""Joints of a chain; each is five parameters to fit."""
-FAR = 0.2
+MOST_APART = 0.2
 """Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
 
 
@@ -80,9 +78,9 @@ def chain_from_urdf(
     path = robot.path(base_link, tip_link)
     poses = robot.poses(path[0].parent)
     moving = [joint for joint in path if joint.moves]
-    if len(moving) > MOST_JOINTS:
+    if len(moving) > MOST_NAMES:
         raise ConfigError(
-            f'{len(moving)} joints move between the links, more than {MOST_JOINTS}: choose '
+            f'{len(moving)} joints move between the links, more than {MOST_NAMES}: choose '
             'base_link and tip_link nearer to each other'
         )
     places = [poses[joint.child] for joint in moving]
@@ -158,7 +156,7 @@ def corrected_urdf(
     edited = with_origins(text, origins)
     found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
     q = arm.random_joints(1000, np.random.default_rng(0))
-    if np.abs(found.forward(q) - arm.forward(q)).max() > TOLERANCE:
+    if np.abs(found.forward(q) - arm.forward(q)).max() > SAME:
         raise ConfigError(
             f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '
             'that: let the tool frame be fitted instead, or add a fixed joint and a link'
@@ -185,7 +183,7 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
     shift = np.linalg.norm(found[:, :3, 3] - expected[:, :3, 3], axis=1).mean()
     turns = found[:, :3, :3] @ np.swapaxes(expected[:, :3, :3], 1, 2)
     turn = np.linalg.norm(se3.log_rotation(turns), axis=1).mean()
-    if max(shift, turn) > FAR:
+    if max(shift, turn) > MOST_APART:
         raise ConfigError(
             f'the chain is not the arm of this URDF between these links: the poses differ by '
             f'{shift:.3g} m and {turn:.3g} rad on average; identify again with the URDF as chain'

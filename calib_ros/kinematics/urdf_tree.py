@@ -18,17 +18,17 @@ from xml.parsers import expat
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.texts import LARGEST_TEXT
-from calib_ros.values import LARGEST, parse_name
+from calib_ros.values import LARGEST, SAME, parse_name
 
 MOVING = ('revolute', 'continuous', 'prismatic')
 TYPES = (*MOVING, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
 ENDS = ('lower', 'upper')
-MOST_LINKS = 10_000
+MOST_LINKS = 10 * MOST_ENTRIES
 """Links, and joints, of a URDF."""
 
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
@@ -209,7 +209,7 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     if kind in MOVING:
         axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
         size = np.abs(axis).max()
-        if size < 1e-9:  # a zero as others round it
+        if size < SAME:  # a zero as others round it
             raise ConfigError(f'the axis of {where} has no direction')
         axis = axis / size
         axis = axis / np.linalg.norm(axis)

@@ -119,7 +119,7 @@ RULES: dict[Rule, Advice] = {
         ),
     ),
     Rule.DRIFT: Advice(
-        'The improvement may only be drift of the measuring device',
+        'The measuring device may have drifted',
         'The errors changed slowly during the session. A measuring device that warms up or '
         'settles does just that. Then the correction would fit the device, not the robot, '
         'and be wrong tomorrow.',

@@ -104,6 +104,7 @@ class Report:
     verdict: Verdict
     advice: tuple[Advice, ...] = ()
     accuracy: Section | None = None
+    picture: Section | None = None
     steps: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     identity: tuple[tuple[str, str], ...] = ()
@@ -111,6 +112,11 @@ class Report:
     sections: tuple[Section, ...] = ()
     origin: Origin = Origin()
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
+
+    @property
+    def shown(self) -> tuple[Section, ...]:
+        """Return the sections of which any may have a figure."""
+        return (*filter(None, (self.picture,)), *self.sections)
 
 
 def plotly_script() -> str | None:
@@ -139,7 +145,7 @@ def render(report: Report, script: str = '') -> str | None:
         script=script,
         plotly=plotly,
         data={
-            'figures': {each.name: each.figure for each in report.sections if each.figure},
+            'figures': {each.name: each.figure for each in report.shown if each.figure},
             'explorer': report.explorer,
         },
     )
@@ -156,8 +162,7 @@ def on_paper(report: Report) -> bytes | None:
         return None
     from calib_ros.report.plots import drawing
 
-    heights = {each.name: each.height for each in report.sections} | {'cumulated': 260}
-    drawn = ((each.name, drawing(each.figure, heights[each.name])) for each in report.sections)
+    drawn = ((each.name, drawing(each.figure, each.height)) for each in report.shown)
     logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
     page = filled(
         'report.html.jinja',

@@ -22,14 +22,12 @@ from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
 from calib_ros.report.sections import (
     ISO_9283,
-    accuracy_rows,
     accuracy_section,
     coverage,
     distribution,
     gain,
     identity_of,
     limits_of,
-    row_of,
 )
 
 SURVEYED = 4000
@@ -47,30 +45,28 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     limits = limits_of(judged, 1, CONFIDENT)
-    accuracy = [
-        row
-        for label, which in (('fitted', result.fitted), ('not fitted', result.validation))
-        if which is not None
-        for row in accuracy_rows(label, which)
-    ]
-    if judged.outliers:
-        accuracy.append(row_of('after, with outliers', judged.figures_of_all[1], None))
+    compared = {'fitted: ': result.fitted}
+    if result.validation is not None:
+        compared = {'': result.validation} | compared
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
         verdict=_verdict(result, limits, tolerance),
         advice=advice(result.refusals, result.noise.position),
         accuracy=accuracy_section(
-            'Accuracy before and after',
+            f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
             (
-                f'"Before" is {words.BEFORE}. Judged by {result.validated_by}. The interval is '
-                'that of the RMS error over poses like these, each configuration counted once.',
-                'RMS (root mean square) is the usual size of the error. 1 mrad of orientation '
-                'moves the tip of a tool of 1 m by 1 mm.',
+                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
+                f'{result.validated_by}. "Fitted" are the poses that the correction was computed '
+                'from: they prove nothing.',
+                'RMS (root mean square) is the usual size of the error; its interval is that over '
+                'poses like these. 1 mrad of orientation moves the tip of a tool of 1 m by 1 mm.',
                 ISO_9283,
             ),
-            accuracy,
+            compared,
+            judged.figures_of_all[1] if judged.outliers else None,
         ),
+        picture=distribution(poses),
         steps=_steps(result, limits, tolerance),
         remarks=(*warnings, *words.remarks(result)),
         identity=identity_of(
@@ -101,8 +97,8 @@ def _verdict(
             ),
         )
     how = (
-        'RMS position error before and after, on poses that were not used to compute the '
-        'correction; in brackets the 95 % interval.'
+        'Before and after, on poses that were not used to compute the correction; in brackets '
+        'the 95 % interval.'
     )
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(each for each in (how, where) if each)
@@ -166,7 +162,6 @@ def _steps(
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterator[Section]:
     """Return the sections below the poses."""
-    yield distribution(poses)
     yield Section(
         'noise',
         'What is left against the noise of the device',
@@ -176,15 +171,14 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
             'is too small.',
         ),
         figures.against_noise(poses),
-        said=(f'In figures: {words.noise_in_words(result)}.', *words.chance_in_words(result)),
+        said=(words.noise_in_words(result), *words.chance_in_words(result)),
     )
     if result.outliers:
         yield _outliers(poses)
     yield from _offsets(problem, result)
     yield _parameters(result)
     yield _correlations(result)
-    said = tuple(words.identifiability_in_words(result))
-    yield Section('determined', 'What the poses determine', said)
+    yield _determined(result)
     yield coverage(result.chain, poses.joints, 'How far each joint was moved')
     if result.verdicts:
         yield _effects(result)
@@ -198,7 +192,7 @@ def _effects(result: Identification) -> Section:
     return Section(
         'effects',
         'Errors beyond geometry',
-        ('RMS position error on configurations left out, with and without each effect.',),
+        ('RMS position error on poses left out, with and without each effect.',),
         head=('effect', 'without [mm]', 'with it [mm]', 'used'),
         rows=tuple(
             (v.what, f'{v.rms_mm_before:.4f}', f'{v.rms_mm_after:.4f}', pays[v.pays])
@@ -220,7 +214,7 @@ def _outliers(poses: Poses, most: int = 50) -> Section:
             'They differ from all the others by more than errors of this arm and device do. '
             f'Measure them again, or look what happened there.{more}',
         ),
-        head=('where', 'pose', 'size [usual errors]', 'error after [mm]'),
+        head=('where', 'pose', 'times the usual error', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
             for k in rows[:most].tolist()
@@ -263,7 +257,8 @@ def _parameters(result: Identification) -> Section:
     for p in result.parameters:
         unit = p.name.unit
         scale, small = (1.0, unit) if p.name.of_lens else (1e3, f'm{unit}')
-        found = (p.offset if p.std is not None else None, p.std, p.half_width())
+        placed = p.std is None or result.chain.owns_frame(p.name)
+        found = (None if placed else p.offset, p.std, p.half_width())
         forms = zip(found, ('+.4f', '.4f', '.4f'), strict=True)
         numbers = ['' if x is None else f'{scale * x:{form}}' for x, form in forms]
         rows.append((p.name, f'{p.value:.9f} {unit}', *numbers, small, p.status))
@@ -271,13 +266,28 @@ def _parameters(result: Identification) -> Section:
         'parameters',
         'All parameters',
         (
-            'gauge: redundant by the structure of the chain, kept nominal. not excited: the '
-            'poses do not determine it, kept nominal. fixed: held on request.',
+            'Kept nominal are those of status "gauge" (by the build of the arm they show only '
+            'together with others), "not excited" (the poses do not determine them) and "fixed" '
+            '(held on request). Base and tool are placed by the fit: they have no offset.',
             f'{result.rank} are fitted, in {result.iterations} iterations.',
             *words.priors_in_words(result),
         ),
         head=('parameter', 'value', 'offset', 'std', '± (95 %)', 'unit', 'status'),
         rows=tuple(rows),
+    )
+
+
+def _determined(result: Identification) -> Section:
+    """Return what no measurement at these poses can tell."""
+    return Section(
+        'determined',
+        'What the poses determine',
+        tuple(words.identifiability_in_words(result)),
+        head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
+        rows=tuple(
+            (name, ', '.join(partners) or 'no measured pose depends on it')
+            for name, partners in result.gauges.items()
+        ),
     )
 
 

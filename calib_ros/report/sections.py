@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping
 from datetime import datetime, timezone
 
 import numpy as np
@@ -28,17 +28,18 @@ ISO_9283 = (
     'and the mean of the poses attained. Where a pose was measured once, its repeatability is '
     'part of the figure.'
 )
-HEAD = (
+LABELS = (
     '',
     'poses',
     'RMS [mm]',
     '95 % interval',
-    'mean',
-    'max',
-    'mean + 3 sigma',
+    'mean [mm]',
+    'largest [mm]',
+    'mean + 3 sigma [mm]',
     'RMS [mrad]',
     'RMS [px]',
 )
+"""Rows of the table of accuracy."""
 
 
 def gain(which: Comparison) -> str:
@@ -47,7 +48,7 @@ def gain(which: Comparison) -> str:
     for when, found in enumerate(which.figures):
         between = _between(limits_of(which, when, INTERVAL))
         parts.append(f'{found.rms_mm:.3f} mm' + (f' ({between})' if between else ''))
-    return ' → '.join(parts)
+    return f'RMS position error: {" → ".join(parts)}'
 
 
 def _between(limits: tuple[float, float]) -> str:
@@ -62,30 +63,33 @@ def limits_of(which: Comparison, when: int, confidence: float) -> tuple[float, f
     return rms_interval(residuals.position[mask], residuals.configurations[mask], confidence)
 
 
-def accuracy_rows(label: str, which: Comparison) -> list[tuple[str, ...]]:
-    """Return the rows of the table of accuracy, before and after."""
-    return [
-        row_of(f'{label}, {name}', found, limits_of(which, when, INTERVAL))
+def accuracy_section(
+    title: str,
+    text: tuple[str, ...],
+    judged: Mapping[str, Comparison],
+    with_outliers: ErrorFigures | None = None,
+) -> Section:
+    """Return the table of accuracy: before and after of each comparison, by its prefix."""
+    columns = [
+        _column(f'{prefix}{name}', found, limits_of(which, when, INTERVAL))
+        for prefix, which in judged.items()
         for when, (name, found) in enumerate(zip(('before', 'after'), which.figures, strict=True))
     ]
+    if with_outliers is not None:
+        columns.append(_column('after, with outliers', with_outliers))
+    head, *rows = (row for row in zip(LABELS, *columns, strict=True) if any(row[1:]))
+    return Section('accuracy', title, text, head=head, rows=tuple(rows))
 
 
-def accuracy_section(
-    title: str, text: tuple[str, ...], rows: Sequence[tuple[str, ...]]
-) -> Section:
-    """Return the table of accuracy; without its last column where no pixels were measured."""
-    end = None if any(row[-1] for row in rows) else -1
-    cut = tuple(row[:end] for row in rows)
-    return Section('accuracy', title, text, head=HEAD[:end], rows=cut)
-
-
-def row_of(label: str, found: ErrorFigures, limits: tuple[float, float] | None) -> tuple[str, ...]:
-    """Return a row of the table of accuracy, with limits [m] of the RMS if they are known."""
-    between = '' if limits is None else _between(limits)
-    turned, seen = ('' if x is None else f'{x:.3f}' for x in (found.rms_mrad, found.rms_px))
+def _column(
+    label: str, found: ErrorFigures, limits: tuple[float, float] | None = None
+) -> tuple[str, ...]:
+    """Return a column of the table of accuracy, with limits [m] of the RMS if they are known."""
     lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
-    shown = (f'{each:.3f}' for each in lengths)
-    return (label, f'{found.count:,}', f'{found.rms_mm:.3f}', between, *shown, turned, seen)
+    rest = (*lengths, found.rms_mrad, found.rms_px)
+    between = '' if limits is None else _between(limits)
+    shown = ('' if x is None else f'{x:.3f}' for x in rest)
+    return (label, f'{found.count:,}', f'{found.rms_mm:.3f}', between, *shown)
 
 
 def identity_of(
@@ -135,9 +139,10 @@ def distribution(poses: Poses) -> Section:
     )
     return Section(
         'cumulated',
-        'How many poses are how good',
+        'How many poses are within an error',
         ('Outliers are left out. The further left a curve, the better.',),
         figures.cumulated(before, after),
+        height=400,
     )
 
 

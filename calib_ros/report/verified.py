@@ -16,7 +16,6 @@ from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
 from calib_ros.report.sections import (
     ISO_9283,
-    accuracy_rows,
     accuracy_section,
     coverage,
     distribution,
@@ -63,17 +62,17 @@ def verification_report(
         accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
-            accuracy_rows('measured', found.comparison),
+            {'': found.comparison},
         ),
+        picture=distribution(poses),
         steps=NEXT[found.verdict],
         remarks=(*warnings, *remarks(found)),
         identity=identity_of(
-            chain, origin, poses, ('Configurations', str(found.configurations)), table_hash(chain)
+            chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)
         ),
         explorer=explorer(chain, poses),
         sections=(
             *_by_configuration(found),
-            distribution(poses),
             coverage(chain, poses.joints, 'How far each joint was moved'),
         ),
         origin=origin,

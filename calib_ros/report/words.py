@@ -25,9 +25,8 @@ from calib_ros.kinematics.chain_file import dump_yaml
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
+from calib_ros.shown import some
 
-NAMED = 5
-"""Outliers that an answer names."""
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
 
@@ -43,7 +42,7 @@ def summary(
     measurements.
     """
     before, after = (result.validation or result.fitted).figures
-    text = f'{len(result.fitted.judged)} samples, RMS {before.rms_mm:.3f} -> '
+    text = f'{len(result.fitted.judged)} poses, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
@@ -90,12 +89,10 @@ def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, in
     """Return the numbers and stamps [s] of outliers, the largest first."""
     largest = sorted(outliers, key=lambda each: -each.size)
     words = [
-        f'sample {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
-        for each in largest[:NAMED]
+        f'pose {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
+        for each in largest
     ]
-    if len(largest) > NAMED:
-        words.append(f'and {len(largest) - NAMED} more')
-    return ', '.join(words)
+    return ', '.join(some(words))
 
 
 def weakly_determined(result: Identification) -> tuple[str, ...]:
@@ -123,7 +120,7 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
 
     It must hold as for `verdict`, and nothing may have changed.
     """
-    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} samples'
+    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
     if found.changed:
         reasons = '; '.join(reason_in_words(each) for each in found.changed)
         return False, (
@@ -148,7 +145,7 @@ def verdict(
     A share of them may be `reused`: fitted before, as of a bag that is played again.
     """
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    text += f'{now.count} samples taken since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
     if warning := reused_in_words(reused):
         text += f'; {warning}'
     if calibration.residual is None:
@@ -238,7 +235,7 @@ def region_figures(region: Region) -> dict[str, Any]:
     return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
 
 
-BEFORE = 'the nominal chain with its base and tool frames fitted to the same samples'
+BEFORE = 'the nominal chain with its base and tool frames fitted to the same measurements'
 
 
 def sigma_over_range(result: Identification) -> dict[str, float]:
@@ -249,21 +246,21 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 
 def noise_in_words(result: Identification) -> str:
     """Return how large the residuals are against the sigmas given."""
-    return f'{scatter_in_words(result.noise)}; {neighbours_in_words(result.noise)}'
+    return f'{scatter_in_words(result.noise)} {neighbours_in_words(result.noise)}'
 
 
 def scatter_in_words(noise: Noise) -> str:
     """Return how much more is left than the device should leave."""
-    text = f'what is left is {noise.position:.2f} times the stated noise in position'
+    text = f'The error left is {noise.position:.2f} times the stated noise in position'
     if noise.orientation is not None:
-        text += f' and {noise.orientation:.2f} times in orientation'
+        text += f', {noise.orientation:.2f} times in orientation'
     if noise.consistent:
-        return f'{text}, consistent with it (chi-squared test)'
+        return f'{text}: consistent with it (chi-squared test).'
     if noise.position < 1.0:
-        return f'{text}: less than --sigma-position and --sigma-orientation say'
+        return f'{text}: less than --sigma-position and --sigma-orientation say.'
     return (
-        f'{text}: the measurements are not what --sigma-position and --sigma-orientation say; '
-        'intervals are as wide as what is left makes them'
+        f'{text}: more than --sigma-position and --sigma-orientation say. The intervals allow '
+        'for it.'
     )
 
 
@@ -276,12 +273,12 @@ NEIGHBOURS = {
 def neighbours_in_words(noise: Noise) -> str:
     """Return which neighbours share errors, by how much, and what follows."""
     if not noise.shared:
-        return 'neighbouring configurations share no errors that a test would find'
+        return 'Neighbouring poses share no error that a test would find.'
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
     return (
-        f'configurations {" and ".join(parts)} share errors, as of a drifting tracker or of '
-        'effects that the model lacks, and count for fewer: standard deviations are '
-        f'{noise.widened:.2f} times those of independent errors'
+        f'The errors of poses {" and ".join(parts)} are alike (correlation in brackets): the '
+        'device drifts, or the model lacks an effect. So each pose counts for less, and standard '
+        f'deviations are {noise.widened:.2f} times those of independent errors.'
     )
 
 
@@ -290,8 +287,8 @@ def chance_in_words(result: Identification) -> list[str]:
     if result.chance is None:
         return []
     return [
-        'chance that the improvement is only tracker drift: '
-        f'{100.0 * result.chance:.1f} % (time-shifted residuals that are explained just as well)'
+        'The chance that the improvement is only drift of the device is '
+        f'{100.0 * result.chance:.1f} % (share of time-shifted residuals explained just as well).'
     ]
 
 
@@ -314,27 +311,18 @@ def priors_in_words(result: Identification) -> list[str]:
 
 
 def identifiability_in_words(result: Identification) -> list[str]:
-    """Return which parameters trade against which, which are weak, and the indices."""
-    lines = []
-    for name, partners in result.gauges.items():
-        if partners:
-            lines.append(
-                f'{name} cannot be told apart from {", ".join(partners)}: only their combination '
-                f'shows, and {name} keeps its nominal value'
-            )
-        else:
-            lines.append(f'{name}: no measured pose depends on it; it keeps its nominal value')
+    """Return how well the arm is known, which parameters are weak, and the indices."""
+    sigma = sigma_over_range(result)
+    lines = [
+        f'One sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
+        f'(median), {sigma["max"]:.3f} mm at most.',
+        f'Observability: {observability_in_words(result)}.',
+    ]
     weak = weakly_determined(result)
     if weak:
-        lines.append(f'weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}')
-    for first, second, value in result.correlated():
-        lines.append(f'{first} and {second} are correlated by {value:+.3f}')
-    sigma = sigma_over_range(result)
-    lines.append(
-        f'one sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
-        f'(median), {sigma["max"]:.3f} mm at most'
-    )
-    lines.append(f'observability {observability_in_words(result)}')
+        lines.append(
+            f'Weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}.'
+        )
     return lines
 
 

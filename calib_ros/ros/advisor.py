@@ -31,32 +31,29 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import next_pose
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
-from calib_ros.errors import CalibrationError, InputError
+from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError
 from calib_ros.files.trajectories import RATES, trajectory_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import STILL
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
 from calib_ros.sampling.cdr import trajectory_size
-from calib_ros.sampling.live import LOOK, Estimate
+from calib_ros.sampling.live import Estimate
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+from calib_ros.shown import some
 
-CANDIDATES = 300
-"""Random poses among which the next one is looked for, where no file gives any."""
 CLOUD = 10_000
-"""Points of the cloud of errors."""
-MOST_POINTS = 50_000
+"""Points of the cloud of errors (60 ms)."""
+MOST_POINTS = Settings.pose_buffer
 """Points of a trajectory; a longer one is refused."""
-MOST_JOINTS = 1000
-"""Joints that a trajectory names; one of more is refused."""
 MOST_SIZE = 400 * MOST_POINTS
 """Bytes of a serialised trajectory: ten joints with all rates take 352 a point."""
 MOST_QUEUED = 10
 """Trajectories that may wait; those that come on top are refused."""
-MOST_REASONS = 3
-"""Refused points whose reasons are told."""
 
 
 class Guide:
@@ -85,13 +82,13 @@ class Guide:
         self._next_pose = node.create_publisher(JointState, '~/next_pose', to_ros.LATCHED)
         self._errors = node.create_publisher(PointCloud2, '~/workspace_error', to_ros.LATCHED)
         self._corrected = node.create_publisher(
-            JointTrajectory, '~/compensated_joint_trajectory', 10
+            JointTrajectory, '~/compensated_joint_trajectory', MOST_QUEUED
         )
         node.create_subscription(
             JointTrajectory,
             '~/joint_trajectory',
             self._guarded(self._on_trajectory),
-            10,
+            MOST_QUEUED,
             raw=True,  # see `_too_large`
         )
 
@@ -142,11 +139,11 @@ class Guide:
         rng = np.random.default_rng(len(taken))
         candidates = self._candidates
         if candidates is None:
-            candidates = draw_candidates(design, CANDIDATES, rng)
+            candidates = draw_candidates(design, SOME_POSES, rng)
         apart = np.abs(candidates[:, np.newaxis] - taken).max(axis=2).min(axis=1)
         candidates = candidates[apart > STILL]
         if len(candidates):
-            task = design.chain.random_joints(LOOK, rng)
+            task = design.chain.random_joints(SOME_POSES, rng)
             found = next_pose(design, candidates, task, self._session.settings.wanted_accuracy)
             self._next_pose.publish(
                 to_ros.joints(self._session.joint_names, found.joints, self._now())
@@ -200,13 +197,8 @@ class Guide:
         corrected, result = compensate_program(compensator, program)
         words = in_words(compensator, result)
         if result.refusals:
-            reasons = [
-                f'point {each.sample + 1}: {each.reason}'
-                for each in result.refusals[:MOST_REASONS]
-            ]
-            if len(result.refusals) > MOST_REASONS:
-                reasons.append(f'and {len(result.refusals) - MOST_REASONS} more')
-            raise InputError('; '.join([words, *reasons]))
+            reasons = [f'point {each.sample + 1}: {each.reason}' for each in result.refusals]
+            raise InputError('; '.join([words, *some(reasons)]))
         known, warning = calibration.knowledge(result.joints, result.orientation_before)
         words = '; '.join(part for part in (words, known, warning) if part)
         if warning:
@@ -235,10 +227,10 @@ def _too_large(data: bytes) -> str:
 
     To decode a million points takes many seconds, and no other thread runs meanwhile.
     """
-    names, points = trajectory_size(data, MOST_JOINTS)
+    names, points = trajectory_size(data, MOST_ENTRIES)
     for count, most, what in (
         (len(data), MOST_SIZE, 'bytes'),
-        (names, MOST_JOINTS, 'joints'),
+        (names, MOST_ENTRIES, 'joints'),
         (points, MOST_POINTS, 'points'),
     ):
         if count > most:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.errors import shortened
+from calib_ros.errors import LONGEST, shortened
 from calib_ros.files.archive import Archive
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
@@ -28,7 +28,7 @@ from calib_ros.ros.outputs import Published
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession
 
-ANSWER_LENGTH = 200
+ANSWER_LENGTH = LONGEST // 2
 """Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
 
 

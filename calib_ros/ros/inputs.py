@@ -24,14 +24,12 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.intake import Stream, links_of
+from calib_ros.sampling.intake import BATCH, Stream, links_of
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.slices import SILENCE
 
-INPUT_QUEUE = 2000
-"""Messages of a topic that may wait while the node is busy; what comes on top is lost."""
-IMAGE_QUEUE = INPUT_QUEUE // 100
-"""Images that may wait: of 30 Hz for as long as the node is ever busy."""
+IMAGE_QUEUE = BATCH // 100
+"""Images of a topic that may wait, as a BATCH of other messages, while the node is busy."""
 
 
 @dataclass
@@ -211,7 +209,7 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
     """Return the messages that wait, with the times at which they were received [ns]."""
     found = []
     with subscription.handle:
-        for _ in range(INPUT_QUEUE):
+        for _ in range(BATCH):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 break
@@ -222,7 +220,7 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
 def _qos(stream: Stream) -> QoSProfile:
     """Return how a topic is asked for; a new one each time, because overriding changes it."""
     return QoSProfile(
-        depth=IMAGE_QUEUE if stream.type in PICTURES else INPUT_QUEUE,
+        depth=IMAGE_QUEUE if stream.type in PICTURES else BATCH,
         reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if stream.still else DurabilityPolicy.VOLATILE,
     )

@@ -58,6 +58,7 @@ TAKING_PERIOD = 0.1
 """Time [s] between two times at which the messages that have come are taken, all at once: one at
 a time, each in a cold cache, they cost three times as much."""
 DIAGNOSTICS_PERIOD = 1.0
+"""Time [s] between two reports on /diagnostics, as is usual there."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD
 """Time [s] for which the end waits for what was begun."""
 STATUS_LENGTH = 120
@@ -145,7 +146,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Say that the node is ready, once an executor serves it."""
         self.get_logger().info(
             f'ready to calibrate {self.session.chain.name}: joints '
-            f'{", ".join(self.session.joint_names)}; samples are kept in {self._archive.folder}'
+            f'{", ".join(self.session.joint_names)}; poses are kept in {self._archive.folder}'
         )
 
     def close(self) -> bool:
@@ -157,7 +158,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._archive.close()
         self.lost = self._archive.error
         if self.lost:
-            self.get_logger().error(f'samples are lost: {self.lost}')
+            self.get_logger().error(f'poses are lost: {self.lost}')
         self.destroy_node()
         return all(ended)
 
@@ -234,7 +235,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         before = self._archive.error
         self._archive.add(sample)
         if self._archive.error and not before:
-            self.get_logger().error(f'samples are kept in memory only: {self._archive.error}')
+            self.get_logger().error(f'poses are kept in memory only: {self._archive.error}')
 
     def _resume(self) -> None:
         """Go on with the newest journal of this robot."""
@@ -243,7 +244,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         for warning in warnings:
             self.get_logger().warning(warning)
         if self._archive.journal is not None:
-            self.get_logger().info(f'resumed {len(samples)} samples of {self._archive.journal}')
+            self.get_logger().info(f'resumed {len(samples)} poses of {self._archive.journal}')
 
     def _load_at_start(self) -> None:
         """Publish the calibration of before if that is wanted, or say that there is one."""
@@ -284,18 +285,18 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         socket = self.get_parameter('socket').value
         count, why = self.session.capture(socket)
         if not count:
-            return False, f'no sample taken: {why}'
+            return False, f'no pose taken: {why}'
         if socket:
-            return True, f'sample {len(self.session.samples)} taken: ball in socket {socket}'
+            return True, f'pose {len(self.session.samples)} taken: ball in socket {socket}'
         taken = self.session.samples[-count:]
         words = ', '.join(
             f'{each.count} measurements, spread {1e3 * each.spread:.3f} mm' for each in taken
         )
-        return True, f'sample {len(self.session.samples)} taken ({words})'
+        return True, f'pose {len(self.session.samples)} taken ({words})'
 
     def _on_remove_last(self, request: Any) -> Answer:
         self.session.remove_last()
-        return True, f'sample {len(self.session.samples) + 1} removed'
+        return True, f'pose {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> Answer:
         figures = self.session.validate()
@@ -314,7 +315,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         old = self._archive.begin_anew()
         self.session.clear()
         kept = f'; they stay in {old}' if old else ''
-        return True, f'{count} samples cleared{kept}; the calibration stays'
+        return True, f'{count} poses cleared{kept}; the calibration stays'
 
     def _on_record(self, request: Any) -> Answer:
         self.session.recording = bool(request.data)

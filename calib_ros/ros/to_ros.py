@@ -21,6 +21,7 @@ from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
+from calib_ros.errors import MOST_ENTRIES
 from calib_ros.identification.identification import Identification, residuals
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
@@ -31,7 +32,6 @@ LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """For topics whose last message a late subscriber gets."""
-MOST_ARROWS = 1000
 
 
 def dh_parameters(chain: Chain) -> Float64MultiArray:
@@ -121,7 +121,7 @@ def residual_markers(
         world = base @ invert(result.chain.frame(each.base).matrix)
         begins = each.positions @ world[:3, :3].T + world[:3, 3]
         ends = begins - scale * left @ world[:3, :3].T
-        for k in range(max(0, len(each) - MOST_ARROWS), len(each)):
+        for k in range(max(0, len(each) - MOST_ENTRIES), len(each)):
             color = ColorRGBA(r=float(share[k]), g=float(1.0 - share[k]), b=0.0, a=1.0)
             for x, y, z in (begins[k].tolist(), ends[k].tolist()):
                 lines.points.append(Point(x=x, y=y, z=z))

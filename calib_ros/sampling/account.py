@@ -29,13 +29,14 @@ class Account:
 
     def __str__(self) -> str:
         """Return the account in words."""
-        text = f'{self.joint_states} joint states and {self.poses} poses gave {self.samples} '
-        text += 'samples'
+        text = f'{self.joint_states} joint states and {self.poses} measurements gave '
+        text += f'{self.samples} poses'
         if self.held_out:
             text += f' to fit and {self.held_out} held out'
-        text += f' in {self.configurations} configurations'
+        if self.configurations < self.samples:
+            text += f', {self.configurations} of them different'
         if self.waiting:
-            text += f', {self.waiting} poses wait'
+            text += f', {self.waiting} measurements wait'
         for label, counts in (
             ('not used', self.unused),
             ('dropped', self.dropped),

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.sampling.messages import JOINT_STATE, Readings, frame_name
-from calib_ros.sampling.names import MOST_NAMES
 from calib_ros.sampling.rows import Stamps
+from calib_ros.values import MOST_NAMES
 
 LITTLE_ENDIAN = b'\x00\x01'
 MOST_LAYOUTS = 2 * MOST_NAMES

@@ -13,19 +13,18 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.collector import ADVANCE_NS, Collector
-from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, Delay, find_delay
+from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, STEP, Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import JOINTS, Piece, Slice, StreamKey, merged
 from calib_ros.settings import Settings
+from calib_ros.shown import NAMED
 
 WATCH_NS = round(5e9 * LEAST_MOTION)
 """Time over which a watch looks."""
-DENSE_NS = 4_000_000
-"""Time between two samples that it keeps; nearer ones tell no more."""
-MOST_MOVES = 5
-"""Moves of the clocks that are remembered."""
+DENSE_NS = round(0.8e9 * STEP)
+"""Time between two samples that it keeps; nearer ones tell no more of speeds."""
 WATCHED = 5 * WATCH_NS // DENSE_NS
 """Samples that it keeps at most, of several streams."""
 CLOCKS_MOVED = SMOOTHING
@@ -58,7 +57,7 @@ class Watch:
         """The last one seen."""
         self.unclear: Delay | None = None
         """One with rivals, while no other was seen."""
-        self.moves: deque[tuple[float, int]] = deque(maxlen=MOST_MOVES)
+        self.moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
         """By how much [s] it changed, and after how many samples at least."""
 
     def wake(self, unrest: int, calm: int, taken: int) -> None:

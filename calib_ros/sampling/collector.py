@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.hints import Hint, restless, sparse
-from calib_ros.sampling.making import WIDTH, Maker, Matched, Numbered
+from calib_ros.sampling.making import ROW_WIDTH, Maker, Matched, Numbered
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, MANY, Slice, StreamKey
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, Slice, StreamKey
 from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.sampling.waiting import Waiting
 from calib_ros.settings import Settings
 
-WINDOW = 0.1
+REST_S = 0.1
 """Time [s] during which joints must have stayed where they are to be standing."""
-ADVANCE_NS = round(5e9 * WINDOW)
+ADVANCE_NS = round(5e9 * REST_S)
 """Time of the newest joint sample between two rounds of taking samples."""
 
 
@@ -59,7 +59,7 @@ class Collector:
         """True while the delay is being looked for, so that nothing may be taken."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
-        self.waiting = Waiting(WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
+        self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
         self.unused: Counter[str] = Counter()
         """What no sample is made of in the ordinary course of things, by cause."""
         self.notes: Counter[str] = Counter()
@@ -67,7 +67,7 @@ class Collector:
     def known(
         self, now_ns: int | None
     ) -> tuple[tuple[Stamps, FloatArray], list[tuple[Stamps, FloatArray]]]:
-        """Return stamps and joint values, and stamps and rows (N, WIDTH) of waiting positions.
+        """Return stamps and joint values, and stamps and rows (N, ROW_WIDTH) of waiting positions.
 
         Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
         """
@@ -141,7 +141,7 @@ class Collector:
             newest = int(stamps[-1])
             if newest < self.track.horizon_ns:
                 self._backwards += 1
-                if self._backwards < MANY:
+                if self._backwards < NO_ACCIDENT:
                     self.dropped['joints: later than lateness allows'] += 1
                     return []
                 self.start_anew()
@@ -164,7 +164,7 @@ class Collector:
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the joint states, of so many measurements."""
         needed = self.rests.needed(self.settings.still)
-        between = self.dropped[f'poses: {APART}']
+        between = self.dropped[f'measurements: {APART}']
         found = [
             None if needed is None else restless(needed, self.settings.still),
             sparse(between, measurements, self.settings.max_gap),
@@ -195,11 +195,11 @@ class Collector:
             return 'looking for the delay of the measurements: keep the arm moving'
         if self.settings.mode == 'continuous':
             return 'every measurement is taken'
-        stands = self.track.standing(self.settings.still, WINDOW)
+        stands = self.track.standing(self.settings.still, REST_S)
         if not len(stands) or stands[-1, 1] < newest:
             return 'the arm is moving'
         if stands[-1, 0] <= self._sampled_ns:
-            return 'the arm stands and is sampled: move on'
+            return 'the arm stands and its pose is measured: move on'
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:
@@ -210,12 +210,12 @@ class Collector:
         if self.settings.mode == 'continuous':
             return 0, 'every measurement is taken in mode continuous'
         self._sort()
-        stands = self.track.standing(self.settings.still, WINDOW)
+        stands = self.track.standing(self.settings.still, REST_S)
         newest = self.track.newest_ns
         if not newest:
             return 0, 'no joint states have come'
         if not (self.waiting.count or place):
-            return 0, 'no measurements have come since the last sample'
+            return 0, 'no measurements have come since the last pose'
         shortest = round(self.settings.shortest_stop * 1e9)
         if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
             return 0, (
@@ -242,7 +242,7 @@ class Collector:
     @property
     def _late_ns(self) -> int:
         """Return by how much older measurements than the joints are complete [ns]."""
-        return max(self._lateness_ns + max(self.delay_ns, 0), round(WINDOW * 1e9))
+        return max(self._lateness_ns + max(self.delay_ns, 0), round(REST_S * 1e9))
 
     @property
     def _complete_ns(self) -> int:
@@ -262,7 +262,7 @@ class Collector:
         else:
             until = self._take_stops(until, rounds, ends_here)
         self._settled_ns = max(self._settled_ns, until)
-        margin = round((WINDOW + self.settings.max_gap) * 1e9)
+        margin = round((REST_S + self.settings.max_gap) * 1e9)
         self.track.release(min(until, self._complete_ns) - margin)
 
     def _sort(self) -> None:
@@ -272,7 +272,7 @@ class Collector:
         for rows in self.waiting.values():
             twice = rows.sort()
             if twice:
-                self.dropped['poses: same stamp twice'] += twice
+                self.dropped['measurements: same stamp twice'] += twice
 
     def _take_each(self, until: int, rounds: Sequence[int]) -> None:
         """Make a sample of every measurement up to a stamp of the joints, round by round."""
@@ -298,7 +298,7 @@ class Collector:
         """Make samples of the stops that end before a stamp; return what has been dealt with."""
         settings = self.settings
         newest = self.track.newest_ns
-        stands = self.track.standing(settings.still, WINDOW)
+        stands = self.track.standing(settings.still, REST_S)
         shortest = round(settings.shortest_stop * 1e9)
         seen = seen_stops(stands, rounds or (newest,), self._settled_ns, self._late_ns, shortest)
         for found, now in zip(seen, rounds or (newest,), strict=True):
@@ -334,10 +334,10 @@ class Collector:
                 cause = self.track.causes(stamps[~inside])
                 self._count_causes(cause)
                 for k, count in Counter(numbers[~inside][cause == 0].tolist()).items():
-                    self.unused[f'poses: {plan.why[k]}'] += count
+                    self.unused[f'measurements: {plan.why[k]}'] += count
             early = inside & (stamps < calm[numbers])
             if early.any():
-                self.unused['poses: the arm had just stopped'] += int(early.sum())
+                self.unused['measurements: the arm had just stopped'] += int(early.sum())
             good = np.flatnonzero(inside & ~early)
             if len(good):
                 motion = self.track.at(stamps[good], standing=True)
@@ -346,7 +346,7 @@ class Collector:
             if len(good):
                 more = len(good) - len(np.unique(numbers[good]))
                 if key.images and more:
-                    self.unused['poses: of a stop of which one image is used'] += more
+                    self.unused['measurements: of a stop of which one image is used'] += more
                 numbers, stamps, values = numbers[good], rows.stamps[good], rows.values[good]
                 matched = Matched(key, numbers, stamps, values, motion, self.delay_ns)
                 found += self.maker.of_stops(matched, self.settings.sigma_position)
@@ -362,13 +362,13 @@ class Collector:
         for k, text in enumerate(CAUSES[1:], start=1):
             count = int((cause == k).sum())
             if count:
-                self.dropped[f'poses: {text}'] += count
+                self.dropped[f'measurements: {text}'] += count
 
     def _make_room(self) -> None:
         """Let go the older half of the samples of some joints; nothing may be held any longer."""
         self._round(self._complete_ns)
         if self.track.full:
-            self.notes['joint samples let go, the joint buffer was full'] += self.track.halve()
+            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
 
     def start_anew(self) -> None:
         """Go on after the clock jumped back: finish what came before, keep the samples."""

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.identification.levels import TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.rows import FEWEST, Stamps
+from calib_ros.sampling.rows import Stamps
 from calib_ros.settings import Settings
 
 STEP = 5e-3
@@ -27,13 +28,13 @@ MOST_DELAY = Settings.lateness
 """Largest delay that is looked for [s]: as late as measurements may come."""
 LEAST_MOTION = 3.0
 """Time in motion that is needed [s]."""
-CONVINCING = 0.8
+ALIKE_ENOUGH = 0.8
 """Least correlation."""
 RISE = 0.02
 """Least rise of the correlation beyond a valley for another peak."""
 RIVAL = 3.0
 """A rival explains the speeds unless it leaves so many times what the best delay leaves."""
-MOVING = 0.1
+IN_MOTION = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
@@ -67,7 +68,7 @@ def find_delay(
     Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3). Between joint
     samples further apart than `max_gap` [s] nothing is known of their motion.
     """
-    if len(joint_stamps) < FEWEST or len(stamps) < FEWEST:
+    if len(joint_stamps) < TELLING or len(stamps) < TELLING:
         return None
     start = joint_stamps[0]
     joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
@@ -82,12 +83,12 @@ def find_delay(
     if heard.sum() * STEP < LEAST_MOTION:
         return None
     nearest = np.unique(np.round(coarse).astype(int))
-    if len(nearest) < FEWEST:  # a gap
+    if len(nearest) < TELLING:  # a gap
         return None
     poses = chain.forward(joints[nearest])
     first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
     by_joints = np.interp(grid, *first)
-    moving = heard & (by_joints > MOVING * np.percentile(by_joints, 95))
+    moving = heard & (by_joints > IN_MOTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
     second = _speed(times, positions, rotations, rotations is not None)
@@ -97,7 +98,7 @@ def find_delay(
     known = int(np.sum(wide < second[0][0])), int(np.sum(wide <= second[0][-1]))
     score = _correlations(by_joints, np.interp(wide, *second), known)
     best = int(np.argmax(score))
-    if score[best] < CONVINCING or best in (0, len(lags) - 1):
+    if score[best] < ALIKE_ENOUGH or best in (0, len(lags) - 1):
         return None
     left, middle, right = score[best - 1 : best + 2]
     bend = left - 2.0 * middle + right

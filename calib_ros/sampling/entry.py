@@ -83,7 +83,7 @@ class Entry:
             count, frame_id = len(places), readings.strings[0]
             self.received[POSES] += count
             if not recording:
-                self.unused['poses: not recording'] += count
+                self.unused['measurements: not recording'] += count
             elif self._is_in_frame(source.device, frame_id, wanted, count):
                 width = readings.numbers.shape[1]
                 if width > 7:  # a covariance of zeros stands for none

@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import Estimate, barely_moved
-from calib_ros.sampling.slices import MANY
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.settings import Settings
 
 SHARE = 0.2
@@ -40,7 +40,7 @@ def restless(needed: float, still: float) -> Hint:
 
 def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
     """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
-    if between < MANY or between <= SHARE * measurements:
+    if between < NO_ACCIDENT or between <= SHARE * measurements:
         return None
     rate = f'{2.0 / max_gap:g} Hz or more'
     return Hint(
@@ -75,8 +75,8 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
     """Tell by how much [s] the clocks moved against each other, and after how many samples."""
     words = ', '.join(f'by {seconds:+.3f} s after about {count}' for seconds, count in steps)
     return Hint(
-        f'clocks moved after about {max(count for _, count in steps)} samples: make them agree',
-        f'the stamps of the measurements moved against those of the joint states {words} samples: '
+        f'clocks moved after about {max(count for _, count in steps)} poses: make them agree',
+        f'the stamps of the measurements moved against those of the joint states {words} poses: '
         'make the clocks agree, and measure again what came after',
     )
 
@@ -88,7 +88,7 @@ def progress(
 
     `fitted` holds the joint values (n,) of each.
     """
-    counted = f'{len(fitted)} samples'
+    counted = f'{len(fitted)} poses'
     if estimate is not None:
         counted += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()

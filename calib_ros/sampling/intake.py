@@ -41,6 +41,8 @@ from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Links, Pair
 
+BATCH = 2000
+"""Messages that are taken at once (benchmarks/bags.py, benchmarks/soak.py)."""
 OF_CAMERAS = (*PICTURES, CAMERA_INFO)
 Deserialise: TypeAlias = Callable[[Any, str], Any]
 """Makes a message of its bytes and type."""

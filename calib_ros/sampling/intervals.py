@@ -11,7 +11,7 @@ import numpy as np
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
 
-LAGS = 4
+LOOKS_BACK = 4
 """Samples within the window with which the present one is compared."""
 
 
@@ -27,8 +27,8 @@ def standing(
     quiet = np.ones(len(stamps), dtype=bool)
     joints = values.T.copy()  # numpy is slow over a short last axis
     back = begin
-    for lag in range(1, LAGS + 1):
-        back = np.searchsorted(stamps, stamps - window_ns * lag // LAGS)
+    for lag in range(1, LOOKS_BACK + 1):
+        back = np.searchsorted(stamps, stamps - window_ns * lag // LOOKS_BACK)
         back = np.maximum(np.minimum(back, index - 1), begin)
         quiet &= np.abs(joints - np.take(joints, back, axis=1)).max(axis=0) <= still
     starts = np.flatnonzero(quiet & ~np.concatenate([[False], quiet[:-1]]) | (quiet & gap))

@@ -68,7 +68,7 @@ class Kept:
         frame_id = self._frame_of(sample)
         strays = sample.frame_id != frame_id
         if strays:
-            self._dropped[f'poses: {strange(sample.frame_id, frame_id)}'] += sample.count
+            self._dropped[f'measurements: {strange(sample.frame_id, frame_id)}'] += sample.count
         return strays
 
     @property

@@ -30,40 +30,36 @@ from scipy import linalg
 
 from calib_ros.errors import CalibrationError
 from calib_ros.identification.configurations import configurations
+from calib_ros.identification.fitting import SOME
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import Prior, System, normal_equations
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.leastsquares import (
+    SMALL_STEP,
+    STEP_TOLERANCE,
+    Prior,
+    System,
+    normal_equations,
+)
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.robust import robust_fit, thorough_fit
+from calib_ros.identification.robust import OUTER, robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
 
 WIDE = (0.01, 0.02)
 """Standard deviations [m, rad] of arm parameters before anything is measured."""
-FAR = 1e-3
-"""Step [m or rad] from which the linear model is made anew."""
-MOST_STEPS = 5
 START = 6
-"""Configurations with which the frames can be found."""
-MOST_ANEW = 500
-"""Samples up to which the linear model is made anew, and with which it begins at most."""
+"""Configurations with which the frames can be found: 12 unknowns of 18 coordinates."""
 MOST_THOROUGH = 60
 """Parameters up to which it begins with the thorough fit, which takes too long for more."""
 GROWN = 1.2
 """Growth of the number of samples from which all of them are judged anew."""
-MOST_AT_ONCE = 4 * MOST_ANEW
+MOST_AT_ONCE = 4 * SOME
 """Samples that one update adds at most; the rest waits for the next ones."""
-FAR_OFF = 7.0
-"""Distance [standard deviations] from which a sample is left out as suspicious."""
-LEAST_NOISE = 1e-3
-"""Smallest noise [sigma given] that residuals are taken to show."""
-LOOK = 100
-"""Configurations at which the arm is to be accurate."""
 LITTLE = 0.35
 """Range [rad] of a joint over all samples that is too little; a tenth of it [m]."""
 
@@ -142,7 +138,7 @@ class LiveEstimate:
     def _outgrown(self, fresh: Sequence[Sample]) -> bool:
         """Tell whether it is time to begin, or to begin anew."""
         count = len(self._added) + len(self.suspicious) + len(fresh)
-        return self._chain is None or GROWN * self._begun < count <= MOST_ANEW
+        return self._chain is None or GROWN * self._begun < count <= SOME
 
     def _knows(self, sample: Sample) -> bool:
         assert self._chain is not None
@@ -165,7 +161,7 @@ class LiveEstimate:
             return False
         wide = {name: _wide(name) for name in self._names if not model.owns_frame(name)}
         self._prior = Prior(model, {**wide, **problem.prior_sigmas})
-        self._joints = chain.random_joints(LOOK, np.random.default_rng(0))
+        self._joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
         groups = self._groups(fitted)
         system = self._system(groups, self._prior)
         loss = 'redescending' if self._enough(system.rows) else 'none'
@@ -181,8 +177,8 @@ class LiveEstimate:
 
     def _settle(self) -> None:
         """Move the point of linearisation to the estimate while that is far from it."""
-        for _ in range(MOST_STEPS):
-            if np.abs(self._step()).max() < FAR or len(self._added) > MOST_ANEW:
+        for _ in range(ROUNDS):
+            if np.abs(self._step()).max() < SMALL_STEP or len(self._added) > SOME:
                 break
             self._linearise(self._estimate())
 
@@ -248,7 +244,7 @@ class LiveEstimate:
             spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
             spread += np.eye(left.shape[1]) * noise * self._sigmas[0] ** 2
             size = (left * np.linalg.solve(spread, left[..., np.newaxis])[..., 0]).sum(axis=1)
-            for sample, far in zip(members, (size > FAR_OFF**2).tolist(), strict=True):
+            for sample, far in zip(members, (size > OUTER**2).tolist(), strict=True):
                 (self.suspicious if far else good).append(sample)
         return good
 
@@ -270,7 +266,7 @@ class LiveEstimate:
         """Return the covariance by the noise that the residuals show, and its variance."""
         left = max(self._cost - float(self._step() @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
-        noise = max(left / freedom, LEAST_NOISE**2) if freedom > 0 else 1.0
+        noise = max(left / freedom, STEP_TOLERANCE**2) if freedom > 0 else 1.0
         scale, matrix = self._scaled()
         return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
 
@@ -292,7 +288,7 @@ class LiveEstimate:
 
     def _excess(self, chain: Chain) -> float:
         """Return the RMS residual of positions in units of what measurements scatter by."""
-        chosen = np.linspace(0, len(self._added) - 1, MOST_ANEW).round().astype(int)
+        chosen = np.linspace(0, len(self._added) - 1, SOME).round().astype(int)
         some = [self._added[k] for k in np.unique(chosen)]
         total = 0.0
         for members, each in self._groups(some):
@@ -318,14 +314,14 @@ def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
 
 
 def _spread(samples: Sequence[Sample]) -> list[Sample]:
-    """Return at most MOST_ANEW samples or so, evenly from those between each pair of frames."""
+    """Return at most SOME samples or so, evenly from those between each pair of frames."""
     frames = Frames()
     groups: dict[tuple[str, str], list[int]] = {}
     for k, sample in enumerate(samples):
         groups.setdefault(frames.of(sample), []).append(k)
     chosen: set[int] = set()
     for members in groups.values():
-        count = min(len(members), 1 + MOST_ANEW // len(groups))
+        count = min(len(members), 1 + SOME // len(groups))
         chosen |= {members[k] for k in np.linspace(0, len(members) - 1, count).astype(int)}
     return [samples[k] for k in sorted(chosen)]
 

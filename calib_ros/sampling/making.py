@@ -24,17 +24,17 @@ from calib_ros.sampling.track import Motion
 
 DISTANCE, POSITION = slice(0, 1), slice(0, 3)
 QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
-WIDTH = COVARIANCE.stop
+ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]
 """A sample with the number of the round or the stop in which it was taken."""
-VIBRATING = 'poses: still vibrating, or a spike'
-RESTLESS = 'poses: a stop that spreads more than the noise'
+VIBRATING = 'measurements: still vibrating, or a spike'
+RESTLESS = 'measurements: a stop that spreads more than the noise'
 
 
 class Matched(NamedTuple):
     """Measurements of one stream, in the order of their stamps, and the motion at these.
 
-    Numbers (N,) are those of their rounds or stops, values (N, WIDTH) are stamped late by a delay.
+    Numbers (N,) are of their rounds or stops, values (N, ROW_WIDTH) are stamped late by a delay.
     """
 
     key: StreamKey
@@ -170,13 +170,13 @@ class Maker:
         position: FloatArray,
         **more: Any,
     ) -> Iterator[Numbered]:
-        """Yield a sample of measurements (N, WIDTH), unless there is one or no room."""
+        """Yield a sample of measurements (N, ROW_WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
-            self.dropped['poses: a sample with this stamp is there already'] += len(rows)
+            self.dropped['measurements: a pose with this stamp is there already'] += len(rows)
             return
         if len(known) >= self._capacity:
-            self.dropped['poses: the memory for samples is full'] += len(rows)
+            self.dropped['measurements: the memory for poses is full'] += len(rows)
             return
         known.add(stamp_ns)
         covariance = None

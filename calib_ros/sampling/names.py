@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.sampling.messages import MessageError
-from calib_ros.sampling.slices import MANY, Columns
+from calib_ros.sampling.slices import NO_ACCIDENT, Columns
+from calib_ros.settings import EXCEPTION
+from calib_ros.values import MOST_NAMES
 
 Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
-
-MOST_NAMES = 50
-"""Frames of measurements, and sets of joint names, that are told apart."""
-MOST_STRAY = 0.1
-"""Share of measurements in other frames up to which they are stray ones; more is a mistake."""
 
 
 class JointNames:
@@ -84,7 +81,7 @@ class FrameNames:
         if frame_id not in known and len(known) == MOST_NAMES:
             raise MessageError(f'in one of more than {MOST_NAMES} frames')
         known[frame_id] += count
-        if known[frame_id] >= MANY:
+        if known[frame_id] >= NO_ACCIDENT:
             self._usual.setdefault(device, frame_id)
 
     def usual(self, device: str) -> str | None:
@@ -113,7 +110,7 @@ class FrameNames:
         A few measurements in others do not count.
         """
         for known in self._known.values():
-            if known.total() - max(known.values()) > MOST_STRAY * known.total():
+            if known.total() - max(known.values()) > EXCEPTION * known.total():
                 return tuple(sorted(known))
         return ()
 

@@ -23,8 +23,9 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import board_poses, uncertainty
 from calib_ros.kinematics import se3
 from calib_ros.sampling.sample import Sample, View
+from calib_ros.texts import LARGEST_TABLE
 
-MOST_BYTES = 500_000_000
+MOST_BYTES = 5 * LARGEST_TABLE
 """Size of the images that are kept: six seconds of 30 Hz at 2 megapixels in grey."""
 MOST_WAITING = 4
 """Images that may wait to be looked at; an arm that stops so often that more come loses some."""
@@ -116,7 +117,7 @@ class Pictures:
                 self.refused = ''
                 if isinstance(result, Refusal):
                     self.refused = result.reason
-                    self.dropped[f'poses: image {result.cause}'] += sample.count
+                    self.dropped[f'measurements: image {result.cause}'] += sample.count
                 else:
                     found.append(result)
             else:
@@ -129,13 +130,15 @@ class Pictures:
         busy = [looked for looked in waiting if not looked.done()]
         if len(busy) >= MOST_WAITING:
             if not self.patient:
-                self.dropped['poses: image while others were looked at'] += sample.count
+                self.dropped['measurements: image while others were looked at'] += sample.count
                 return None
             busy[0].exception()
         middle = len(sample.images) // 2
         kept = [k for k, number in enumerate(sample.images) if number in self._kept]
         if not kept:
-            self.dropped['poses: image let go, the memory for them was full'] += sample.count
+            self.dropped['measurements: image let go, the memory for them was full'] += (
+                sample.count
+            )
             return None
         nearest = min(kept, key=lambda k: abs(k - middle))
         return self._pool.submit(self._look, self._kept[sample.images[nearest]], sample)

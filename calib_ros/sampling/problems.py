@@ -84,7 +84,7 @@ def in_frames_of(
     usable: Sequence[Sample],
     settings: Settings,
 ) -> list[Observations]:
-    """Return the samples taken since a calibration, those among all usable ones, in its frames.
+    """Return the poses measured since a calibration, those among all usable ones, in its frames.
 
     Without any, or where they are between frames that it does not have, that is an InputError.
     """
@@ -93,11 +93,11 @@ def in_frames_of(
     frames = Frames(calibration.owners) if calibration.owners else named(usable)
     sets = [each for part in collect(since, sigmas, frames) for each in part]
     if not sets:
-        raise InputError('no samples have been taken since: measure some new poses first')
+        raise InputError('no poses have been measured since: measure some new poses first')
     known = calibration.chain.frame_names
     if not all(each.base in known and each.tool in known for each in sets):
         raise InputError(
-            'the samples since were measured by a device or on a target that the '
+            'the poses since were measured by a device or on a target that the '
             'calibration does not know'
         )
     return sets

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray
 
 Stamps = NDArray[np.int64]
-FEWEST = 8
-"""Fewest rows that tell the noise, or the motion, in them."""
 
 
 class Rows:

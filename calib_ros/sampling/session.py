@@ -150,9 +150,9 @@ class CalibrationSession:
     def remove_last(self) -> Sample:
         """Take back the last sample."""
         if not self.samples:
-            raise InputError('there is no sample to remove')
+            raise InputError('there is no pose to remove')
         sample = self.samples.pop()
-        self._entry.unused['poses: of a sample that was taken back'] += sample.count
+        self._entry.unused['measurements: of a pose that was taken back'] += sample.count
         self._collector.forget(sample)
         self._live.restart()
         self.on_removed(sample)
@@ -163,7 +163,7 @@ class CalibrationSession:
         for sample in samples:
             if sample.joints.shape != (len(self.chain.joints),):
                 raise InputError(
-                    f'samples to go on with have {len(sample.joints)} joint values, chain '
+                    f'poses to go on with have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
             if sample.frame_id:
@@ -201,12 +201,12 @@ class CalibrationSession:
         collector = self._collector
         notes = self._road.notes + collector.notes
         if left_out := len(self.samples) - len(usable):
-            notes['samples left out, in another frame or of a target measured once'] += left_out
+            notes['poses left out, in another frame or of a target measured once'] += left_out
         strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._road.gate.dropped.items()})
         dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + strays
         return Account(
             self.received['joints'],
-            self.received['poses'],
+            self.received[POSES],
             collector.waiting.count + self._road.gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
@@ -257,7 +257,7 @@ class CalibrationSession:
         estimate = self.estimate
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
-            told.append(f'sample {number} does not fit the others, was the target moved?')
+            told.append(f'pose {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
         told += progress(self.chain, fitted, estimate, self.settings)
         return '; '.join(filter(None, told))
@@ -277,7 +277,7 @@ class CalibrationSession:
         """Return samples as a problem; with `posed` boards by their poses, not their corners."""
         found = problem_of(self.chain, samples, self.settings, self.socket_distance, posed)
         if found is None:
-            raise InputError(f'no samples to fit: {self._came}')
+            raise InputError(f'no poses to fit: {self._came}')
         return found
 
     def identify(self) -> Identification:
@@ -303,7 +303,7 @@ class CalibrationSession:
         self.calibration = calibration
 
     def validate(self) -> tuple[ErrorFigures, ErrorFigures]:
-        """Judge the calibration on the samples taken since; nothing is fitted.
+        """Judge the calibration on the poses measured since; nothing is fitted.
 
         Return the errors of the calibration, and those of the nominal chain in its frames.
         """

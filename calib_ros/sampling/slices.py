@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
 
-JOINTS, POSES = 'joints', 'poses'
-MANY = 20
+JOINTS, POSES = 'joints', 'measurements'
+NO_ACCIDENT = 20
 """So many messages that differ from the others are no accident."""
 SILENCE = 5.0
 """A joint or topic that was heard before and is silent for so long [s] is told."""

@@ -16,7 +16,7 @@ from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.stops import SPIKE
 from calib_ros.settings import Settings
 
-SAMPLED = 'of a stop that is sampled already'
+SAMPLED = 'of a stop that has its pose already'
 
 
 @dataclass

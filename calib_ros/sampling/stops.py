@@ -16,16 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.identification.levels import MOST_OUTLIERS
 from calib_ros.kinematics.se3 import FloatArray
 
 MOST_SPREAD = 2.0
 """Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
-SETTLED = 2.0 * MOST_SPREAD
+NEAR = 2.0 * MOST_SPREAD
 """Distance [noise] to the later half within which a measurement is taken to have settled."""
 SPIKE = 3.0 * MOST_SPREAD
 """A single measurement further from the median [noise] is left out of the mean."""
-MOST_SPIKES = 0.3
-FEW = 4
+LEAST_COUNT = 4
 """With fewer measurements nothing can be said about their spread."""
 
 
@@ -60,7 +60,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
     used, limits = np.ones(len(values), dtype=bool), np.full(len(begins), np.inf)
     rests = np.ones(len(begins), dtype=bool)
     ends = np.append(begins[1:], len(values))
-    for k in np.flatnonzero(ends - begins >= FEW).tolist():
+    for k in np.flatnonzero(ends - begins >= LEAST_COUNT).tolist():
         part = slice(begins[k], ends[k])
         noise = max(sigmas[k], _noise(values[part]))
         limits[k] = MOST_SPREAD * noise
@@ -69,7 +69,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
         settled[: _settled(values[part], reach)] = False
         middle = np.median(values[part][settled], axis=0)
         spikes = _distance(values[part], middle) > SPIKE * reach
-        rests[k] = (spikes & settled).sum() <= MOST_SPIKES * settled.sum()
+        rests[k] = (spikes & settled).sum() <= MOST_OUTLIERS * settled.sum()
         settled &= ~spikes
     means = mean_of_each(values, begins, used)
     squares = (values - np.repeat(means, ends - begins, axis=0)) ** 2
@@ -95,7 +95,7 @@ def _noise(values: FloatArray) -> float:
 def _settled(values: FloatArray, reach: float) -> int:
     """Return how many measurements come before all of them stay near the later half."""
     half = len(values) // 2
-    far = _distance(values[:half], np.median(values[half:], axis=0)) > SETTLED * reach
+    far = _distance(values[:half], np.median(values[half:], axis=0)) > NEAR * reach
     # A spike among settled ones is no vibration: two of three in a row must be far.
     pairs = far & (np.append(far[1:], False) | np.append(far[2:], [False, False]))
     last = np.flatnonzero(pairs)

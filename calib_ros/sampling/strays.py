@@ -15,7 +15,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib_ros.sampling.slices import JOINTS, MANY, POSES, Slice
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Slice
 
 STRAY = 'stamp far from those before and after'
 
@@ -92,7 +92,7 @@ class Gate:
                 self._held = [each for each in self._held if each[0] != kind]
             return found, False
         self._held.append((kind, time_ns, given))
-        if self.held(kind) < MANY:
+        if self.held(kind) < NO_ACCIDENT:
             return [], False
         moved = [time for other, time, _ in self._held if other == kind]
         passing = [

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.intake import Deserialise, Intake, Stream, measured
+from calib_ros.sampling.intake import BATCH, Deserialise, Intake, Stream, measured
 from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import (
@@ -24,8 +24,9 @@ from calib_ros.sampling.sources import (
     parse_sources,
     short_type,
 )
-from calib_ros.sampling.transforms import SAME, STATIC, Links
+from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
+from calib_ros.values import SAME
 
 Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 """Returns the messages of a recording on some topics."""
@@ -160,7 +161,7 @@ def _batches(
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
         try:
-            batch.extend(itertools.islice(messages, 2000))
+            batch.extend(itertools.islice(messages, BATCH))
             ended = not batch
         except Exception:
             ended = True

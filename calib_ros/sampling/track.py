@@ -15,14 +15,15 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.identification.levels import TELLING
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.intervals import intersection, standing, unheard, union
-from calib_ros.sampling.rows import FEWEST, Rows, Stamps
+from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
-APART = 'joint samples too far apart'
-CAUSES = ('', 'no joint sample before', 'no joint sample after', APART)
+APART = 'joint states too far apart'
+CAUSES = ('', 'no joint state before', 'no joint state after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
 
 
@@ -207,8 +208,8 @@ class Track:
         for columns, rows in self._parts.items():
             end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
             first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
-            values = rows.values[max(0, min(first, end - FEWEST)) : end]
-            if len(values) < FEWEST:
+            values = rows.values[max(0, min(first, end - TELLING)) : end]
+            if len(values) < TELLING:
                 return None
             values = continuous(values, self._revolute[list(columns)])
             noise = np.sqrt((np.diff(values, 2, axis=0) ** 2).mean(axis=0) / 6.0)

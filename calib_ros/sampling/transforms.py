@@ -25,6 +25,8 @@ from calib_ros.sampling.messages import TRANSFORMS, Readings
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import Source, short_type
 from calib_ros.settings import Settings
+from calib_ros.shown import LISTED, some
+from calib_ros.values import SAME
 
 Pair: TypeAlias = tuple[str, str]
 """Names of the parent and the child frame of a link."""
@@ -33,10 +35,6 @@ STATIC = '_static'
 """What the name of the topic of links that stand still ends with."""
 HELD = Settings.pose_buffer
 """Transforms that wait for the frames between which they are."""
-SAME = 1e-9
-"""Numbers [m, rad] that differ by less are the same."""
-LISTED = 20
-"""Links that are named when none of them was chosen."""
 
 
 class Route(NamedTuple):
@@ -185,11 +183,9 @@ class Links:
         order = sorted(self._moving, key=lambda link: (not self._stands_alone(link), link))
         listed = [
             f'{parent} to {child} at {self._moving[parent, child].rate:.0f} Hz'
-            for parent, child in order[:LISTED]
+            for parent, child in order
         ]
-        if len(order) > LISTED:
-            listed.append(f'{len(order) - LISTED} more')
-        words = f'what moves on {self.topic}: {", ".join(listed)}'
+        words = f'what moves on {self.topic}: {", ".join(some(listed, LISTED))}'
         parent, child = order[0]
         if not self._stands_alone(order[0]):
             return f'{words}; they hang on one another, as the joints of a robot do'

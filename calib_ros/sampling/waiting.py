@@ -10,13 +10,13 @@ from collections.abc import Callable
 import numpy as np
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.names import MOST_NAMES
 from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import Slice, StreamKey
+from calib_ros.values import MOST_NAMES
 
 MOST_STREAMS = MOST_NAMES
 """Streams of measurements that are told apart: a tracker may number markers without end."""
-TOO_MANY = f'poses: of one more than {MOST_STREAMS} targets, or frames'
+TOO_MANY = f'measurements: of one more than {MOST_STREAMS} targets, or frames'
 
 
 class Waiting(dict[StreamKey, Rows]):
@@ -52,9 +52,9 @@ class Waiting(dict[StreamKey, Rows]):
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
         if len(due) < len(stamps):
-            self._dropped['poses: later than lateness allows'] += len(stamps) - len(due)
+            self._dropped['measurements: later than lateness allows'] += len(stamps) - len(due)
         if len(taken) < len(due):
-            self._dropped['poses: pose buffer full'] += len(due) - len(taken)
+            self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
 
     def room(self, given: Slice) -> int | None:

@@ -279,7 +279,7 @@ def test_what_is_reached_near_a_singularity_is_never_worse_than_nothing(name):
 
 
 def test_a_sample_that_does_not_converge_is_refused(monkeypatch):
-    monkeypatch.setattr(following, 'ITERATIONS', 1)
+    monkeypatch.setattr(following, 'ROUNDS', 1)
     tolerant = Compensator(UR, UR_TRUE, largest_position_error=1.0, largest_orientation_error=1.0)
     result = compensate(tolerant, regular(UR, 3))
     assert not result.converged.any()

@@ -22,9 +22,10 @@ from calib_ros.apply.design import _root_of_inverse as root_of_inverse
 from calib_ros.errors import InputError
 from calib_ros.identification.identifiability import observability
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.sampling.live import LOOK, LiveEstimate
+from calib_ros.sampling.live import LiveEstimate
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 
@@ -85,7 +86,7 @@ def test_what_the_live_estimate_knows_is_known():
     session = CalibrationSession(chain)
     first, both = (LiveEstimate(session.problem_of).update(samples[:n]) for n in (30, 60))
     design = Design.of(session.problem_of(samples[:30]), first)
-    look = first.chain.random_joints(LOOK, np.random.default_rng(0))
+    look = first.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     assert predicted(design, look) == pytest.approx(first.sigma, rel=1e-3)
     same_noise = both.sigma * first.noise / both.noise
     assert predicted(design.after(seen.joints[30:]), look) == pytest.approx(same_noise, rel=0.03)

@@ -20,7 +20,7 @@ def bad_inputs():
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
     yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a number'
-    yield 'too few rows', (*csv_of, 'few.csv'), '3 measured configurations are too few'
+    yield 'too few rows', (*csv_of, 'few.csv'), '3 measured poses are too few'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
     yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
@@ -56,7 +56,7 @@ def bad_inputs():
     yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
     yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
     yield 'demo, into a file', ('demo', '--out', 'empty', '--poses', '5'), 'empty'
-    yield 'demo, too few', ('demo', '--poses', '2'), '2 measured configurations are too few'
+    yield 'demo, too few', ('demo', '--poses', '2'), '2 measured poses are too few'
 
 
 @pytest.mark.parametrize(

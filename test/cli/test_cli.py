@@ -101,9 +101,9 @@ def test_a_result_is_a_verdict_and_six_rows(run, table):
     lines = out.splitlines()
     assert lines[0].startswith('accepted: ')
     assert [line[:20].strip() for line in lines[1:7]] == [
-        *('robot', 'samples', 'position error', 'orientation error', 'judged by', 'valid')
+        *('robot', 'poses', 'position error', 'orientation error', 'judged by', 'valid')
     ]
-    assert f'{TEST} held-out samples' in lines[5]
+    assert f'{TEST} held-out poses' in lines[5]
     assert max(map(len, lines)) <= 80
 
 

@@ -141,7 +141,7 @@ def test_joints_by_other_names(tmp_path):
     session, _ = session_of(path, joint_names=('r/a', 'r/b', 'r/c'))
     np.testing.assert_array_equal(session.problem().observations.joints, [[1.0, 2.0, 3.0]])
     with pytest.raises(
-        InputError, match=r'no samples to fit: .*2 x joints: none of .*r/a, r/b, r/c'
+        InputError, match=r'no poses to fit: .*2 x joints: none of .*r/a, r/b, r/c'
     ):
         session_of(path)[0].problem()
 
@@ -164,7 +164,7 @@ def test_validation_topics_are_held_out(tmp_path):
     assert problem.observations.positions[:, 0].tolist() == [1, 2]
     (held_out,) = problem.held_out
     assert held_out.positions[:, 0].tolist() == [300, 400]
-    assert '2 samples to fit and 2 held out' in str(session.account())
+    assert '2 poses to fit and 2 held out' in str(session.account())
 
 
 def test_only_validation_poses_are_not_guessed_to_be_fitted(tmp_path):
@@ -245,7 +245,7 @@ def test_topics_without_messages_make_no_pairs(tmp_path, storage):
     kinds = [('/joint_states', JOINT_STATE), ('/pose', 'geometry_msgs/msg/PoseStamped')]
     path = record(tmp_path / 'bag', [('/chatter', text_message())], storage, silent=kinds)
     session, _ = session_of(path)
-    with pytest.raises(InputError, match='no samples to fit: 0 joint states and 0 poses'):
+    with pytest.raises(InputError, match='no poses to fit: 0 joint states and 0 measurements'):
         session.problem()
 
 
@@ -263,22 +263,25 @@ SKEW = GOOD.copy()
 SKEW[0, 1] = 0.5
 ZERO = np.diag([1, 1, 1, 1, 1, 0])
 BAD_POSES = [
-    (pose_stamped(0), 'poses: zero stamp'),
-    (pose_stamped(105 * MS, (np.nan, 0, 0)), 'poses: NaN or infinite position'),
-    (pose_stamped(115 * MS, (0, 0, np.inf)), 'poses: NaN or infinite position'),
-    (pose_stamped(125 * MS, quat=(0, 0, 0, 0)), 'poses: quaternion not of length 1'),
-    (pose_stamped(135 * MS, quat=(0, 0, 0, 1.01)), 'poses: quaternion not of length 1'),
-    (pose_stamped(145 * MS, quat=(0, 0, np.nan, 1)), 'poses: quaternion not of length 1'),
-    (point_stamped(155 * MS, (0, -np.inf, 0)), 'poses: NaN or infinite position'),
-    (transform_stamped(0), 'poses: zero stamp'),
-    (transform_stamped(165 * MS, child='a\nb'), 'poses: child frame whose name cannot be printed'),
-    (transform_stamped(175 * MS, quat=(1, 1, 1, 1)), 'poses: quaternion not of length 1'),
-    (pose_with_covariance(185 * MS, NAN), 'poses: covariance with NaN or infinite values'),
-    (pose_with_covariance(195 * MS, SKEW), 'poses: covariance not symmetric'),
-    (pose_with_covariance(205 * MS, -GOOD), 'poses: covariance not positive definite'),
-    (pose_with_covariance(215 * MS, ZERO), 'poses: covariance not positive definite'),
-    (pose_stamped(5 * MS), 'poses: no joint sample before'),
-    (pose_stamped(1005 * MS), 'poses: no joint sample after'),
+    (pose_stamped(0), 'measurements: zero stamp'),
+    (pose_stamped(105 * MS, (np.nan, 0, 0)), 'measurements: NaN or infinite position'),
+    (pose_stamped(115 * MS, (0, 0, np.inf)), 'measurements: NaN or infinite position'),
+    (pose_stamped(125 * MS, quat=(0, 0, 0, 0)), 'measurements: quaternion not of length 1'),
+    (pose_stamped(135 * MS, quat=(0, 0, 0, 1.01)), 'measurements: quaternion not of length 1'),
+    (pose_stamped(145 * MS, quat=(0, 0, np.nan, 1)), 'measurements: quaternion not of length 1'),
+    (point_stamped(155 * MS, (0, -np.inf, 0)), 'measurements: NaN or infinite position'),
+    (transform_stamped(0), 'measurements: zero stamp'),
+    (
+        transform_stamped(165 * MS, child='a\nb'),
+        'measurements: child frame whose name cannot be printed',
+    ),
+    (transform_stamped(175 * MS, quat=(1, 1, 1, 1)), 'measurements: quaternion not of length 1'),
+    (pose_with_covariance(185 * MS, NAN), 'measurements: covariance with NaN or infinite values'),
+    (pose_with_covariance(195 * MS, SKEW), 'measurements: covariance not symmetric'),
+    (pose_with_covariance(205 * MS, -GOOD), 'measurements: covariance not positive definite'),
+    (pose_with_covariance(215 * MS, ZERO), 'measurements: covariance not positive definite'),
+    (pose_stamped(5 * MS), 'measurements: no joint state before'),
+    (pose_stamped(1005 * MS), 'measurements: no joint state after'),
 ]
 
 
@@ -338,7 +341,10 @@ def test_poses_between_distant_joint_samples_are_counted(tmp_path):
     events += [('/pose', pose_stamped(ms * MS)) for ms in (150, 310)]
     path = record(tmp_path / 'bag', events)
     account = account_of(path)
-    assert (account.samples, account.dropped) == (1, {'poses: joint samples too far apart': 1})
+    assert (account.samples, account.dropped) == (
+        1,
+        {'measurements: joint states too far apart': 1},
+    )
     assert account_of(path, max_gap=0.2).samples == 2
 
 
@@ -347,7 +353,10 @@ def test_a_session_that_does_not_record_counts_what_it_leaves_out(tmp_path):
     session = CalibrationSession(ARM)
     session.recording = False
     replay(path, session)
-    assert session.account().unused == {'joints: not recording': 100, 'poses: not recording': 1}
+    assert session.account().unused == {
+        'joints: not recording': 100,
+        'measurements: not recording': 1,
+    }
 
 
 def test_messages_are_read_by_their_attributes_only():

@@ -157,10 +157,10 @@ def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, r
 @pytest.mark.parametrize(
     ('cause', 'refused'),
     [
-        ('poses: zero stamp', True),
-        ('poses: later than lateness allows', True),
-        ('poses: same stamp twice', False),
-        ('poses: NaN or infinite position', False),
+        ('measurements: zero stamp', True),
+        ('measurements: later than lateness allows', True),
+        ('measurements: same stamp twice', False),
+        ('measurements: NaN or infinite position', False),
     ],
 )
 def test_messages_dropped_for_their_stamps_count_as_lost(cause, refused):

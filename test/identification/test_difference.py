@@ -12,10 +12,12 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import gauged
 from calib_ros.identification.difference import difference
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.parameter import Parameter
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -94,6 +96,16 @@ def test_an_arm_with_other_links_is_another_one(nights):
     assert not found.same
     assert found.unexplained < 1e-6
     assert 'many parameters are different' in found.in_words()
+
+
+def test_what_a_parameter_shares_with_others_is_a_share():
+    """Axes of shoulder and elbow are parallel: the one's d is as good as the other's."""
+    names = [Parameter('elbow_joint.d'), Parameter('elbow_joint.theta')]
+    others = [Parameter('shoulder_lift_joint.d'), *names, Parameter('wrist_1_joint.a')]
+    taken, left = gauged(UR, names, others, free=False)
+    np.testing.assert_allclose(taken[:, :3], [[1, 1, 0], [0, 0, 1]], atol=1e-9)
+    np.testing.assert_allclose(left[:3], 0.0, atol=1e-9)
+    assert 0.1 < left[3] < 1.0
 
 
 def test_what_cannot_be_compared_is_refused(nights):

@@ -25,7 +25,7 @@ def test_targets_of_one_stop_are_one_configuration(rng):
         list(range(5, 20)),
     ]
     result = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
-    assert result.validated_by == '5-fold cross-validation over 20 distinct configurations'
+    assert result.validated_by == '5-fold cross-validation over 20 different poses'
     assert result.validation.after.configurations.tolist() == [*range(20), *range(5, 20)]
 
 
@@ -66,7 +66,7 @@ def test_an_arm_that_bends_is_not_judged_on_what_was_fitted(kind):
             if result.accepted:  # as far as it may be used the arm, which does bend, gains by it
                 assert gain(result, true, rng) > 1.0
             if kind == 'test':
-                assert result.validated_by.endswith('because all held-out samples are at such')
+                assert result.validated_by.endswith('because all held-out poses were fitted too')
 
 
 def gain(result, true, rng):
@@ -88,7 +88,7 @@ def test_held_out_samples_at_fitted_configurations_decide_nothing(rng):
     result = identify(Problem(UR10E, seen, held_out=held_out, **SIGMAS))
     assert result.accepted
     assert result.validated_by == (
-        '40 held-out samples, of which 20 at fitted configurations decide nothing'
+        '40 held-out poses; 20 of them decide nothing: measured at fitted poses again'
     )
     assert result.validation.deciding.tolist() == [False] * 20 + [True] * 20
     assert result.validation.figures[0].count == 40
@@ -133,7 +133,7 @@ def test_a_joint_that_moves_in_outliers_only_is_named(rng):
     seen = replace(measure(true, driven, rng, *NOISE), joints=q)
     result = identify(Problem(UR10E, seen, **SIGMAS))
     assert {outlier.sample for outlier in result.outliers} == {17, 41}
-    assert result.refusals[0].startswith('shoulder_lift_joint moves only in samples that were')
+    assert result.refusals[0].startswith('shoulder_lift_joint moves only in poses that were')
 
 
 def test_outliers_that_go_with_a_joint_are_the_arms(rng):

@@ -181,14 +181,14 @@ def test_the_order_is_that_of_the_stamps(rng):
     step = identify(Problem(UR10E, seen.select(mixed), **SIGMAS)).step
     assert mixed[step.sample] == AT
     assert step.stamp_ns == seen.stamps_ns[AT]
-    assert f'at sample {step.sample + 1} (stamp 270.000 s)' in str(step)
+    assert f'at pose {step.sample + 1} (stamp 270.000 s)' in str(step)
 
 
 def test_without_stamps_the_order_of_the_rows_is_said():
     true, seen = session(3)
     result = identify(Problem(UR10E, moved(seen, true, 'tool', 8e-4), **SIGMAS))
     assert result.refusals[0].startswith(
-        'something moved at sample 27 (line 27, without stamps the order of the rows is taken): '
+        'something moved at pose 27 (line 27, without stamps the order of the rows is taken): '
         'the target (tool, 0.8'
     )
     assert '--session with both' in result.refusals[0]

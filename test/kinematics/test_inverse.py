@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-from calib_ros.kinematics.inverse import TOLERANCE, limits, solve, solve_positive
+from calib_ros.kinematics.inverse import limits, solve, solve_positive
 from calib_ros.kinematics.se3 import log_rotation
+from calib_ros.values import SAME
 
 
 @pytest.mark.parametrize('robot', sorted(shipped_robots()))
@@ -29,7 +30,7 @@ def test_poses_are_reached_from_nearby(robot, rng):
     turn = log_rotation(poses[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2))
     np.testing.assert_allclose(distance, found.position, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(turn, axis=1), found.orientation, atol=1e-7)
-    assert distance[found.converged].max() <= TOLERANCE
+    assert distance[found.converged].max() <= SAME
     assert ((lower <= found.joints) & (found.joints <= upper)).all()
     if len(chain.joints) < 7:
         near = np.abs(found.joints - q).max(axis=1)[found.converged]

@@ -63,6 +63,14 @@ def test_rays_take_the_distortion_out(places):
     np.testing.assert_allclose(lens.rays(pixels.T), (points[:2] / points[2]).T, atol=1e-9)
 
 
+@given(places)
+def test_without_distortion_a_lens_is_a_pinhole(places):
+    points = points_of(places)
+    pixels, _ = Lens(1350.0, 1360.0, 790.0, 620.0).project(points)
+    focal, middle = np.array([[1350.0], [1360.0]]), np.array([[790.0], [620.0]])
+    np.testing.assert_allclose(pixels, middle + focal * points[:2] / points[2])
+
+
 def test_a_lens_is_kept_in_chain_files():
     lens = Lens(1000.0, 1001.0, 500.0, 400.0, 0.1, k3=0.25, fixed=False)
     chain = load_chain('ur5e').with_frame('base', Frame(lens=lens, fixed=True))

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 # In software: a machine for tests has no graphics card.
-GRAPHICS = ('--use-gl=angle', '--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+GRAPHICS = ('--use-angle=swiftshader-webgl', '--enable-unsafe-swiftshader')
 
 
 def browser_path():

@@ -242,39 +242,28 @@ def test_the_first_printed_page_is_the_certificate(wide):
     assert height < 1016
 
 
-def test_many_poses_are_cells_and_bands(chromium, tmp_path, monkeypatch):
+def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
+    """They are shown as cells and bands."""
     monkeypatch.setattr(explorer, 'SINGLE', 30)
-    problem = Problem(load_chain('ur5e'), measured())
-    found = identify(problem)
-    path = tmp_path / 'report.html'
-    poses = poses_of(problem, found)
-    path.write_text(render(identification_report(problem, found, poses, Origin())))
-    seen = Seen(chromium, path, 1280)
-    seen.drawn()
-    cells = seen.page.evaluate("document.getElementById('space').data[0].marker.color")
-    assert 0 < len(cells) <= len(poses)
-    bands = seen.page.evaluate("document.getElementById('session').data.map((t) => t.fill)")
-    assert bands.count('tonexty') == 2
-    seen.page.locator('#rows tbody button').last.click()
-    assert 'Picked' in seen.page.inner_text('#picked')
-    seen.end()
-
-
-def test_a_refused_result_on_a_telephone(chromium, tmp_path):
     rows = measured(chain=load_chain('ur5e'), count=40)
     noise = np.random.default_rng(3).normal(0, 1e-3, (40, 3))
     problem = Problem(load_chain('ur5e'), replace(rows, positions=rows.positions + noise))
     found = identify(problem)
     assert not found.accepted
-    path = tmp_path / 'report.html'
-    path.write_text(
-        render(identification_report(problem, found, poses_of(problem, found), Origin()))
-    )
+    path, poses = tmp_path / 'report.html', poses_of(problem, found)
+    path.write_text(render(identification_report(problem, found, poses, Origin())))
     seen = Seen(chromium, path, 400)
+    page = seen.page
     seen.drawn()
     assert seen.overflow <= 0
-    assert seen.page.evaluate(CONTRAST) == []
-    assert 'Not accepted' in seen.page.inner_text('.verdict')
-    box = seen.page.locator('text=What to do:').first.bounding_box()
+    assert page.evaluate(CONTRAST) == []
+    assert 'Not accepted' in page.inner_text('.verdict')
+    box = page.locator('text=What to do:').first.bounding_box()
     assert box['y'] < 800.0  # without scrolling
+    cells = page.evaluate("document.getElementById('space').data[0].marker.color")
+    assert 0 < len(cells) <= len(poses)
+    bands = page.evaluate("document.getElementById('session').data.map((t) => t.fill)")
+    assert bands.count('tonexty') == 2
+    page.locator('#rows tbody button').last.click()
+    assert 'Picked' in page.inner_text('#picked')
     seen.end()

@@ -102,6 +102,8 @@ def test_the_figures_are_those_of_the_result(solved):
         for figures in which.figures:
             for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
                 assert f'{value:.3f}' in page.text
+    for name, partners in result.gauges.items():
+        assert f'{name} {", ".join(partners)}' in page.text
     assert table_hash(result.chain) in page.text
     assert page.text.index('Accepted') < page.text.index('Accuracy before and after')
 

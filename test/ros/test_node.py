@@ -135,7 +135,7 @@ def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):
         cell.play(topics(recording))
         answer = cell.call('identify')
         assert answer.success, answer.message
-        assert f'{STOPS} samples' in answer.message
+        assert f'{STOPS} poses' in answer.message
         assert 'wrist_3_joint.theta' in cell.in_full(answer)
         # Heard although the subscriptions come after the publishing: the topics are latched.
         tables = cell.listen(Float64MultiArray, 'calibration_node/dh_parameters')
@@ -279,8 +279,8 @@ def test_validation_topics_are_never_fitted(cell, recording):
     )
     answer = cell.call('identify')
     assert answer.success, answer.message
-    assert f'{last} samples' in answer.message
-    assert '6 held-out samples' in answer.message
+    assert f'{last} poses' in answer.message
+    assert '6 held-out poses' in answer.message
 
 
 # Names, time, several robots, the end

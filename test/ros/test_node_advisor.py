@@ -200,7 +200,7 @@ def test_a_trajectory_is_corrected(calibrated, corrected, truth):
     q, velocities, accelerations, times = path()
     message = trajectory(q, velocities, accelerations, times)
     said = send(calibrated, message)
-    assert said.startswith('50 of 50 samples corrected')
+    assert said.startswith('50 of 50 points corrected')
     assert 'sigma of the calibration at these poses: 0.0' in said
     assert 'does not know the orientation' not in said
     calibrated.spin_until(lambda: corrected)
@@ -286,17 +286,17 @@ WRONG = {
     'must be a finite number': lambda q: trajectory(q * np.nan),
     'has no positions': lambda q: JointTrajectory(joint_names=list(UR.joint_names)),
     'needs velocities as well': lambda q: trajectory(q, accelerations=q),
-    '6 points, at most 5 are taken': lambda q: trajectory(np.repeat(q[:1], 6, axis=0)),
+    '8 points, at most 7 are taken': lambda q: trajectory(np.repeat(q[:1], 8, axis=0)),
 }
 
 
 def test_trajectories_that_cannot_be_corrected_are_refused(calibrated, corrected, monkeypatch):
-    monkeypatch.setattr(guide_module, 'MOST_POINTS', 5)
+    monkeypatch.setattr(guide_module, 'MOST_POINTS', 7)
     for reason, make in WRONG.items():
         said = send(calibrated, make(path(5)[0]))
         assert said.startswith('refused: ')
         assert reason in said
-    many = path(5)[0]
+    many = path(7)[0]
     many[:, 4] = 0.0
     said = send(calibrated, trajectory(many))
     assert 'and 2 more' in said

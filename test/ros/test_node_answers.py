@@ -26,9 +26,9 @@ from calib_ros.ros.identifying import _without_middle
 
 def test_errors_are_answers(cell, recording):
     for name, said in (
-        ('identify', 'no samples to fit'),
+        ('identify', 'no poses to fit'),
         ('capture', 'no joint states have come'),
-        ('remove_last', 'no sample to remove'),
+        ('remove_last', 'no pose to remove'),
         ('validate', 'identify or load one first'),
         ('load', 'no saved calibration of ur10e'),
     ):
@@ -41,7 +41,7 @@ def test_errors_are_answers(cell, recording):
     )
     few = cell.call('identify')
     assert not few.success
-    assert '2 measured configurations are too few, at least 5' in few.message
+    assert '2 measured poses are too few, at least 5' in few.message
 
 
 @pytest.mark.parametrize(
@@ -80,17 +80,17 @@ def test_record_remove_last_and_clear(cell, recording):
     assert cell.call('record', SetBool.Request(data=False)).success
     cell.play({'joint_states': joints[:10], 'measured_pose': poses[:2]})
     account = cell.node.session.account()
-    assert account.unused == {'joints: not recording': 10, 'poses: not recording': 2}
+    assert account.unused == {'joints: not recording': 10, 'measurements: not recording': 2}
     assert cell.call('record', SetBool.Request(data=True)).success
     cell.play({'joint_states': joints[10:300], 'measured_pose': poses[2:20]})
     assert len(cell.node.session.samples) == 5
     removed = cell.call('remove_last')
     assert removed.success
-    assert removed.message == 'sample 5 removed'
+    assert removed.message == 'pose 5 removed'
     assert len(cell.node.session.samples) == 4
     cleared = cell.call('clear')
     assert cleared.success
-    assert '4 samples cleared; they stay in' in cleared.message
+    assert '4 poses cleared; they stay in' in cleared.message
     assert cell.node.session.account().samples == 0
     assert cell.node.session.account().joint_states == 0
 
@@ -102,14 +102,14 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
         cell.play({'joint_states': joints[:28], 'measured_pose': poses[:4]})
         taken = cell.call('capture')
         assert taken.success, taken.message
-        assert taken.message.startswith('sample 1 taken (4 measurements, spread 0.0')
+        assert taken.message.startswith('pose 1 taken (4 measurements, spread 0.0')
         twice = cell.call('capture')
         assert not twice.success
-        assert 'no measurements have come since the last sample' in twice.message
+        assert 'no measurements have come since the last pose' in twice.message
         cell.node.set_parameters([Parameter('socket', value='plate A/1')])
         ball = cell.call('capture')
         assert ball.success, ball.message
-        assert ball.message == 'sample 2 taken: ball in socket plate A/1'
+        assert ball.message == 'pose 2 taken: ball in socket plate A/1'
         (path,) = tmp_path.glob('*Z.csv')
         assert path.read_text().splitlines()[-1].endswith(',plate A,1,')
         assert cell.call('remove_last').success
@@ -150,7 +150,7 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         holds = cell.call('validate')
         assert holds.success, holds.message
         assert 'the calibration holds: RMS 0.0' in holds.message
-        assert f'{STOPS} samples taken since' in holds.message
+        assert f'{STOPS} poses measured since' in holds.message
         agrees = cell.call('check')
         assert agrees.success, agrees.message
         assert 'agrees with what was measured: RMS 0.0' in agrees.message
@@ -275,7 +275,7 @@ def test_outliers_are_named_by_number_and_stamp(cell, recording):
     assert answer.success, answer.message
     sample = cell.node.session.samples[6]
     stamp = f'{sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d}'
-    assert f'1 outliers carry no weight: sample 7 ({stamp})' in cell.in_full(answer)
+    assert f'1 outliers carry no weight: pose 7 ({stamp})' in cell.in_full(answer)
 
 
 def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cell, recording):

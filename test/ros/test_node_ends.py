@@ -99,12 +99,12 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
     with cell_and_child(resume='true') as (cell, child):
         output = child.wait_for('ready to calibrate')
         assert 'was cut off and is left out' in output
-        assert f'resumed 10 samples of {path}' in output
+        assert f'resumed 10 poses of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
         cell.spin_until(lambda: len(samples_in(folder)) == 20)
         answer = cell.call('identify')
         assert answer.success, answer.message
-        assert '22 samples' in answer.message  # two stops waited when it was killed
+        assert '22 poses' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
     expected.finish()
     survived = [s for s in expected.samples if not 10.0 < (s.stamp_ns - START) * 1e-9 < 12.0]
@@ -190,7 +190,7 @@ def test_a_node_that_could_keep_no_samples_does_not_start(capsys, ended_by):
     folder = '/proc/nope'
     assert ended_by('chain:=ur10e', f'data_dir:={folder}') == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert f'samples cannot be kept in {folder}' in line
+    assert f'poses cannot be kept in {folder}' in line
     assert 'set data_dir' in line
 
 
@@ -214,14 +214,14 @@ def test_a_full_disk(tmp_path, recording):
             cell.spin_until(lambda: heard and heard[-1].status[0].level == wanted)
             assert said in heard[-1].status[0].message
 
-        level(DiagnosticStatus.ERROR, 'samples are in memory only')
-        cell.spin_until(lambda: status[-1].data.startswith('samples are in memory only: '))
+        level(DiagnosticStatus.ERROR, 'poses are in memory only')
+        cell.spin_until(lambda: status[-1].data.startswith('poses are in memory only: '))
         assert heard[-1].status[0].message.count('in memory only') == 1
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
         answer = cell.call('clear')
         assert not answer.success
-        assert 'samples are in memory only and would be lost' in answer.message
+        assert 'poses are in memory only and would be lost' in answer.message
         answer = cell.call('identify')
         assert answer.success, answer.message
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
@@ -233,9 +233,9 @@ def test_a_full_disk(tmp_path, recording):
             path.with_suffix('.settings.yaml').name
         ]
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
-        level(DiagnosticStatus.OK, 'samples')
+        level(DiagnosticStatus.OK, 'poses')
         cell.spin_until(lambda: 'memory' not in status[-1].data)
         assert len(samples_in(tmp_path)) == STOPS
         assert cell.call('save').success
         assert child.end(signal.SIGINT) == 0
-        assert child.output.count('samples are kept in memory only') == 1
+        assert child.output.count('poses are kept in memory only') == 1

@@ -64,7 +64,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
             found = diagnostics[-1].status[0]
             assert found.level == DiagnosticStatus.ERROR
             assert f'{what} is broken' in found.message
-            assert (what != 'the status') == ('samples' in found.message)
+            assert (what != 'the status') == ('poses' in found.message)
             assert (what in ('the account', 'the figures')) == (not found.values)
             if what not in ('taking messages', 'the status'):
                 heard = len(status)
@@ -75,7 +75,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
         found = diagnostics[-1].status[0]
         assert found.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
         assert 'failed' not in found.message
-        assert 'samples' in found.message
+        assert 'poses' in found.message
         assert int(values_of(diagnostics[-1])['samples']) >= 8
 
 
@@ -155,7 +155,7 @@ def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
         message.pose.position.z += 0.02
     words = cell.listen(String, 'calibration_node/status')
     cell.play(part(recording, 0.0, 20.0))
-    cell.spin_until(lambda: words and '; 18 samples' in words[-1].data)
+    cell.spin_until(lambda: words and '; 18 poses' in words[-1].data)
     assert 'fit' not in words[-1].data
     joints = topics(recording)['joint_states'][1000:]
     cell.play({'joint_states': joints, 'measured_pose': some[80:]})
@@ -187,7 +187,7 @@ def test_one_stray_frame_does_not_stop_the_cell(cell, recording):
     some[40].header.frame_id = 'camera'
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     cell.play(topics(recording, measured_pose=some))
-    said = 'poses: in frame "camera", not in "tracker" as others'
+    said = 'measurements: in frame "camera", not in "tracker" as others'
     cell.spin_until(lambda: heard and f'dropped {said}' in values_of(heard[-1]))
     answer = cell.call('identify')
     assert answer.success, answer.message
@@ -201,7 +201,7 @@ def test_poses_in_another_frame_than_frame_id_are_dropped(tmp_path, recording):
         cell.spin_until(lambda: heard)
         cell.play(topics(recording, measured_pose=some))
         cell.spin_until(lambda: any('messages are dropped' in m.status[0].message for m in heard))
-        said = 'poses: in frame "camera", not in frame_id "tracker"'
+        said = 'measurements: in frame "camera", not in frame_id "tracker"'
         assert cell.node.session.account().dropped == {said: 1}
 
 
@@ -237,8 +237,8 @@ def test_broken_messages_are_counted_by_cause(cell, recording):
         'joints: NaN or infinite joint value': 1,
         'joints: names and positions differ in number': 1,
         'joints: zero stamp': 1,
-        'poses: NaN or infinite position': 1,
-        'poses: quaternion not of length 1': 2,
+        'measurements: NaN or infinite position': 1,
+        'measurements: quaternion not of length 1': 2,
     }
 
 

@@ -47,7 +47,7 @@ def test_messages_are_taken_while_an_identification_runs(monkeypatch, tmp_path, 
         # The samples that came meanwhile were not fitted, so they may judge.
         judged = cell.call('validate')
         assert judged.success
-        assert '4 samples taken since' in judged.message
+        assert '4 poses measured since' in judged.message
         assert cell.call('identify').success
 
 
@@ -166,4 +166,4 @@ def test_clear_while_an_identification_runs(monkeypatch, cell, recording):
     assert running.result().success, running.result().message
     cell.play(topics(recording))
     judged = cell.call('validate')
-    assert f'{STOPS} samples taken since' in judged.message
+    assert f'{STOPS} poses measured since' in judged.message

@@ -194,7 +194,7 @@ def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
         found = live.calibration.chain
     assert wanted.on_flange
     assert len(live.samples) == STOPS - len(SPOILT)
-    dropped = {f'poses: image {cause}': 1 for cause in SPOILT.values()}
+    dropped = {f'measurements: image {cause}': 1 for cause in SPOILT.values()}
     assert live.account().dropped == dropped
     away = found.forward(wanted.joints) - truth.forward(wanted.joints)
     assert 1e3 * np.abs(away[:, :3, 3]).max() < 0.2
@@ -233,10 +233,12 @@ def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_not
     batch = [(streams_of(given)[topic], message) for topic, message in come]
     assert feed(session, batch, lambda message, kind: message) == []
     assert session.account().joint_states == len(shift[0])  # none has waited
-    assert session.account().dropped['poses: image while others were looked at'] > STOPS // 2
+    assert (
+        session.account().dropped['measurements: image while others were looked at'] > STOPS // 2
+    )
     camera.go_on.set()
     session.finish()
-    assert session.account().dropped['poses: image blurred'] >= pictures.MOST_WAITING
+    assert session.account().dropped['measurements: image blurred'] >= pictures.MOST_WAITING
     assert 'the last image is not used: it is blurred' in session.status()
 
 

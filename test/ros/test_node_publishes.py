@@ -57,7 +57,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         words = cell.listen(String, 'calibration_node/status')
         cell.spin_until(lambda: words)
         assert words[0].data.startswith('the arm ')
-        assert f'; {STOPS} samples, 0.0' in words[0].data
+        assert f'; {STOPS} poses, 0.0' in words[0].data
         assert 'enough for the accuracy wanted' in words[0].data
 
 
@@ -71,7 +71,7 @@ def test_the_status_tells_what_the_arm_does(cell, recording):
     assert session.state == 'the arm is moving'
     few = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
-    assert few[-1].data == 'the arm is moving; 0 samples'
+    assert few[-1].data == 'the arm is moving; 0 poses'
 
 
 def test_the_status_is_short_and_its_first_words_are_those_that_matter(
@@ -86,9 +86,9 @@ def test_the_status_is_short_and_its_first_words_are_those_that_matter(
     assert 100 < len(words[-1].data) <= 120
     assert words[-1].data.endswith(' ...')
     cell.spin_until(lambda: heard and heard[-1].status[0].message.endswith(long))
-    trouble = 'samples are in memory only: ' + 'no space left on a device of a long name ' * 5
+    trouble = 'poses are in memory only: ' + 'no space left on a device of a long name ' * 5
     monkeypatch.setattr(Archive, 'trouble', f'{trouble}; ')
-    cell.spin_until(lambda: words[-1].data.startswith('samples are in memory only: '))
+    cell.spin_until(lambda: words[-1].data.startswith('poses are in memory only: '))
     assert 100 < len(words[-1].data) <= 120
     assert '...; the arm is moving' in words[-1].data
 

@@ -21,9 +21,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
+from calib_ros.sampling.slices import MANY
 from calib_ros.sampling.waiting import MOST_STREAMS, TOO_MANY
 
-LATE = 'poses: later than lateness allows'
+LATE = 'measurements: later than lateness allows'
 
 
 # Order of arrival
@@ -69,10 +70,15 @@ def test_what_comes_later_than_lateness_is_counted(mode):
 
 
 def test_joint_samples_that_come_too_late_are_counted():
-    made = collector(lateness=0.5)
-    play(made, joint_events(tour(), 9.5))
-    play(made, [(0.0, (0, 1), START, np.zeros(2))], finish=False)
-    assert made.dropped == {'joints: later than lateness allows': 1}
+    """Many in succession are a clock that jumped; now and then they are not."""
+    made, late = collector(lateness=0.5), [(0.0, (0, 1), START, np.zeros(2))]
+    for begin in (0.0, 9.5, 19.0):
+        play(made, joint_events(tour(), begin + 9.5, begin=begin), finish=False)
+        for _ in range(MANY - 1):
+            play(made, late, finish=False)
+    assert made.dropped == {'joints: later than lateness allows': 3 * (MANY - 1)}
+    play(made, late, finish=False)
+    assert made.notes['the clock jumped back'] == 1
 
 
 @pytest.mark.parametrize('delay', [0.2, -0.05])
@@ -146,19 +152,19 @@ def test_a_small_joint_buffer_costs_only_what_it_cannot_hold():
 @pytest.mark.parametrize('capacity', [2, 60])
 def test_a_joint_buffer_that_is_too_small_says_so(capacity):
     made, _ = toured(joint_buffer=capacity, end=4.5)
-    assert made.notes['joint samples let go, the joint buffer was full'] > 0
+    assert made.notes['joint states let go, the joint buffer was full'] > 0
 
 
 def test_a_full_pose_buffer_drops_new_measurements_and_counts_them():
     made, _ = toured(pose_buffer=10)
-    assert made.dropped['poses: pose buffer full'] > 300
+    assert made.dropped['measurements: pose buffer full'] > 300
 
 
 def test_samples_kept_are_bounded():
     motion = sweep(2, np.random.default_rng(2))
     made = collector(mode='continuous', pose_buffer=60, lateness=0.2)
     assert len(play(made, joint_events(motion, 5.0), pose_events(motion, 5.0))) == 60
-    assert made.dropped['poses: the memory for samples is full'] > 150
+    assert made.dropped['measurements: the memory for poses is full'] > 150
 
 
 # Targets without end

@@ -126,7 +126,7 @@ def test_bodies_that_are_not_seen_are_counted(tmp_path, rng):
     session, _ = session_of(path, sources=(line(MOCAP), line(MOCAP, 'lost')))
     assert session.account().poses == len(TIMES) + len(TIMES) // 2
     assert session.account().dropped == {
-        'poses: NaN or infinite position': len(TIMES) // 2,
+        'measurements: NaN or infinite position': len(TIMES) // 2,
     }
 
 

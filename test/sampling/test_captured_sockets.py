@@ -53,7 +53,7 @@ def test_sockets_are_identified_from_the_node_as_from_a_table(tmp_path):
     assert resumed.problem().separations == live.separations
     found = session.identify()
     assert found.fitted.figures[1].rms_mm < 1e-3
-    assert 'samples' in session.status()
+    assert 'poses' in session.status()
 
 
 def test_a_moving_arm_and_a_wrong_label_are_refused():

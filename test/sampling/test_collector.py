@@ -21,8 +21,8 @@ from arriving import (
 )
 from streams import START, stamps, stops, sweep
 
-MOVING = 'poses: the arm was moving'
-CALM = 'poses: the arm had just stopped'
+MOVING = 'measurements: the arm was moving'
+CALM = 'measurements: the arm had just stopped'
 
 
 # Stops
@@ -86,7 +86,7 @@ def test_measuring_begins_after_the_arm_has_settled(settle, count):
 def test_a_stop_that_is_too_short_is_no_sample():
     made, samples = toured(shortest_stop=1.6)
     assert samples == []
-    assert made.unused['poses: the stop was too short'] > 200
+    assert made.unused['measurements: the stop was too short'] > 200
 
 
 def test_of_a_long_stop_only_the_beginning_is_used():
@@ -105,7 +105,7 @@ def test_a_long_stop_is_sampled_while_it_lasts():
     made = collector(longest_stop=2.0)
     events = joint_events(motion, 4.0), pose_events(motion, 4.0)
     assert len(play(made, *events, finish=False)) == 1
-    assert made.state() == 'the arm stands and is sampled: move on'
+    assert made.state() == 'the arm stands and its pose is measured: move on'
 
 
 def test_a_measurement_while_the_arm_vibrates_is_left_out():
@@ -120,7 +120,7 @@ def test_a_measurement_while_the_arm_vibrates_is_left_out():
         events.append((time, POSE, int(stamps(time)), seen))
     samples = play(made, joint_events(motion, 9.5), events)
     assert len(samples) == 5
-    assert made.dropped['poses: still vibrating, or a spike'] > 20
+    assert made.dropped['measurements: still vibrating, or a spike'] > 20
     for sample, where in zip(samples, STOPS, strict=True):
         error = np.abs(sample.position - place(where[np.newaxis])[0]).max()
         assert error < 5.0 * NOISE / np.sqrt(sample.count)
@@ -135,7 +135,7 @@ def test_a_stop_at_which_the_target_moves_is_dropped_and_counted():
     ]
     assert play(made, joint_events(motion, 9.5), events) == []
     assert made.dropped == {
-        'poses: a stop that spreads more than the noise': pytest.approx(270, abs=10)
+        'measurements: a stop that spreads more than the noise': pytest.approx(270, abs=10)
     }
 
 
@@ -185,7 +185,7 @@ def test_in_continuous_mode_samples_come_while_the_arm_moves():
 def test_in_triggered_mode_nothing_is_taken_unasked():
     made, samples = toured(mode='triggered')
     assert samples == []
-    assert set(made.unused) == {MOVING, 'poses: nobody asked for them'}
+    assert set(made.unused) == {MOVING, 'measurements: nobody asked for them'}
 
 
 def ask(times):
@@ -205,7 +205,7 @@ def test_a_capture_that_gives_nothing_says_why():
     made = collector(mode='triggered')
     assert made.capture() == (0, 'no joint states have come')
     play(made, joint_events(motion, 0.5), finish=False)
-    assert made.capture() == (0, 'no measurements have come since the last sample')
+    assert made.capture() == (0, 'no measurements have come since the last pose')
     events = joint_events(motion, 1.5, begin=0.5), pose_events(motion, 1.5, begin=0.5)
     play(made, *events, finish=False)
     count, why = made.capture()

@@ -146,7 +146,7 @@ def test_a_clock_that_is_moved_is_told_with_the_sample(step, mode):
     )
     made.finish()
     (warning,) = told(made)
-    found = re.search(r'by ([+-]\d\.\d+) s after about (\d+) samples', warning)
+    found = re.search(r'by ([+-]\d\.\d+) s after about (\d+) poses', warning)
     assert float(found[1]) == pytest.approx(step, abs=0.01)
     stamps_ns = np.array([sample.stamp_ns for sample in made.samples])
     before = int((stamps_ns < START + 30 * S).sum())
@@ -163,7 +163,7 @@ def test_clocks_that_agree_all_the_time_are_not_told_of(mode):
     made.finish()
     assert told(made) == ()
     if mode == 'dwell':
-        assert made.account().dropped['poses: still vibrating, or a spike'] > 10
+        assert made.account().dropped['measurements: still vibrating, or a spike'] > 10
 
 
 def back_and_forth(times):

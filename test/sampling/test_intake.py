@@ -4,7 +4,7 @@
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
+from recorded import TYPESTORE, joint_state, point_stamped, pose_stamped
 
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.chain_file import load_chain
@@ -16,8 +16,6 @@ from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
 ARM = load_chain('ur10e')
-STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES = STORE.types
 POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'
 JOINTS = Stream('joints', JOINT_STATE)
 GRIPPER = Stream('gripper', JOINT_STATE)
@@ -27,28 +25,20 @@ START = 1_700_000_000_000_000_000
 RARE = 0.002
 
 
-def header(stamp_ns, frame_id=''):
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
-    return TYPES['std_msgs/msg/Header'](time, frame_id)
+def written(stream, message):
+    return stream, bytes(TYPESTORE.serialize_cdr(message, stream.type))
 
 
 def joints(stream, stamp_ns, names, values):
-    none = np.zeros(0)
-    message = TYPES[JOINT_STATE](header(stamp_ns), list(names), np.array(values), none, none)
-    return stream, bytes(STORE.serialize_cdr(message, JOINT_STATE))
+    return written(stream, joint_state(stamp_ns, values, names))
 
 
-def pose(stamp_ns, position, quat, frame_id='world'):
-    point = TYPES['geometry_msgs/msg/Point'](*position)
-    turn = TYPES['geometry_msgs/msg/Quaternion'](*quat)
-    message = TYPES[POSE](header(stamp_ns, frame_id), TYPES['geometry_msgs/msg/Pose'](point, turn))
-    return TRACKER, bytes(STORE.serialize_cdr(message, POSE))
+def pose(*given):
+    return written(TRACKER, pose_stamped(*given))
 
 
 def point(stamp_ns, position):
-    message = TYPES[POINT](header(stamp_ns, 'lens'), TYPES['geometry_msgs/msg/Point'](*position))
-    return CAMERA, bytes(STORE.serialize_cdr(message, POINT))
+    return written(CAMERA, point_stamped(stamp_ns, position))
 
 
 def shift(rng, stops=5):
@@ -118,9 +108,9 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     while begin < len(messages):
         end = begin + int(rng.choice([1, 10, 100, 400, 3000]))
         one.recording = many.recording = bool(rng.random() < 0.8)
-        assert feed(many, messages[begin:end], STORE.deserialize_cdr) == []
+        assert feed(many, messages[begin:end], TYPESTORE.deserialize_cdr) == []
         for message in messages[begin:end]:
-            assert feed(one, [message], STORE.deserialize_cdr) == []
+            assert feed(one, [message], TYPESTORE.deserialize_cdr) == []
         assert outcome(one) == outcome(many)
         begin = end
     one.finish()
@@ -136,7 +126,7 @@ def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
     for k in range(1, 5):
         messages += [point(START + k, np.zeros(3)), pose(START + k, np.zeros(3), quat)]
     session = CalibrationSession(ARM)
-    assert feed(session, messages, STORE.deserialize_cdr) == []
+    assert feed(session, messages, TYPESTORE.deserialize_cdr) == []
     assert session.account().waiting == 4
     assert [key.device for key in session._collector.waiting] == ['camera']
 
@@ -146,7 +136,7 @@ def test_a_damaged_message_is_told_and_the_others_are_taken():
     messages = [joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)) for stamp in stamps]
     messages[7] = (JOINTS, messages[7][1][:40])
     session = CalibrationSession(ARM)
-    (problem,) = feed(session, messages, STORE.deserialize_cdr)
+    (problem,) = feed(session, messages, TYPESTORE.deserialize_cdr)
     assert problem.startswith('a message on joints cannot be decoded')
     assert session.received['joints'] == 19
 
@@ -165,10 +155,10 @@ def test_numbers_that_stand_for_nothing_are_dropped(value, together):
     session = CalibrationSession(ARM, Settings(mode='continuous', delay=1e-3))
     for begin in range(0, 300, 300 if together else 1):
         part = messages[begin : begin + (300 if together else 1)]
-        assert feed(session, part, STORE.deserialize_cdr) == []
+        assert feed(session, part, TYPESTORE.deserialize_cdr) == []
     session.finish()
     dropped = session.account().dropped
-    assert dropped['poses: position beyond 1000 km'] == 30
+    assert dropped['measurements: position beyond 1000 km'] == 30
     assert sum(count for cause, count in dropped.items() if 'joint value' in cause) == 3
     assert len(session.samples) > 100
 
@@ -182,8 +172,8 @@ def test_streams_of_the_same_joints_share_a_buffer():
         for stream, names in ((JOINTS, ARM.joint_names), (GRIPPER, order))
     ]
     session = CalibrationSession(ARM, Settings(joint_buffer=150))
-    assert feed(session, messages[:2], STORE.deserialize_cdr) == []
-    assert feed(session, messages[2:], STORE.deserialize_cdr) == []
+    assert feed(session, messages[:2], TYPESTORE.deserialize_cdr) == []
+    assert feed(session, messages[2:], TYPESTORE.deserialize_cdr) == []
     assert session.received['joints'] == 400
 
 
@@ -202,6 +192,6 @@ def test_an_error_in_a_batch_costs_no_other_message():
         raise RuntimeError('no room for a sample')
 
     session = CalibrationSession(ARM, on_sample=fail)
-    (problem,) = feed(session, messages, STORE.deserialize_cdr)
+    (problem,) = feed(session, messages, TYPESTORE.deserialize_cdr)
     assert 'no room for a sample' in problem
-    assert session.received == {'joints': 2000, 'poses': 2000}
+    assert session.received == {'joints': 2000, 'measurements': 2000}

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tracked import MS, fill, filled
 
-from calib_ros.sampling.intervals import LAGS
+from calib_ros.sampling.intervals import LOOKS_BACK
 
 # Standing
 
@@ -19,8 +19,8 @@ def brute_standing(stamps, values, still, window, max_gap):
         if k and stamps[k] - stamps[k - 1] > max_gap:
             start = k
         calm, back = True, k
-        for lag in range(1, LAGS + 1):
-            wanted = stamps[k] - window * lag // LAGS
+        for lag in range(1, LOOKS_BACK + 1):
+            wanted = stamps[k] - window * lag // LOOKS_BACK
             back = next(i for i in range(len(stamps)) if stamps[i] >= wanted)
             back = max(min(back, k - 1), start)
             calm = calm and np.abs(values[k] - values[back]).max() <= still

@@ -4,40 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import NOISE, SIGMAS, UR10E
+from sessions import seen
 
-from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.apply.simulation import Cell, faulty, random_frame
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling import live as live_module
 from calib_ros.sampling.live import START, LiveEstimate, barely_moved
-from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
-
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 
 
 def session(**settings):
     return CalibrationSession(UR10E, Settings(**SIGMAS | settings))
-
-
-def seen(true, count, rng, oriented=True, start=0, **more):
-    """Return samples of a true chain at random configurations."""
-    joints = UR10E.random_joints(count, rng)
-    found = measure(true, joints, rng, *NOISE, oriented=oriented)
-    return [
-        Sample(
-            start + k + 1,
-            joints[k],
-            position=found.positions[k],
-            rotation=found.rotations[k] if oriented else None,
-            **more,
-        )
-        for k in range(count)
-    ]
 
 
 def growing(samples, **settings):
@@ -99,7 +79,7 @@ def test_one_by_one_or_all_at_once_is_the_same(rng):
 
 def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
     """An update is short whatever waits, and in the end nothing has been left out."""
-    monkeypatch.setattr(live_module, 'MOST_ANEW', 40)
+    monkeypatch.setattr(live_module, 'SOME', 40)
     monkeypatch.setattr(live_module, 'MOST_AT_ONCE', 25)
     true = faulty(UR10E, Cell(), rng)
     samples = seen(true, 80, rng) + [
@@ -117,7 +97,7 @@ def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
 
 def test_what_it_does_not_begin_with_is_taken_next(rng, monkeypatch):
     """Of many samples of one target and few of another it begins with a part of the many."""
-    monkeypatch.setattr(live_module, 'MOST_ANEW', 60)
+    monkeypatch.setattr(live_module, 'SOME', 60)
     true = faulty(UR10E, Cell(), rng)
     samples = seen(true, 50, rng) + seen(true, 8, rng, start=100, target='other')
     live = LiveEstimate(session().problem_of)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib_ros.kinematics import se3
-from calib_ros.sampling.making import WIDTH, Maker, Matched
+from calib_ros.sampling.making import ROW_WIDTH, Maker, Matched
 from calib_ros.sampling.slices import StreamKey
 from calib_ros.sampling.track import Motion
 
@@ -17,7 +17,7 @@ NOISE = 5e-5
 def samples(rotations, rng, spikes=(), stops=1):
     """Return the samples of stops at which rotations (N, 3, 3) were measured, alike at each."""
     count = len(rotations)
-    values = np.full((stops * count, WIDTH), np.nan)
+    values = np.full((stops * count, ROW_WIDTH), np.nan)
     values[:, :3] = 0.5 + rng.normal(scale=NOISE, size=(stops * count, 3))
     values[list(spikes), :3] += 0.1
     values[:, 3:7] = np.tile(se3.to_quat(rotations), (stops, 1))

@@ -80,7 +80,10 @@ def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     made.finish()
     expected.finish()
     if where:  # the first comes in the time in which the arm has just stopped
-        assert made.account().dropped['poses: in frame "stray", not in "tracker" as others'] == 1
+        assert (
+            made.account().dropped['measurements: in frame "stray", not in "tracker" as others']
+            == 1
+        )
     assert 'different frames' not in made.status()
     assert made.identify().accepted
     assert made.problem().world_frame == 'tracker'
@@ -103,7 +106,9 @@ def test_a_sample_in_a_stray_frame_goes_when_the_usual_one_is_known():
     made.problem()
     assert removed == [stray]
     assert stray not in made.samples
-    assert made.account().dropped == {'poses: in frame "stray", not in "tracker" as others': 1}
+    assert made.account().dropped == {
+        'measurements: in frame "stray", not in "tracker" as others': 1
+    }
     assert made.identify().accepted
 
 
@@ -129,9 +134,9 @@ def test_targets_that_were_measured_once_are_left_out():
     ]
     made = session(junk[:150], good, junk[150:])
     assert [len(each) for each in made.problem().sets] == [20]
-    assert '; 20 samples' in made.status()
+    assert '; 20 poses' in made.status()
     assert made.identify().accepted
-    left_out = 'samples left out, in another frame or of a target measured once'
+    left_out = 'poses left out, in another frame or of a target measured once'
     assert made.account().notes[left_out] == 300
     made.restore(samples(1, seed=0, start=1000, target='junk 0'))  # seen again
     assert len(made.problem().sets) == 2
@@ -147,8 +152,8 @@ def test_frames_without_end_are_not_remembered():
         message.header.frame_id = f'frame {k}' if k else 'line\nbreak'
         take(made, (TRACKER, POSE, message))
     dropped = made.account().dropped
-    assert dropped['poses: in a frame whose name cannot be printed'] == 1
-    assert dropped['poses: in one of more than 50 frames'] == 9
+    assert dropped['measurements: in a frame whose name cannot be printed'] == 1
+    assert dropped['measurements: in one of more than 50 frames'] == 9
 
 
 def test_samples_of_another_robot_are_not_restored():

@@ -37,12 +37,12 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
     drive(made, where + 0.1, [tracker()], start=end)
     made.finish()
     assert len(made.samples) == 3
-    assert made.account().unused['poses: the stop was too short'] > 0
+    assert made.account().unused['measurements: the stop was too short'] > 0
 
 
 def test_the_status_tells_how_far_it_is():
     made = session(samples(6))
-    assert made.status().startswith('waiting for joint states; 6 samples, ')
+    assert made.status().startswith('waiting for joint states; 6 poses, ')
     assert 'too few to tell how many it takes' in made.status()
     assert 'more' not in made.status()
     made.restore(samples(60, start=100))
@@ -77,7 +77,7 @@ def test_the_status_names_a_sample_that_does_not_fit():
     made = session(given[:45])
     assert 'does not fit' not in made.status()
     made.samples.append(replace(given[45], position=given[45].position + 0.01))
-    assert 'sample 46 does not fit the others' in made.status()
+    assert 'pose 46 does not fit the others' in made.status()
     made.remove_last()
     assert 'does not fit' not in made.status()
 
@@ -108,11 +108,11 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
 
 def test_the_status_is_never_an_error():
     only_judging = session(samples(10, validation=True))
-    assert '; 0 samples' in only_judging.status()
+    assert '; 0 poses' in only_judging.status()
     (one,) = samples(1)
     same_place = session([replace(one, stamp_ns=k) for k in range(1, 20)])
-    assert '; 19 samples' in same_place.status()
-    assert '; 0 samples' in CalibrationSession(UR5E).status()
+    assert '; 19 poses' in same_place.status()
+    assert '; 0 poses' in CalibrationSession(UR5E).status()
     assert CalibrationSession(UR5E).status('identifying') == (
-        'waiting for joint states; identifying; 0 samples'
+        'waiting for joint states; identifying; 0 poses'
     )

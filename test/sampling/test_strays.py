@@ -22,7 +22,7 @@ from streams import (
 
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.slices import JOINTS, MANY, POSES, Piece, Slice, StreamKey
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
 from calib_ros.sampling.strays import Gate
 from calib_ros.settings import Settings
 
@@ -120,7 +120,7 @@ def test_measurements_may_come_long_before_their_joint_states():
 def test_every_message_passes_is_held_back_or_is_counted(messages):
     passed, gate = through(messages)
     assert len(passed) + count(gate) == len(messages)
-    assert max(gate.held(JOINTS), gate.held(POSES)) < MANY
+    assert max(gate.held(JOINTS), gate.held(POSES)) < NO_ACCIDENT
 
 
 @given(

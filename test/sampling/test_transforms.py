@@ -269,7 +269,7 @@ def test_a_pair_that_repeats_is_one_measurement(tmp_path, rng):
     found, session = poses_of(record(tmp_path / 'bag', events(rng, moving)))
     assert len(found) == 2
     assert session.account().poses == 5
-    assert session.account().dropped == {'poses: same stamp twice': 3}
+    assert session.account().dropped == {'measurements: same stamp twice': 3}
 
 
 @pytest.mark.parametrize('big_endian', [False, True])
@@ -294,7 +294,7 @@ def test_bad_transforms_are_counted_if_they_are_of_the_pair(rng, change, cause, 
     session = session_fed([tf(foreign, good), tf(bad, foreign), tf(foreign)], not big_endian)
     account = session.account()
     assert account.poses == 2
-    assert account.dropped == {f'poses: {cause}': 1}
+    assert account.dropped == {f'measurements: {cause}': 1}
 
 
 def session_fed(come, little_endian=True, at_once=True):
@@ -324,7 +324,7 @@ def test_what_could_not_wait_for_its_frames_is_counted(monkeypatch, rng):
     account = session_fed(come, at_once=False).account()
     assert account.poses == 21
     assert account.samples == 1
-    assert account.dropped == {'poses: buffer full before their frames were linked': 20}
+    assert account.dropped == {'measurements: buffer full before their frames were linked': 20}
     assert session_fed(come).account().samples == 21
 
 

@@ -196,7 +196,7 @@
 
   // The list
   const SIZE = 12;
-  const head = ['pose', 'from', 'used', 'before [mm]', 'after [mm]', ...(e.oriented ? ['before [mrad]', 'after [mrad]'] : []), 'size', ...e.joints];
+  const head = ['pose', 'from', 'used', 'before [mm]', 'after [mm]', ...(e.oriented ? ['before [mrad]', 'after [mrad]'] : []), 'times usual', ...e.joints];
   function cell(row, text, number = true) {
     const td = row.insertCell();
     td.textContent = text;

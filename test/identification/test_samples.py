@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import UR10E, arm
+
+from calib_ros.apply.simulation import Camera, before_camera, measure, photograph
+from calib_ros.identification.samples import Samples, residual_arrays, seen_residuals
+
+SPREAD = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
+
+
+def lengths(seen):
+    distances = np.linalg.norm(seen.positions, axis=1)
+    return replace(seen, distances=distances, oriented=np.zeros(len(seen), dtype=bool))
+
+
+@pytest.mark.parametrize(
+    'given',
+    [
+        lambda seen: seen,
+        lengths,
+        lambda seen: replace(seen, covariance=1e-8 * np.tile(SPREAD, (len(seen), 1, 1))),
+    ],
+    ids=['pose', 'distance', 'covariance'],
+)
+def test_weighted_rows_give_back_the_errors_in_metres(given):
+    rng = np.random.default_rng(0)
+    seen = given(measure(arm(0), UR10E.random_joints(20, rng), rng, 5e-5, 2e-4))
+    samples = Samples(seen, 3e-4, 7e-4)
+    rows = samples.rows_of(UR10E, UR10E.parameter_names[:4])
+    expected, _ = residual_arrays(UR10E, seen)
+    found = samples.position_errors(rows[-1].ravel())
+    np.testing.assert_allclose(found[:, : expected.shape[1]], expected, rtol=1e-9)
+
+
+def test_residuals_are_those_of_the_joint_values_at_the_delay():
+    """An arm at 0.3 rad/s, 50 ms before the stamps, before a tracker and before a camera."""
+    rng = np.random.default_rng(0)
+    moving = np.full(6, 0.3)
+
+    def late(chain, seen):
+        chain = chain.with_frame('base', replace(chain.frame('base'), delay=0.05))
+        velocity = np.tile(moving, (len(seen), 1))
+        return chain, replace(seen, joints=seen.joints + 0.05 * moving, velocity=velocity)
+
+    posed = late(UR10E, measure(UR10E, UR10E.random_joints(5, rng), rng))
+    board = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
+    chain = before_camera(UR10E, Camera(), board, False, rng)
+    pictured = late(chain, photograph(chain, Camera(), board, False, 2, rng))
+    for left in (*residual_arrays(*posed), *seen_residuals(*pictured)):
+        np.testing.assert_allclose(left, 0.0, atol=1e-8)
+    assert np.abs(residual_arrays(UR10E, posed[1])[0]).max() > 1e-3
+    stood = replace(posed[1], velocity=None)
+    for chain, seen in ((UR10E, posed[1]), (posed[0], stood)):  # nothing is late, nothing moved
+        joints, velocity = Samples(seen, 1.0, 1.0).moving(chain)
+        np.testing.assert_array_equal(joints, seen.joints.T)
+        assert velocity is None
