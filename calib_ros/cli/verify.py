@@ -6,11 +6,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
@@ -34,32 +33,6 @@ TITLES = {
 }
 
 
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to judge')
-    add = group.add_argument
-    text = 'new measurements: a bag, or a table with q1..qn as reported, x y z ...'
-    add('measured', type=Path, metavar='MEASURED', help=text)
-    common.add_chain(group)
-    common.add_calibration(group)
-    text = 'the program before its correction, q1..qn: judge against the poses that it means'
-    add('--commanded', type=Path, metavar='FILE', help=text)
-    add('--session', metavar='NAME', help='session of the table')
-    common.add_moved(group)
-    group = parser.add_argument_group('how to judge')
-    wanted = 'wanted RMS position error; if not given, errors only, without a verdict'
-    common.add_each(
-        group,
-        float,
-        ('--tolerance', 'MM', None, wanted),
-        ('--confidence', 'SHARE', 0.95, 'of the verdict'),
-    )
-    common.add_out(group, 'the report and the residuals')
-    common.add_history(group)
-    common.add_settings(parser, common.OF_BAGS)
-    common.add_layout(parser)
-    common.add_identity(parser, pdf=True)
-
-
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     with common.results(options, VERIFICATION_FILES) as contents:
         status = _verified(options, screen, contents)
@@ -70,7 +43,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
-    history = common.history_of(options)
+    history = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = load_calibration(options.calibration, nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
@@ -90,7 +63,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     if history is not None:
         judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
         hashed = table_hash(arm.chain)
-        about = common.filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
+        about = given.filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)
@@ -102,11 +75,11 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     with screen.work('writing the report'):
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
         report = verification_report(
-            arm.chain, found, poses, common.origin_of(options, read), warnings
+            arm.chain, found, poses, given.origin_of(options, read), warnings
         )
         contents['residuals.csv'] = poses.table()
         contents['verification.txt'] = f'{in_words(found)}\n'
-        contents |= common.page_of(report, screen, pdf=options.pdf)
+        contents |= given.page_of(report, screen, pdf=options.pdf)
     return status
 
 
@@ -156,16 +129,3 @@ def _sets(
     if not (fitted or held_out):
         raise InputError(f'{options.measured} gives no poses: {session.account()}')
     return (*fitted, *held_out), read.warnings, False
-
-
-COMMANDS = {
-    'verify': Command(
-        _add,
-        _run,
-        (
-            'verify new.csv --chain ur10e --calibration result/',
-            'verify recording/ --chain ur10e --calibration result/ --tolerance 0.3',
-            'verify new.csv --chain ur10e --calibration result/ --commanded tests.csv',
-        ),
-    ),
-}
