@@ -16,7 +16,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
 from calib_ros.files.detector import detect, marker_cells
-from calib_ros.files.images import SUFFIXES, Image, files_of, image_of
+from calib_ros.files.images import SUFFIXES, Image, files_of, image_of, read_image
 from calib_ros.kinematics.chain_file import dump_yaml
 
 
@@ -70,14 +70,13 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
     folder = options.images.is_dir()
-    if folder and any(path.suffix.lower() in SUFFIXES for path in options.images.iterdir()):
-        count = sum(path.suffix.lower() in SUFFIXES for path in options.images.iterdir())
-        for k, each in enumerate(files_of(options.images)):
-            work(each[0], k / count)
-            yield each
-        return
-    if folder and not (options.images / 'metadata.yaml').exists():
+    paths = files_of(options.images) if folder else []
+    if folder and not paths and not (options.images / 'metadata.yaml').exists():
         raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
-
+    for k, path in enumerate(paths):
+        work(path.name, k / len(paths))
+        yield path.name, read_image(path)
+    if paths:
+        return
     for stamp, message in pictures(options.images, options.topic):
         yield str(stamp), image_of(message)

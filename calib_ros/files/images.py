@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,19 +31,17 @@ def opencv() -> Any:
     return cv2
 
 
-def files_of(folder: Path) -> Iterator[tuple[str, Image]]:
-    """Yield the images of a folder by name, those that cannot be read without pixels."""
-    paths = sorted(
-        (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES),
-        key=lambda path: (len(path.name), path.name),
-    )
-    if not paths:
-        raise InputError(f'{folder} has no images ({", ".join(SUFFIXES)})')
-    for path in paths:
-        if path.stat().st_size > LARGEST_IMAGE:
-            yield path.name, np.zeros((0, 0), dtype=np.uint8)
-        else:
-            yield path.name, decoded(np.fromfile(path, dtype=np.uint8))
+def files_of(folder: Path) -> list[Path]:
+    """Return the images of a folder by name, shorter ones first."""
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def read_image(path: Path) -> Image:
+    """Return an image in grey; without pixels where it cannot be read."""
+    if path.stat().st_size > LARGEST_IMAGE:
+        return np.zeros((0, 0), dtype=np.uint8)
+    return decoded(np.fromfile(path, dtype=np.uint8))
 
 
 def decoded(data: NDArray[np.uint8]) -> Image:
