@@ -16,7 +16,7 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -147,11 +147,15 @@ class Compensation(Solution):
 
 
 def compensate(
-    compensator: Compensator, joints: FloatArray, approach: FloatArray | None = None
+    compensator: Compensator,
+    joints: FloatArray,
+    approach: FloatArray | None = None,
+    heard: Callable[[float], None] | None = None,
 ) -> Compensation:
     """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
 
-    `approach` (N, n) holds the signs of the velocities before, for backlash.
+    `approach` (N, n) holds the signs of the velocities before, for backlash;
+    `heard` is called with the share that is done.
 
     Raises
     ------
@@ -169,7 +173,7 @@ def compensate(
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
-    solution = follower.solve(command, approach)
+    solution = follower.solve(command, approach, heard=heard)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,11 +52,13 @@ class Program(Shown):
     approach: FloatArray | None = None
 
 
-def compensate_program(compensator: Compensator, program: Program) -> tuple[Program, Compensation]:
-    """Return a program with corrected joint values, and what became of each sample.
+def compensate_program(
+    compensator: Compensator, program: Program, heard: Callable[[float], None] | None = None
+) -> tuple[Program, Compensation]:
+    """Return a program with corrected joint values, and what became of each point.
 
     Velocities and accelerations follow the corrected path; times stay. Joints that are not of the
-    arm stay as they are. Refused samples are NaN.
+    arm stay as they are. Refused points are NaN; `heard` is called with the share that is done.
 
     Raises
     ------
@@ -67,7 +69,7 @@ def compensate_program(compensator: Compensator, program: Program) -> tuple[Prog
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]
     approach = approaches(positions) if program.approach is None else program.approach
-    result = compensate(compensator, positions, approach)
+    result = compensate(compensator, positions, approach, heard)
     if program.velocities is None:
         return replace(program, positions=_put(program.positions, columns, result.joints)), result
     given = program.accelerations

@@ -18,6 +18,7 @@ from calib_ros.errors import InputError
 from calib_ros.files.trajectories import read_program
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.shown import some
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
@@ -61,13 +62,15 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     arm = load_calibration(options.calibration, nominal)
     limits = {name: getattr(options, name) for name in POSITIVE}
     compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
-    with screen.work(f'correcting {options.program.name}'):
+    with screen.work(f'correcting {options.program.name}') as work:
         source = read_program(options.program, nominal.joint_names)
-        corrected, result = compensate_program(compensator, source.program)
+        corrected, result = compensate_program(
+            compensator, source.program, lambda share: work(share=share)
+        )
     if result.refusals:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
-        for refusal in result.refusals:
-            screen.warn(refusal.reason, source.places[refusal.sample])
+        for each in some([f'{source.places[r.sample]}: {r.reason}' for r in result.refusals]):
+            screen.warn(each, 'refused')
         return common.NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')

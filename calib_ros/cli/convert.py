@@ -62,7 +62,8 @@ def _import(options: argparse.Namespace, screen: Screen) -> int:
     for note in notes:
         screen.warn(note, 'note')
     write_file(options.out, text, overwrite=options.force)
-    screen.say(f'wrote {options.out}: {len(columns.lines)} rows of {text.partition(chr(10))[0]}')
+    header = text.partition('\n')[0].replace(',', ', ')
+    screen.say(f'wrote {options.out}: {len(columns.lines)} rows of {header}')
     return 0
 
 

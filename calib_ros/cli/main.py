@@ -22,7 +22,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
 from calib_ros.cli.command import GROUPS, TEXTS, load
-from calib_ros.cli.screen import WIDTH, Screen
+from calib_ros.cli.screen import Screen, help_width
 from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
 
 WAY = (
@@ -103,7 +103,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
         added = names.add_parser(
             name,
             add_help=False,
-            description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', WIDTH),
+            description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', help_width()),
             epilog=_foot(command.examples),
             formatter_class=_Help,
         )
@@ -120,7 +120,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
 def _foot(examples: Iterable[str]) -> str:
     lines = ['examples:']
     for each in examples:
-        parts = textwrap.wrap(f'calib_ros {each}', WIDTH - 8, break_on_hyphens=False)
+        parts = textwrap.wrap(f'calib_ros {each}', help_width() - 8, break_on_hyphens=False)
         lines.append('  ' + ' \\\n      '.join(parts))
     return '\n'.join(lines)
 
@@ -129,7 +129,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
     """Help in 80 columns that tells a default where there is one."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=26, width=WIDTH)
+        super().__init__(prog, max_help_position=26, width=help_width())
 
     def add_usage(
         self,
@@ -146,7 +146,8 @@ class _Help(argparse.RawDescriptionHelpFormatter):
                 words.append(f'[{name}]' if each.nargs == '?' else name)
             elif each.required:
                 words.append(f'{each.option_strings[-1]} {name}')
-        text = textwrap.fill(' '.join([*words, '[options]']), WIDTH, subsequent_indent='    ')
+        words.append('[options]')
+        text = textwrap.fill(' '.join(words), help_width(), subsequent_indent='    ')
         self._add_item(lambda: f'{text}\n\n', [])
 
     def _metavar(self, action: argparse.Action) -> str:
@@ -174,7 +175,7 @@ def _overview() -> str:
         for name, text in entries.items():
             head = f'  {name:12}'
             lines.append(
-                textwrap.fill(text, WIDTH, initial_indent=head, subsequent_indent=' ' * 14)
+                textwrap.fill(text, help_width(), initial_indent=head, subsequent_indent=' ' * 14)
             )
     lines += ['', 'The way:']
     for command, words in WAY:

@@ -185,6 +185,11 @@ def _width(stream: TextIO) -> int:
     return min(shutil.get_terminal_size((WIDTH, 24)).columns, 100) if stream.isatty() else WIDTH
 
 
+def help_width() -> int:
+    """Return how many columns a help takes: fewer than usual on a narrow terminal."""
+    return min(WIDTH, _width(sys.stdout))
+
+
 def _printable(text: str) -> str:
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
 

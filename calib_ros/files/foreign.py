@@ -237,7 +237,7 @@ class _Table:
         if not joint and 'q1' in names:
             assumed.append('joint values in rad (--joint-angle)')
         if assumed:
-            self.notes.append(f'units are not given, taken are {", ".join(assumed)}')
+            self.notes.append(f'no units are given: taking {", ".join(assumed)}')
         return length or 'm', angle or 'rad', joint or 'rad'
 
     def _factor(self, ours: str, units: tuple[str, str, str]) -> float:

@@ -19,7 +19,7 @@ Arrays inside are laid out (component, sample), as in `jacobian.py`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -123,14 +123,23 @@ class Follower:
         self._diagonal = np.diag_indices(len(unit))
 
     def solve(
-        self, joints: FloatArray, approach: FloatArray | None = None, bounded: bool = True
+        self,
+        joints: FloatArray,
+        approach: FloatArray | None = None,
+        bounded: bool = True,
+        heard: Callable[[float], None] | None = None,
     ) -> Solution:
-        """Return the changes for commands (N, n), within the limits of the joints if bounded."""
+        """Return the changes for commands (N, n), within the limits of the joints if bounded.
+
+        `heard` is called with the share that is done.
+        """
         parts = []
         for start in range(0, len(joints), BLOCK):
             rows = slice(start, start + BLOCK)
             came = None if approach is None else np.ascontiguousarray(approach[rows].T)
             parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
+            if heard is not None:
+                heard(min(1.0, rows.stop / len(joints)))
         names = [each.name for each in fields(Solution)]
         found = {name: [getattr(part, name) for part in parts] for name in names}
         iterations = max(found.pop('iterations'))

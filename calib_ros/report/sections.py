@@ -69,10 +69,13 @@ def accuracy_section(
     judged: Mapping[str, Comparison],
     with_outliers: ErrorFigures | None = None,
 ) -> Section:
-    """Return the table of accuracy: before and after of each comparison, by its prefix."""
+    """Return the table of accuracy: before and after of each comparison, by its prefix.
+
+    The first is what counts: it has intervals.
+    """
     columns = [
-        _column(f'{prefix}{name}', found, limits_of(which, when, INTERVAL))
-        for prefix, which in judged.items()
+        _column(f'{prefix}{name}', found, None if k else limits_of(which, when, INTERVAL))
+        for k, (prefix, which) in enumerate(judged.items())
         for when, (name, found) in enumerate(zip(('before', 'after'), which.figures, strict=True))
     ]
     if with_outliers is not None:

@@ -93,7 +93,7 @@ def test_messages_in_any_order_give_the_same(tmp_path, rng):
     assert first.account().notes == {}
     assert set(second.account().notes) == {
         'joints with a stamp older than the one before',
-        'poses with a stamp older than the one before',
+        'measurements with a stamp older than the one before',
     }
 
 
@@ -332,8 +332,9 @@ def test_stamps_going_backwards_lose_nothing_and_are_noted(tmp_path):
     events = standing([pose_stamped(ms * MS, (ms, 0, 0)) for ms in (305, 105, 405, 205)])
     session, _ = session_of(record(tmp_path / 'bag', events))
     assert session.problem().observations.positions[:, 0].tolist() == [105, 205, 305, 405]
-    assert session.account().notes == {'poses with a stamp older than the one before': 2}
-    assert 'note: 2 x poses with a stamp older than the one before' in str(session.account())
+    note = 'measurements with a stamp older than the one before'
+    assert session.account().notes == {note: 2}
+    assert f'note: 2 x {note}' in str(session.account())
 
 
 def test_poses_between_distant_joint_samples_are_counted(tmp_path):
