@@ -206,7 +206,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
         if parameter['std'] is not None:
             assert parameter['half_width_95'] > 1.95 * parameter['std']
     _, quiet = run(9, identified=identify)
-    assert 'share no errors' in noise_in_words(quiet)
+    assert 'share no error' in noise_in_words(quiet)
 
 
 @pytest.mark.parametrize('count', [2, 7, 8])
