@@ -58,7 +58,12 @@ OF_BAGS = (
     *SETTINGS['bags: what is read'],
     *SETTINGS['bags: how poses are taken'],
 )
-"""Settings by which samples are made of a bag."""
+"""Settings by which poses are made of a bag."""
+LAYOUT = (
+    *('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector'),
+    *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
+)
+"""Options of tables of others."""
 
 
 def add_each(parser: Group, kind: Callable[[str], Any], *rows: tuple[str, str, Any, str]) -> None:
@@ -172,9 +177,7 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
     """Return how to read a table of others, None where nothing says that it is one."""
-    names = [*('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector')]
-    names += ['inverse', 'shift', 'separator', 'decimal', 'sheet']
-    given = {name: getattr(options, name) for name in names}
+    given = {name: getattr(options, name) for name in LAYOUT}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])

@@ -297,7 +297,7 @@ def test_a_verification_has_its_verdict_first(solved):
     found = verify(Calibration.of(result), sets, 1e-3)
     poses = poses_to_verify(result.chain, sets, found.comparison)
     page = page_of(verification_report(result.chain, found, poses, Origin()))
-    assert page.text.index('Passed') < page.text.index('Accuracy before')
+    assert page.text.index('PASS') < page.text.index('Accuracy before')
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
 
@@ -370,7 +370,7 @@ def test_the_other_commands_write_their_pages(solved, tmp_path):
     verified, planned = tmp_path / 'verified', tmp_path / 'plan.csv'
     judged = ['--calibration', str(out), '--tolerance', '1', '--out', str(verified)]
     assert main(['verify', str(new), '--chain', 'ur5e', *judged]) == 0
-    assert 'Passed' in Page((verified / 'report.html').read_text()).text
+    assert 'PASS' in Page((verified / 'report.html').read_text()).text
     assert (verified / 'residuals.csv').read_text().count('\n') == 13
     arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
     assert main(arguments) == 0
