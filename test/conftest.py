@@ -27,6 +27,22 @@ def rng():
     return np.random.default_rng(20240607)
 
 
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Return a function that runs a command in `tmp_path`: status, output and errors."""
+    from calib_ros.cli.main import main
+
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        capsys.readouterr()
+        status = main([*map(str, arguments)])
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return run
+
+
 @pytest.fixture(autouse=True)
 def no_signs_of_life(monkeypatch):
     """Keep lines that tell how long a command takes, on a busy machine, from its output."""

@@ -37,6 +37,12 @@ def drawn(board):
     return page
 
 
+@cache
+def noise_of(shape):
+    """Return standard normal noise of an image (height, width)."""
+    return np.random.default_rng(0).normal(size=shape)
+
+
 def rendered(board, pose, lens, size, blur=0.7, noise=2.0, finer=4):
     """Return an image (height, width) of a board at a pose (4, 4) in a camera without distortion.
 
@@ -44,18 +50,26 @@ def rendered(board, pose, lens, size, blur=0.7, noise=2.0, finer=4):
     """
     camera = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
     matrix = camera @ np.column_stack([pose[:3, :2], pose[:3, 3]])
-    middle = (finer - 1) / 2
-    larger = np.array([[finer, 0.0, middle], [0.0, finer, middle], [0.0, 0.0, 1.0]])
-    page = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, SCALE]]) / SCALE
-    large = cv2.warpPerspective(
-        drawn(board),
-        larger @ matrix @ page,
-        (finer * size[0], finer * size[1]),
-        flags=cv2.INTER_AREA,
-        borderValue=210,
-    )
-    image = cv2.resize(large, size, interpolation=cv2.INTER_AREA)
+    outline = np.array([(x, y, 1.0) for x in (0.0, board.size[0]) for y in (0.0, board.size[1])])
+    box = outline @ matrix.T
+    box = box[:, :2] / box[:, 2:]
+    first = np.clip(np.floor(box.min(axis=0)) - 2, 0, size).astype(int)
+    last = np.clip(np.ceil(box.max(axis=0)) + 3, 0, size).astype(int)
+    image = np.full(size[::-1], 210, dtype=np.uint8)
+    if (last > first).all():
+        middle = (finer - 1) / 2 - finer * first
+        larger = np.array([[finer, 0.0, middle[0]], [0.0, finer, middle[1]], [0.0, 0.0, 1.0]])
+        page = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, SCALE]]) / SCALE
+        large = cv2.warpPerspective(
+            drawn(board),
+            larger @ matrix @ page,
+            (finer * (last - first)).tolist(),
+            flags=cv2.INTER_AREA,
+            borderValue=210,
+        )
+        small = cv2.resize(large, (last - first).tolist(), interpolation=cv2.INTER_AREA)
+        image[first[1] : last[1], first[0] : last[0]] = small
     image = cv2.GaussianBlur(image, (0, 0), blur).astype(float)
-    image += np.random.default_rng(0).normal(size=image.shape) * noise
+    image += noise_of(image.shape) * noise
     seen = np.column_stack([board.corners[:, :2], np.ones(len(board.corners))]) @ matrix.T
     return np.clip(image, 0, 255).astype(np.uint8), seen[:, :2] / seen[:, 2:]

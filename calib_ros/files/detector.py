@@ -71,6 +71,11 @@ def _dictionary(name: str) -> Any:
     return aruco.getPredefinedDictionary(getattr(aruco, name))
 
 
+def _halvings(image: Image) -> int:
+    """Return how often an image is halved at most."""
+    return int(np.log2(max(*image.shape[:2], COARSE) / COARSE))
+
+
 def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
     """Return which cells (B, B) of each marker are black, its border included."""
     aruco, dictionary = opencv().aruco, _dictionary(board.dictionary)
@@ -120,12 +125,14 @@ class Detector:
         if width > BLURRED:
             reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
             return Refusal('blurred', reason)
-        found = self._judged(image, *self._sought(image))
+        corners, ids = self._sought(image)
+        found = self._judged(image, corners, ids)
         if not isinstance(found, Refusal):
             return found
-        corners, ids = self._markers(image, self._dictionary)
+        coarse = image if len(ids) else self._halved(image, _halvings(image))
+        corners, ids = self._markers(coarse, self._dictionary)
         if not len(ids):
-            reason = f'it shows no marker of {self._board.dictionary}{self._others(image)}'
+            reason = f'it shows no marker of {self._board.dictionary}{self._others(coarse)}'
             return Refusal('without the board', reason)
         own = ids < self._count
         if (~own).sum() > len(ids) // 2:
@@ -134,31 +141,34 @@ class Detector:
                 f'it shows another board: marker {int(ids[~own][0])}, and this board has 0 to '
                 f'{self._count - 1}',
             )
-        return self._judged(image, corners[own], ids[own])
+        return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:
         """Return the markers of the board, by as few pixels and candidates as it takes."""
         size = np.array(image.shape[1::-1])
-        halvings = int(np.log2(max(*size / COARSE, 1.0))) if self._board.type == 'charuco' else 0
+        halvings = _halvings(image) if self._board.type == 'charuco' else 0
         steps = [(k, range(13, 14)) for k in range(halvings, -1, -1)]
         corners, ids = np.zeros((0, 4, 2)), np.zeros(0, np.intp)
         missing, first, last = np.arange(self._count), np.zeros(2, np.intp), size
         for k, windows in (*steps, (0, range(3, 24, 20))):
-            part = image[first[1] : last[1], first[0] : last[0]]
-            smaller = tuple(np.maximum((last - first) // 2**k, 1).tolist())
-            if k:
-                part = self._cv2.resize(part, smaller, interpolation=self._cv2.INTER_AREA)
+            part = self._halved(image[first[1] : last[1], first[0] : last[0]], k)
             among = _dictionary(self._board.dictionary)
             among.bytesList = among.bytesList[missing]
             share = max(last - first) / max(size)
             more, number = self._markers(part, among, windows, share)
-            more = (more + 0.5) * ((last - first) / smaller) - 0.5 + first
+            more = (more + 0.5) * ((last - first) / part.shape[1::-1]) - 0.5 + first
             corners = np.concatenate([corners, more])
             ids = np.concatenate([ids, missing[number]])
             missing, first, last = self._hidden(corners, ids, size)
             if not len(missing):
                 break
         return corners, ids
+
+    def _halved(self, image: Image, times: int) -> Image:
+        size = tuple(max(side // 2**times, 1) for side in image.shape[1::-1])
+        return (
+            self._cv2.resize(image, size, interpolation=self._cv2.INTER_AREA) if times else image
+        )
 
     def _hidden(
         self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
@@ -283,12 +293,20 @@ class Detector:
         return np.array(corners, dtype=float).reshape(-1, 4, 2), numbers
 
     def _others(self, image: Image) -> str:
-        """Return in words which other dictionary's markers an image shows."""
-        for name in dictionaries():
-            if name != self._board.dictionary and 'ARUCO_MIP' not in name:
-                found = len(self._markers(image, _dictionary(name))[1])
-                if found >= FEWEST:
-                    return f', but {found} of {name}: is it the right board file?'
+        """Return in words which other dictionary's markers an image shows.
+
+        Boards number them from 0, and dictionaries of one kind have the first ones in common.
+        """
+        names = sorted(dictionaries(), key=len, reverse=True)
+        known = {name: _dictionary(name) for name in names if 'ARUCO_MIP' not in name}
+        few = min(len(each.bytesList) for each in known.values())
+        kinds = {each.bytesList[:few].tobytes(): name for name, each in known.items()}
+        kinds.pop(self._dictionary.bytesList[:few].tobytes(), None)
+        for name in sorted(kinds.values()):
+            known[name].bytesList = known[name].bytesList[:few]
+            found = len(self._markers(image, known[name], range(13, 14))[1])
+            if found >= FEWEST:
+                return f', but {found} of {name}: is it the right board file?'
         return ': is the board in sight, and well lit?'
 
 

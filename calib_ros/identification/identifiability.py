@@ -143,8 +143,8 @@ def structurally_independent(
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
     """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first, of planes the height in the middle. Those few that do not arrive,
-    stretched, are left out.
+    It is that of the first, of planes the height in the middle. Those that have not arrived in 20
+    steps, stretched, are left out.
     """
     places = chain.forward(joints, base=kind.base, tool=kind.tool)
     place = places[0, :3, 3].copy()
@@ -152,7 +152,7 @@ def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, 
         place[:] = 0.0, 0.0, np.median(places[:, 2, 3])
     places[:, :3, 3] = place
     part = slice(2, 3) if kind.plane else slice(3)
-    found = solve(chain, places, joints, kind.base, kind.tool, part)
+    found = solve(chain, places, joints, kind.base, kind.tool, part, 20)
     return found.joints[found.converged], place
 
 

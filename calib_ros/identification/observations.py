@@ -157,7 +157,7 @@ class Observations(Shown):
         The joint values (N, n) are those of the image, the `points` (N, 3) [m] those of the board
         that are seen at `pixels` (N, 2).
         """
-        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
+        plain = cls.from_arrays(joints, np.broadcast_to(np.zeros(3), (len(joints), 3)))
         stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
         return replace(
             plain,
@@ -178,7 +178,11 @@ class Observations(Shown):
         """Return the pairs chosen by a mask, by indices or a slice; they have been checked."""
         chosen = object.__new__(Observations)
         vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
-        vars(chosen).update({name: array[mask] for name, array in self._arrays().items()})
+        count = len(self.stamps_ns[mask])
+        for name, array in self._arrays().items():
+            alike = array.strides[0] == 0  # what all pairs share stays one row
+            few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
+            vars(chosen)[name] = few
         if 'configurations' in vars(self):  # takes longer to find than all the rest
             _, vars(chosen)['configurations'] = np.unique(
                 self.configurations[mask], return_inverse=True

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.resection import products_of
+from calib_ros.identification.resection import image_products
 from calib_ros.identification.samples import BLOCK, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -73,14 +73,15 @@ class PixelSamples(Samples):
     """
 
     def __init__(self, observations: Observations, sigma_pixel: float, *_: float) -> None:
-        super().__init__(observations, sigma_pixel, sigma_pixel)
         assert observations.pixels is not None
         assert observations.points is not None
+        begins = np.flatnonzero(np.diff(observations.images, prepend=-1))
+        super().__init__(observations.select(begins), sigma_pixel, sigma_pixel)
+        self.observations, self.count = observations, len(observations)
         self.rows = 2 * self.count
         self._pixels = np.ascontiguousarray(observations.pixels.T)
         self._points = np.ascontiguousarray(observations.points.T)
-        self._images = observations.images
-        self._begins = np.flatnonzero(np.diff(self._images, prepend=-1))
+        self._images, self._begins = observations.images, begins
         self._shifts: FloatArray | None = None
 
     @property
@@ -98,20 +99,24 @@ class PixelSamples(Samples):
         """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
         size = len(names)
         found = np.zeros((count, 2, size + 1, size + 1))
+        these: slice | NDArray[np.bool_] = slice(None)
         for block in self._linearised(chain, names):
-            inner = products_of(block.columns, block.begins) / self.sigmas[0] ** 2
-            outer = (inner[:, :, :6] @ block.twist.transpose(2, 1, 0)).transpose(2, 1, 0)
+            inner = image_products(block.columns, block.begins, 6)
+            twist = np.ascontiguousarray(block.twist.T)
+            outer = inner[:, :, :6] @ twist
             own = np.array([*block.lens, size])
             for k, (matrix, _) in enumerate(found):
-                here = slice(None)
                 if folds is not None:
-                    here = folds[block.part][block.begins] == k
-                twist = block.twist[:, :, here].reshape(size, -1)
-                matrix[:-1, :-1] += twist @ outer[:, :6, here].reshape(size, -1).T
-                mixed = outer[:, 6:, here].sum(axis=2)
+                    these = folds[block.part][block.begins] == k
+                here = these if folds is None else folds[block.part] == k
+                turned = twist[these].reshape(-1, size).T
+                mixed = turned @ inner[these, :, 6:].reshape(-1, len(own))
+                alone = block.columns[6:, :, here].reshape(len(own), -1)
+                matrix[:-1, :-1] += turned @ outer[these].reshape(-1, size)
                 matrix[:-1, own] += mixed
                 matrix[own, :-1] += mixed.T
-                matrix[own[:, np.newaxis], own] += inner[here, 6:, 6:].sum(axis=0)
+                matrix[own[:, np.newaxis], own] += alone @ alone.T
+        found /= self.sigmas[0] ** 2
         order = [*block.model.order, size]
         return found[:, :, np.array(order)[:, np.newaxis], order]
 
@@ -167,40 +172,59 @@ class PixelSamples(Samples):
         yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
     def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Images]:
-        """Yield blocks of whole images with about four BLOCKs of points."""
+        """Yield blocks of images that hold about four BLOCKs of points.
+
+        The arm is linearised for all images of about a BLOCK at once.
+        """
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
         lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
         own = [name for name in parameters_of(seen_by.camera, LENS_KINDS) if name in names]
         kinds = [name.kind for name in own]
         row = dict(zip(names, model.order.tolist(), strict=True))
-        joints, velocity = self.moving(chain)
-        ends = np.append(self._begins, self.count)
-        first = 0
-        while first < len(self._begins):
-            last = max(int(np.searchsorted(ends, ends[first] + 4 * BLOCK, 'right')) - 1, first + 1)
-            images, part = self._begins[first:last], slice(int(ends[first]), int(ends[last]))
-            approach = None if self.approach is None else self.approach[:, images]
-            moving = None if velocity is None else velocity[:, images]
-            axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
-            begins = images - part.start
-            owner = self._images[part] - self._images[part.start]
-            seen = view(lens, axes, origin, owner, self._points[:, part], seen_by.on_flange)
-            columns = np.empty((7 + len(kinds), *seen.pixels.shape))
-            seen.by_twist(columns[:6])
-            lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
-            columns[-1] = self._pixels[:, part] - seen.pixels
-            if self.weights is not None:
-                columns *= self.weights[part]
-            twist = np.zeros((len(names), 6, len(images)))
-            twist[:, :3] = shift[:-1]
-            twist[: model.rotations, 3:] = turn[:-1]
-            if seen_by.on_flange:  # along the camera's axes, as it moves the other way
-                flat = twist.reshape(len(names), 2, 3, -1)
-                twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
-            rows = [row[name] for name in own]
-            yield _Images(part, begins, owner, columns, twist, rows, seen, model)
-            first = last
+        rows = [row[name] for name in own]
+        ends, total = np.append(self._begins, self.count), len(self._begins)
+        few = max(4 * BLOCK * total // max(self.count, 1), 1)
+        for start in range(0, total, few * max(BLOCK // few, 1)):
+            end = min(start + few * max(BLOCK // few, 1), total)
+            axes, origin, twist = self._arm(model, slice(start, end))
+            for first in range(start, end, few):
+                last = min(first + few, end)
+                part, images = (
+                    slice(*ends[[first, last]].tolist()),
+                    slice(first - start, last - start),
+                )
+                owner = self._images[part] - first
+                seen = view(
+                    lens,
+                    axes[..., images],
+                    origin[:, images],
+                    owner,
+                    self._points[:, part],
+                    seen_by.on_flange,
+                )
+                columns = np.empty((7 + len(own), *seen.pixels.shape))
+                seen.by_twist(columns[:6])
+                lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
+                columns[-1] = self._pixels[:, part] - seen.pixels
+                if self.weights is not None:
+                    columns *= self.weights[part]
+                begins = self._begins[first:last] - part.start
+                yield _Images(part, begins, owner, columns, twist[..., images], rows, seen, model)
+
+    def _arm(self, model: ErrorModel, images: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return axes (3, 3, M) and origin (3, M) of the chain's end, and twists (P, 6, M)."""
+        joints, velocity = self.moving(model.chain)
+        approach = None if self.approach is None else self.approach[:, images]
+        moving = None if velocity is None else velocity[:, images]
+        axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
+        twist = np.zeros((len(shift) - 1, 6, origin.shape[1]))
+        twist[:, :3] = shift[:-1]
+        twist[: model.rotations, 3:] = turn[:-1]
+        if self.observations.on_flange:  # along the camera's axes, as it moves the other way
+            flat = twist.reshape(len(twist), 2, 3, -1)
+            twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
+        return axes, origin, twist
 
 
 def samples_of(

@@ -72,7 +72,7 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
     rows = np.empty((6, 2, len(index)))
     _seen(lens, poses, index, observations.points.T).by_twist(rows)
     begins = np.flatnonzero(np.diff(index, prepend=-1))
-    return np.asarray(np.linalg.inv(products_of(rows, begins)))
+    return np.asarray(np.linalg.inv(image_products(rows, begins)))
 
 
 def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatArray) -> View:
@@ -81,8 +81,10 @@ def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatA
     return view(lens, axes, origin, index, points, False)
 
 
-def products_of(rows: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
-    """Return (M, S, S) the products of rows (S, 2, C) with each other, image by image."""
+def image_products(
+    rows: FloatArray, begins: NDArray[np.intp], first: int | None = None
+) -> FloatArray:
+    """Return (M, F, S) the products of the first of rows (S, 2, C) with all, image by image."""
     size, _, count = rows.shape
     points = np.diff(begins, append=count)
     most = int(points.max())
@@ -92,7 +94,7 @@ def products_of(rows: FloatArray, begins: NDArray[np.intp]) -> FloatArray:
         full = np.zeros((size, 2, len(points), most))
         full[:, :, np.arange(most) < points[:, np.newaxis]] = rows
     parts = full.transpose(1, 2, 0, 3)
-    return np.asarray((parts @ parts.swapaxes(2, 3)).sum(axis=0))
+    return np.asarray((parts[:, :, :first] @ parts.swapaxes(2, 3)).sum(axis=0))
 
 
 def resect(observations: Observations, lens: Lens) -> BoardPoses:
@@ -154,7 +156,7 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
     rows = np.zeros((9, 2, len(plane)))
     rows[:3, 0] = rows[3:6, 1] = point
     rows[6:] = -near.T * point[:, np.newaxis]
-    _, vectors = np.linalg.eigh(products_of(rows, begins))
+    _, vectors = np.linalg.eigh(image_products(rows, begins))
     matrix = vectors[:, :, 0].reshape(-1, 3, 3)
     back = np.zeros((len(begins), 3, 3))
     back[:, 0, 0] = back[:, 1, 1] = size[:, 0]
@@ -176,32 +178,33 @@ def _refined(
 ) -> BoardPoses:
     """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2).
 
-    All images at once, each with its own damping, where `leastsquares` solves one problem.
+    Images that still move at once, each with its own damping; `leastsquares` solves one problem.
     """
-    begins = np.flatnonzero(np.diff(index, prepend=-1))
-    count = np.bincount(index)
-    best, least = poses.copy(), np.full(len(poses), np.inf)
-    damping = np.full(len(poses), ROUNDING)
-    step_from = (np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 6)))
-    rows = np.empty((7, 2, len(index)))
+    count, few = np.bincount(index), np.arange(len(poses))
+    poses, best, least = poses.copy(), poses.copy(), np.full(len(poses), np.inf)
+    damping, normal = np.full(len(poses), ROUNDING), np.zeros((len(poses), 7, 7))
     for _ in range(ROUNDS):
-        seen = _seen(lens, poses, index, points)
+        these = np.isin(index, few)
+        seen = _seen(lens, poses[few], np.searchsorted(few, index[these]), points[:, these])
+        rows = np.empty((7, *seen.pixels.shape))
         seen.by_twist(rows[:6])
-        rows[6] = pixels.T - seen.pixels
-        normal = products_of(rows, begins)
-        better = normal[:, 6, 6] < least
-        settled = least - normal[:, 6, 6] < HALF_THE_DIGITS * least
-        least = np.where(better, normal[:, 6, 6], least)
-        best[better] = poses[better]
-        step_from[0][better], step_from[1][better] = normal[better, :6, :6], normal[better, :6, 6]
-        if settled.all():
+        rows[6] = pixels[these].T - seen.pixels
+        found = image_products(rows, np.cumsum(count[few]) - count[few])
+        fall = least[few] - found[:, 6, 6]
+        better, moving = fall > 0.0, ~(np.abs(fall) < HALF_THE_DIGITS * least[few])
+        won = few[better]
+        best[won], least[won], normal[won] = poses[won], found[better, 6, 6], found[better]
+        less = np.maximum(0.1 * damping[few], ROUNDING)
+        damping[few] = np.where(better, less, 100.0 * damping[few])
+        few = few[moving]
+        if not len(few):
             break
-        damping = np.where(better, np.maximum(0.1 * damping, ROUNDING), 100.0 * damping)
-        scale = np.sqrt(np.maximum(np.einsum('mpp->mp', step_from[0]), 1e-300))
-        scaled = step_from[0] / (scale[:, :, np.newaxis] * scale[:, np.newaxis])
-        scaled += damping[:, np.newaxis, np.newaxis] * np.eye(6)
-        step = np.linalg.solve(scaled, (step_from[1] / scale)[..., np.newaxis])[..., 0] / scale
-        poses = best.copy()
-        poses[:, :3, 3] += step[:, :3]
-        poses[:, :3, :3] = se3.exp_rotation(step[:, 3:]) @ poses[:, :3, :3]
+        matrix, gradient = normal[few, :6, :6], normal[few, :6, 6]
+        scale = np.sqrt(np.maximum(np.einsum('mpp->mp', matrix), 1e-300))
+        scaled = matrix / (scale[:, :, np.newaxis] * scale[:, np.newaxis])
+        scaled += damping[few, np.newaxis, np.newaxis] * np.eye(6)
+        step = np.linalg.solve(scaled, (gradient / scale)[..., np.newaxis])[..., 0] / scale
+        poses[few] = best[few]
+        poses[few, :3, 3] += step[:, :3]
+        poses[few, :3, :3] = se3.exp_rotation(step[:, 3:]) @ best[few, :3, :3]
     return BoardPoses(best, np.sqrt(least / count))

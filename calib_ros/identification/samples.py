@@ -14,7 +14,8 @@ have a module of their own (`pixels.py`).
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -29,6 +30,8 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 
 Block: TypeAlias = tuple[slice | NDArray[np.intp], FloatArray, FloatArray, ErrorModel]
+Both: TypeAlias = tuple[FloatArray, FloatArray]
+"""Residuals by position and orientation, or in the image and at the board."""
 
 
 class Samples:
@@ -40,12 +43,17 @@ class Samples:
     sigma_position, sigma_orientation : float
         Standard deviations [m, rad] of measurements that bring no covariance of their own.
 
+    Attributes
+    ----------
+    moments : Observations
+        One of each joint values that are linearised: the observations, or one of each image.
+
     """
 
     def __init__(
         self, observations: Observations, sigma_position: float, sigma_orientation: float
     ) -> None:
-        self.observations = observations
+        self.observations = self.moments = observations
         self.count = len(observations)
         self.joints = np.ascontiguousarray(observations.joints.T)
         self.positions = np.ascontiguousarray(observations.positions.T)
@@ -168,9 +176,9 @@ class Samples:
     def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
         """Return joint values (n, N) at the device's delay, and velocities where it has one."""
         delay = chain.frame(self.observations.base).delay
-        if self.observations.velocity is None or delay is None:
+        if self.moments.velocity is None or delay is None:
             return self.joints, None
-        then = self.observations.earlier(delay)
+        then = self.moments.earlier(delay)
         velocity = np.ascontiguousarray(np.asarray(then.velocity).T)
         return np.ascontiguousarray(then.joints.T), velocity
 
@@ -247,20 +255,28 @@ class Samples:
             yield part, slice(None)
 
 
-def residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
-    """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
+def _kept(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:
+    """Return a function of residuals that keeps in observations those of the last chain."""
 
-    Measured distances give (N, 1). Rotation vectors are NaN where none was measured. Observations
-    keep those of the last chain, which several ask for.
-    """
-    known = vars(observations).get('_residuals')
-    if known is None or known[0] is not chain:
-        known = vars(observations)['_residuals'] = (chain, _residual_arrays(chain, observations))
-    found: tuple[FloatArray, FloatArray] = known[1]
+    @wraps(find)
+    def found(chain: Chain, observations: Observations) -> Both:
+        known = vars(observations).get('_residuals')
+        if known is None or known[0] is not chain:
+            known = vars(observations)['_residuals'] = (chain, find(chain, observations))
+            for each in known[1]:
+                each.setflags(write=False)
+        arrays: Both = known[1]
+        return arrays
+
     return found
 
 
-def _residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
+@_kept
+def residual_arrays(chain: Chain, observations: Observations) -> Both:
+    """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
+
+    Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
+    """
     then = observations.earlier(chain.frame(observations.base).delay)
     distances = observations.distances
     position = np.empty((len(then), 3 if distances is None else 1))
@@ -282,12 +298,11 @@ def _residual_arrays(chain: Chain, observations: Observations) -> tuple[FloatArr
             measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
             orientation[part] = orientation_error(measured, axes).T
     orientation[~oriented] = np.nan
-    for each in (position, orientation):
-        each.setflags(write=False)
     return position, orientation
 
 
-def seen_residuals(chain: Chain, observations: Observations) -> tuple[FloatArray, FloatArray]:
+@_kept
+def seen_residuals(chain: Chain, observations: Observations) -> Both:
     """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m]."""
     camera = observations.camera
     lens = require_lens(chain.frame(camera).lens, camera)

@@ -147,9 +147,9 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
         middle = white * fit.normal.parts[part]
         by_time = []
         for (kind, length), size in zip(kernels[part], rest, strict=True):
-            if size > 0.0 and kind == 'near':
+            if size and kind == 'near':  # sizes are never negative
                 middle = middle + size * _near(even, part, length, share)
-            elif size > 0.0:
+            elif size:
                 by_time.append((length, size))
         if by_time:
             middle = middle + _successive(fit.chain, names, system, part, by_time)

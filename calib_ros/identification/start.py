@@ -119,7 +119,8 @@ def _start_one(
         return robust_fit(start, names, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     best, best_error = chain, np.inf
-    for candidates in (_closed_form(chain, arm, subset), _search()):
+    cube = Rotation.create_group('O').as_matrix()
+    for candidates in (_closed_form(chain, arm, subset), cube):
         for rotation in candidates:
             start = _complete(chain, arm, subset, rotation)
             if not determined:
@@ -256,11 +257,6 @@ def _closed_form(
         columns = np.concatenate([arm[:, :3, :3].reshape(-1, 9), arm[:, :3, 3]], axis=1)
         solution = np.linalg.lstsq(columns - columns.mean(axis=0), positions, rcond=1e-9)[0]
         yield se3.nearest_rotation(solution[9:].T)
-
-
-def _search() -> Iterator[FloatArray]:
-    """Yield the 24 rotations of a cube."""
-    yield from Rotation.create_group('O').as_matrix()
 
 
 def _complete(

@@ -60,6 +60,7 @@ def solve(
     base: str = 'base',
     tool: str = 'tool',
     part: slice = slice(6),
+    iterations: int = ROUNDS,
 ) -> Inverse:
     """Return the joint values near a start that bring the target to wanted poses.
 
@@ -78,6 +79,8 @@ def solve(
         Frames at the ends of the chain.
     part : slice
         What counts of the position and the rotation in world axes, six in all.
+    iterations : int
+        Steps at most.
 
     """
     aim = Aim(chain, base, tool)
@@ -93,7 +96,7 @@ def solve(
     least, first, most = DAMPING
     damping = np.full(len(poses), first)
     diagonal = np.diag_indices(len(q))
-    for _ in range(ROUNDS):
+    for _ in range(iterations):
         (active,) = np.nonzero((size > SAME) & (damping < most))
         if not active.size:
             break

@@ -29,7 +29,7 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.errors import CalibrationError
-from calib_ros.identification.configurations import configurations
+from calib_ros.identification.configurations import configurations, distinct
 from calib_ros.identification.fitting import SOME
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import (
@@ -122,7 +122,8 @@ class LiveEstimate:
         if self._outgrown(fresh) or any(not self._knows(sample) for sample in fresh):
             fitted = [sample for sample in samples if not sample.validation]
             first = _spread(fitted)
-            if _distinct(first) < START or not self._begin(first):
+            joints = np.array([sample.joints for sample in first])
+            if distinct(configurations(joints)) < START or not self._begin(first):
                 return None
             chosen = set(first)
             self._begun = len(fitted)
@@ -324,13 +325,6 @@ def _spread(samples: Sequence[Sample]) -> list[Sample]:
         count = min(len(members), 1 + SOME // len(groups))
         chosen |= {members[k] for k in np.linspace(0, len(members) - 1, count).astype(int)}
     return [samples[k] for k in sorted(chosen)]
-
-
-def _distinct(samples: Sequence[Sample]) -> int:
-    """Return in how many configurations samples were taken."""
-    if not samples:
-        return 0
-    return int(configurations(np.array([sample.joints for sample in samples])).max()) + 1
 
 
 def _wide(name: str) -> float:

@@ -11,7 +11,6 @@ from designs import arm, design_of, some
 from calib_ros.apply import simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.choice import choose
-from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.waypoints import joints_csv, read_joints
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
@@ -57,20 +56,8 @@ def test_a_region_out_of_reach_is_refused(rng):
         Visibility(axis=(0.0, 0.0, 0.0))
 
 
-@pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        status = main(['plan', *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return run
-
-
 def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
-    status, out, err = run('--chain', 'ur10e', '--poses', 25, '--out', 'plan.csv')
+    status, out, err = run('plan', '--chain', 'ur10e', '--poses', 25, '--out', 'plan.csv')
     assert (status, err) == (0, '')
     q = read_joints(tmp_path / 'plan.csv', load_chain('ur10e'))
     assert q.shape == (25, 6)
@@ -84,9 +71,9 @@ def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     assert 'the tool is unknown' in out
     before = (tmp_path / 'plan.csv').read_bytes()
     again = ('--chain', 'ur10e', '--seed', 1, '--draw', 100, '--out', 'plan.csv')
-    assert run(*again)[0] == 1
+    assert run('plan', *again)[0] == 1
     assert (tmp_path / 'plan.csv').read_bytes() == before
-    assert run(*again, '--force')[0] == 0
+    assert run('plan', *again, '--force')[0] == 0
     assert (tmp_path / 'plan.csv').read_bytes() != before
 
 
@@ -98,13 +85,13 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
         (tmp_path / f'{name}.csv').write_text(joints_csv(values))
     common = ('--chain', 'chain.yaml', '--candidates', 'q.csv', '--poses', 12, '--force')
     common += ('--task', 'task.csv', '--measured', 'position', '--out', 'plan.csv')
-    _, alone, _ = run(*common)
+    _, alone, _ = run('plan', *common)
     found = read_joints(tmp_path / 'plan.csv', chain)
     nearest = np.abs(found[:, None] - q).max(axis=2).min(axis=1)
     assert nearest.max() < 1e-8
     expected = choose(design_of(chain, oriented=False), q, 12)
     assert {tuple(row) for row in found.round(6)} == {tuple(row) for row in q[expected].round(6)}
-    _, after, _ = run(*common, '--taken', 'taken.csv', '--criterion', 'task')
+    _, after, _ = run('plan', *common, '--taken', 'taken.csv', '--criterion', 'task')
 
     def last(text):
         return float(
@@ -116,17 +103,19 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
 
 
 def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
-    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 200)
+    _, out, _ = run(
+        'plan', '--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 200
+    )
     count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
     assert f'0.1 mm: {count} poses' in out
     assert 18 <= count <= 26
-    _, out, _ = run('--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 200)
+    _, out, _ = run('plan', '--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 200)
     assert f'0.1 mm: {count} poses' in out
     assert out.splitlines()[-5].split()[0] == '10'
 
 
 def test_plan_with_too_few_poses_says_so(run):
-    _, out, _ = run('--chain', 'ur10e', '--poses', 3)
+    _, out, _ = run('plan', '--chain', 'ur10e', '--poses', 3)
     assert 'too few poses to determine all parameters' in out
 
 
@@ -147,7 +136,7 @@ def test_plan_with_too_few_poses_says_so(run):
     ],
 )
 def test_plan_refuses_what_makes_no_sense(run, arguments, text):
-    status, out, err = run('--chain', 'ur10e', *arguments)
+    status, out, err = run('plan', '--chain', 'ur10e', *arguments)
     assert (status, out) == (1, '')
     assert text in err
 
@@ -155,7 +144,7 @@ def test_plan_refuses_what_makes_no_sense(run, arguments, text):
 def test_plan_from_candidates_that_nothing_sees(run, tmp_path):
     (tmp_path / 'q.csv').write_text(joints_csv(some(arm(), 10)))
     arguments = ('--candidates', 'q.csv', '--box', 5, 5, 5, 6, 6, 6)
-    status, _, err = run('--chain', 'ur10e', *arguments)
+    status, _, err = run('plan', '--chain', 'ur10e', *arguments)
     assert status == 1
     assert 'measured at no pose of q.csv' in err
 
@@ -163,7 +152,7 @@ def test_plan_from_candidates_that_nothing_sees(run, tmp_path):
 @pytest.mark.parametrize('option', ['--task', '--taken'])
 def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
     (tmp_path / 'q.csv').write_text('q1,q2,q3,q4,q5,q6\n0,0,180,0,0,0\n')
-    status, _, err = run('--chain', 'ur10e', option, 'q.csv')
+    status, _, err = run('plan', '--chain', 'ur10e', option, 'q.csv')
     assert status == 1
     assert 'q3 180 is beyond the limits of elbow_joint' in err
 
@@ -183,6 +172,6 @@ def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
 )
 def test_files_of_poses_that_cannot_be_read(run, tmp_path, content, text):
     (tmp_path / 'q.csv').write_text(content)
-    status, _, err = run('--chain', 'ur10e', '--candidates', 'q.csv')
+    status, _, err = run('plan', '--chain', 'ur10e', '--candidates', 'q.csv')
     assert status == 1
     assert text in err

@@ -9,7 +9,6 @@ from surveyed import TASK, UR, calibrated, identified
 
 from calib_ros.apply import simulation, workspace
 from calib_ros.apply.workspace import regions, survey
-from calib_ros.cli.main import main
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.files.waypoints import csv_of, read_joints, read_poses
@@ -157,18 +156,6 @@ def test_a_map_holds_the_rms_of_each_cell(rng):
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        status = main(['workspace', *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return run
-
-
-@pytest.fixture
 def folder(tmp_path):
     write_result(tmp_path / 'result', identified()[1])
     return 'result'
@@ -176,7 +163,7 @@ def folder(tmp_path):
 
 def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     arguments = (folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500)
-    status, out, err = run(*arguments)
+    status, out, err = run('workspace', *arguments)
     assert (status, err) == (0, '')
     found = {path.name for path in (tmp_path / 'map').iterdir()}
     assert found == set(WORKSPACE_FILES)
@@ -190,7 +177,7 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     rms = 1e3 * np.sqrt(np.mean([float(row['error']) ** 2 for row in rows]))
     assert f'| removed by the calibration | {rms:.4f} |' in text
     assert f'{rms:.4f}' in out
-    assert run(*arguments)[0] == 1
+    assert run('workspace', *arguments)[0] == 1
 
 
 def test_workspace_places_a_task(run, folder, tmp_path):
@@ -199,6 +186,7 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     (tmp_path / 'task.csv').write_text(csv_of(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values))
     np.testing.assert_allclose(read_poses(tmp_path / 'task.csv'), task, atol=1e-8)
     status, out, err = run(
+        'workspace',
         *(folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500, '--task', 'task.csv'),
         *('--model', 'nominal', '--aim', 'worst', '--cells', 4, '--region', 0, -1, -0.5, 1, 1, 1),
     )
@@ -229,7 +217,7 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     ],
 )
 def test_workspace_refuses_what_makes_no_sense(run, folder, tmp_path, arguments, text):
-    status, out, err = run(folder, '--chain', 'ur10e', '--out', 'map', *arguments)
+    status, out, err = run('workspace', folder, '--chain', 'ur10e', '--out', 'map', *arguments)
     assert (status, out) == (1, '')
     assert text in err
     assert not (tmp_path / 'map').exists()

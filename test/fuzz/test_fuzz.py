@@ -16,7 +16,7 @@ def test_readers_keep_their_contract_on_the_corpus(name):
 
 @pytest.mark.parametrize('name', TARGETS)
 def test_readers_keep_their_contract_on_variants(name):
-    @settings(max_examples=60, suppress_health_check=list(HealthCheck))
+    @settings(suppress_health_check=list(HealthCheck))
     @given(variants(corpus(name)))
     def keeps(data):
         keep_contract(name, data)

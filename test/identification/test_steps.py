@@ -78,11 +78,13 @@ def session(seed, design='random', oriented=True, errors=1.0, unmodelled=False, 
     return true, measure(true, q, rng, *NOISE, oriented=oriented)
 
 
-@pytest.mark.parametrize('unmodelled', [False, True])
+@pytest.mark.parametrize(
+    ('design', 'unmodelled'),
+    [('random', True), ('path', True), ('sweep', False), ('sweep', True)],
+)
 @pytest.mark.parametrize(
     ('what', 'size'), [('tool', 1e-3), ('base', 1e-3), ('joint', 2e-3), ('joint', 9e-3)]
 )
-@pytest.mark.parametrize('design', DESIGNS)
 def test_a_step_is_named_and_refused(design, what, size, unmodelled):
     seed = int(unmodelled) ^ int(what == 'base') ^ int(size > 2e-3)
     true, seen = session(seed, design, bool(seed), unmodelled=unmodelled)

@@ -4,31 +4,26 @@
 
 import base64
 import csv
-import hashlib
 import io
 import json
-import re
-import sys
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from measured import TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
+from measured import TEST, TRAIN, TRUE, UR, measured
+from pages import Page, page_of, problem_of, report_of
 from plotly import graph_objects
 
 from calib_ros.apply.verification import verify
 from calib_ros.apply.workspace import survey
-from calib_ros.cli.main import main
-from calib_ros.files.export import exports
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice, explorer
 from calib_ros.report.maps import workspace_report
 from calib_ros.report.page import Input, Origin, Report, Verdict, render
@@ -39,56 +34,6 @@ from calib_ros.report.verified import verification_report
 
 EMPTY = Report('kind', 'robot', Verdict('info', 'heading'), identity=(('a', 'b'),))
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
-
-
-class Page(HTMLParser):
-    """Tags with their attributes, the text that is seen, and the data of a page."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.words, self._inside = [], [], []
-        self.data = None
-        self.feed(text)
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append((tag, dict(attributes)))
-        if tag not in ('meta', 'link', 'input', 'br'):
-            self._inside.append((tag, dict(attributes)))
-
-    def handle_endtag(self, tag):
-        self._inside.pop()
-
-    def handle_data(self, text):
-        tag, attributes = self._inside[-1] if self._inside else ('', {})
-        if attributes.get('id') == 'data':
-            self.data = json.loads(text)
-        elif tag not in ('script', 'style'):
-            self.words.append(' '.join(text.split()))
-
-    @property
-    def text(self):
-        return ' '.join(self.words)
-
-
-def problem_of(count=TRAIN, chain=UR, **more):
-    rows = measured(count=count + TEST)
-    held_out = rows.select(np.arange(count, count + TEST))
-    return Problem(chain, rows.select(np.arange(count)), held_out, **more)
-
-
-@pytest.fixture(scope='module')
-def solved():
-    problem = problem_of()
-    return problem, identify(problem)
-
-
-def report_of(problem, result, **more):
-    poses = poses_of(problem, result)
-    return identification_report(problem, result, poses, Origin(), **more)
-
-
-def page_of(report):
-    return Page(render(report))
 
 
 def figures_of(page):
@@ -148,7 +93,7 @@ def test_positions_alone_leave_the_orientation_out():
     result = identify(problem)
     poses = poses_of(problem, result)
     assert 'after_rx' not in poses.table()
-    page = page_of(identification_report(problem, result, poses, Origin()))
+    page = page_of(report_of(problem, result))
     assert 'angle' not in [kind for kind, _ in page.data['explorer']['kinds']]
 
 
@@ -302,83 +247,6 @@ def test_a_verification_has_its_verdict_first(solved):
     assert len(page.data['explorer']['role']) == TEST
 
 
-def test_exported_files_carry_the_hash_of_the_table(solved):
-    _, result = solved
-    digest = table_hash(result.chain)
-    assert parse_chain(dump_chain(result.chain)) is not None
-    assert table_hash(parse_chain(dump_chain(result.chain))) == digest
-    assert digest != table_hash(UR)
-    for each in exports(result.chain, UR):
-        assert digest in each.content, each.name
-
-
-@pytest.fixture
-def table(tmp_path):
-    return write_csv(tmp_path / 'measured.csv', rows_of(measured()))
-
-
-def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
-    out = tmp_path / 'out'
-    told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
-    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
-    assert main([*arguments, '--tolerance', '5', '--pdf']) == 0
-    content = (out / 'report.pdf').read_bytes()
-    assert content.startswith(b'%PDF')
-    assert len(content) < 2e6
-    page = Page((out / 'report.html').read_text())
-    digest = hashlib.sha256(table.read_bytes()).hexdigest()
-    for text in ('A. Smith', 'tracker 7', '0012', digest, 'tolerance of 5 mm'):
-        assert text in page.text
-    assert page.data['explorer']['lines']
-    document = json.loads((out / 'result.json').read_text())
-    assert document['origin']['operator'] == 'A. Smith'
-    assert document['origin']['inputs'][0]['sha256'] == digest
-    assert document['tolerance_mm'] == 5.0
-    assert (
-        f'table_sha256: {re.search("[0-9a-f]{64}", page.text)[0]}'
-        in (out / 'calibration.yaml').read_text()
-    )
-
-
-def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
-    for name in ('jinja2', 'weasyprint'):
-        monkeypatch.setitem(sys.modules, name, None)
-    out = tmp_path / 'out'
-    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
-    assert main(arguments) == 0
-    said = capsys.readouterr().err
-    assert said.count('\n') == 2
-    assert 'calib_ros[report]' in said
-    assert 'calib_ros[pdf]' in said
-    names = {path.name for path in out.iterdir()}
-    assert not {'report.html', 'report.pdf'} & names
-    assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
-
-
-@pytest.mark.parametrize('wrong', ['0', '-1', 'nan', 'inf'])
-def test_a_tolerance_that_makes_no_sense_is_refused(table, capsys, wrong):
-    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', f'--tolerance={wrong}']
-    assert main(arguments) == 1
-    assert '--tolerance must be positive' in capsys.readouterr().err
-
-
-def test_the_other_commands_write_their_pages(solved, tmp_path):
-    out = tmp_path / 'out'
-    out.mkdir()
-    (out / 'calibration.yaml').write_text(Calibration.of(solved[1]).dump())
-    new = write_csv(tmp_path / 'new.csv', rows_of(measured(seed=8, count=12), held_out=0))
-    verified, planned = tmp_path / 'verified', tmp_path / 'plan.csv'
-    judged = ['--calibration', str(out), '--tolerance', '1', '--out', str(verified)]
-    assert main(['verify', str(new), '--chain', 'ur5e', *judged]) == 0
-    assert 'PASS' in Page((verified / 'report.html').read_text()).text
-    assert (verified / 'residuals.csv').read_text().count('\n') == 13
-    arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
-    assert main(arguments) == 0
-    page = Page((tmp_path / 'plan.report.html').read_text())
-    assert 'Poses to go' in page.text
-    assert main(arguments) == 1
-
-
 @settings(max_examples=5)
 @given(st.text(min_size=1))
 def test_any_operator_is_text(operator):
@@ -421,6 +289,6 @@ def test_distances_and_outliers_have_pages():
     poses = poses_of(problem, result)
     assert len(poses) == 160
     assert poses.outlier.sum() == len(result.outliers) > 0
-    page = page_of(identification_report(problem, result, poses, Origin()))
+    page = page_of(report_of(problem, result))
     assert 'Outliers: ' in page.text
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text

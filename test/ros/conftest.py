@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the tests of the node share: an arm, a shift in which it is measured, a cell."""
 
+from functools import partial
+
 import pytest
 
 
@@ -17,6 +19,14 @@ def recording(truth):
     from ros_cell import shift
 
     return shift(truth)
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Return a function that evaluates a launch file, and returns its actions."""
+    from launching import launch
+
+    return partial(launch, monkeypatch)
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from streams import START, stamps, stops, sweep
 
-from calib_ros.sampling.slices import MANY
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.sampling.waiting import MOST_STREAMS, TOO_MANY
 
 LATE = 'measurements: later than lateness allows'
@@ -74,9 +74,9 @@ def test_joint_samples_that_come_too_late_are_counted():
     made, late = collector(lateness=0.5), [(0.0, (0, 1), START, np.zeros(2))]
     for begin in (0.0, 9.5, 19.0):
         play(made, joint_events(tour(), begin + 9.5, begin=begin), finish=False)
-        for _ in range(MANY - 1):
+        for _ in range(NO_ACCIDENT - 1):
             play(made, late, finish=False)
-    assert made.dropped == {'joints: later than lateness allows': 3 * (MANY - 1)}
+    assert made.dropped == {'joints: later than lateness allows': 3 * (NO_ACCIDENT - 1)}
     play(made, late, finish=False)
     assert made.notes['the clock jumped back'] == 1
 

@@ -206,7 +206,8 @@ def test_two_stray_stamps_cost_two_messages(rng, mode, off):
     found = session_of([*given[:962], *stray, *given[962:]], mode=mode)
     assert_same_samples(expected, found)
     cause = 'stamp far from those before and after'
-    kinds = {f'{"joints" if hasattr(each, "position") else "poses"}: {cause}' for each in stray}
+    of = ['joints' if hasattr(each, 'position') else 'measurements' for each in stray]
+    kinds = {f'{kind}: {cause}' for kind in of}
     assert {key for key in found.account().dropped if cause in key} == kinds
     others = {key: n for key, n in found.account().dropped.items() if cause not in key}
     assert others == expected.account().dropped

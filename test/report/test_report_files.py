@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Files that commands write beside a result: pages, on paper too, and what they carry."""
+
+import hashlib
+import json
+import re
+import sys
+
+import pytest
+from measured import UR, measured, rows_of, write_csv
+from pages import Page
+
+from calib_ros.cli.main import main
+from calib_ros.files.export import exports
+from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+
+
+def test_exported_files_carry_the_hash_of_the_table(solved):
+    _, result = solved
+    digest = table_hash(result.chain)
+    assert parse_chain(dump_chain(result.chain)) is not None
+    assert table_hash(parse_chain(dump_chain(result.chain))) == digest
+    assert digest != table_hash(UR)
+    for each in exports(result.chain, UR):
+        assert digest in each.content, each.name
+
+
+@pytest.fixture
+def table(tmp_path):
+    return write_csv(tmp_path / 'measured.csv', rows_of(measured()))
+
+
+def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
+    out = tmp_path / 'out'
+    told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
+    assert main([*arguments, '--tolerance', '5', '--pdf']) == 0
+    content = (out / 'report.pdf').read_bytes()
+    assert content.startswith(b'%PDF')
+    assert len(content) < 2e6
+    page = Page((out / 'report.html').read_text())
+    digest = hashlib.sha256(table.read_bytes()).hexdigest()
+    for text in ('A. Smith', 'tracker 7', '0012', digest, 'tolerance of 5 mm'):
+        assert text in page.text
+    assert page.data['explorer']['lines']
+    document = json.loads((out / 'result.json').read_text())
+    assert document['origin']['operator'] == 'A. Smith'
+    assert document['origin']['inputs'][0]['sha256'] == digest
+    assert document['tolerance_mm'] == 5.0
+    assert (
+        f'table_sha256: {re.search("[0-9a-f]{64}", page.text)[0]}'
+        in (out / 'calibration.yaml').read_text()
+    )
+
+
+def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
+    for name in ('jinja2', 'weasyprint'):
+        monkeypatch.setitem(sys.modules, name, None)
+    out = tmp_path / 'out'
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
+    assert main(arguments) == 0
+    said = capsys.readouterr().err
+    assert said.count('\n') == 2
+    assert 'calib_ros[report]' in said
+    assert 'calib_ros[pdf]' in said
+    names = {path.name for path in out.iterdir()}
+    assert not {'report.html', 'report.pdf'} & names
+    assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
+
+
+@pytest.mark.parametrize('wrong', ['0', '-1', 'nan', 'inf'])
+def test_a_tolerance_that_makes_no_sense_is_refused(table, capsys, wrong):
+    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', f'--tolerance={wrong}']
+    assert main(arguments) == 1
+    assert '--tolerance must be positive' in capsys.readouterr().err
+
+
+def test_the_other_commands_write_their_pages(solved, tmp_path):
+    out = tmp_path / 'out'
+    out.mkdir()
+    (out / 'calibration.yaml').write_text(Calibration.of(solved[1]).dump())
+    new = write_csv(tmp_path / 'new.csv', rows_of(measured(seed=8, count=12), held_out=0))
+    verified, planned = tmp_path / 'verified', tmp_path / 'plan.csv'
+    judged = ['--calibration', str(out), '--tolerance', '1', '--out', str(verified)]
+    assert main(['verify', str(new), '--chain', 'ur5e', *judged]) == 0
+    assert 'PASS' in Page((verified / 'report.html').read_text()).text
+    assert (verified / 'residuals.csv').read_text().count('\n') == 13
+    arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
+    assert main(arguments) == 0
+    page = Page((tmp_path / 'plan.report.html').read_text())
+    assert 'Poses to go' in page.text
+    assert main(arguments) == 1
