@@ -7,9 +7,9 @@ their rows are
 
     [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
 
-and their products follow from those of [G | L | residual]: (16, 16) for an image at most, however
-many points it shows. Gross errors are told point by
-point, and image by image, by the sum over its points.
+and their products follow from those of G with [G | L | residual]: (6, 16) for an image at most,
+however many points it shows. Gross errors are told point by point, and image by image, by the sum
+over its points.
 """
 
 from __future__ import annotations
@@ -40,8 +40,7 @@ class _Images:
     `columns` (6 + K + 1, 2, C) are the derivatives of all points by twist and lens, the residual
     last, times robust weights; `begins` (b,) and `owner` (C,) tell the first point of each image
     and the image of each point, both counted from the block's first; `twist` (P, 6, b) is what
-    parameters do to the pose of each image; `lens` the rows of the K parameters
-    of the lens among the P.
+    parameters do to the pose of each image; `lens` the numbers of the K of the lens among the P.
     """
 
     part: slice
@@ -51,14 +50,13 @@ class _Images:
     twist: FloatArray
     lens: list[int]
     seen: View
-    model: ErrorModel
 
     def rows(self, columns: FloatArray, twist: FloatArray) -> FloatArray:
-        """Return rows (P + 1, 2, C) in the order of the names, by points or sums over images."""
+        """Return rows (P + 1, 2, C) by points or sums over images."""
         found = np.empty((len(twist) + 1, *columns.shape[1:]))
         np.einsum('psc,skc->pkc', twist, columns[:6], out=found[:-1])
-        found[self.lens], found[-1] = columns[6:-1], columns[-1]
-        return found[[*self.model.order, len(twist)]]
+        found[[*self.lens, -1]] = columns[6:]
+        return found
 
 
 class PixelSamples(Samples):
@@ -116,9 +114,7 @@ class PixelSamples(Samples):
                 matrix[:-1, own] += mixed
                 matrix[own, :-1] += mixed.T
                 matrix[own[:, np.newaxis], own] += alone @ alone.T
-        found /= self.sigmas[0] ** 2
-        order = [*block.model.order, size]
-        return found[:, :, np.array(order)[:, np.newaxis], order]
+        return found / self.sigmas[0] ** 2
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
         """Yield the rows (P + 1, 2, C) of all points, a block at a time."""
@@ -180,9 +176,7 @@ class PixelSamples(Samples):
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
         lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
         own = [name for name in parameters_of(seen_by.camera, LENS_KINDS) if name in names]
-        kinds = [name.kind for name in own]
-        row = dict(zip(names, model.order.tolist(), strict=True))
-        rows = [row[name] for name in own]
+        kinds, numbers = [name.kind for name in own], [names.index(name) for name in own]
         ends, total = np.append(self._begins, self.count), len(self._begins)
         few = max(4 * BLOCK * total // max(self.count, 1), 1)
         for start in range(0, total, few * max(BLOCK // few, 1)):
@@ -190,19 +184,13 @@ class PixelSamples(Samples):
             axes, origin, twist = self._arm(model, slice(start, end))
             for first in range(start, end, few):
                 last = min(first + few, end)
-                part, images = (
+                part, here = (
                     slice(*ends[[first, last]].tolist()),
                     slice(first - start, last - start),
                 )
-                owner = self._images[part] - first
-                seen = view(
-                    lens,
-                    axes[..., images],
-                    origin[:, images],
-                    owner,
-                    self._points[:, part],
-                    seen_by.on_flange,
-                )
+                owner, points = self._images[part] - first, self._points[:, part]
+                placed = axes[..., here], origin[:, here], owner, points
+                seen = view(lens, *placed, seen_by.on_flange)
                 columns = np.empty((7 + len(own), *seen.pixels.shape))
                 seen.by_twist(columns[:6])
                 lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
@@ -210,7 +198,7 @@ class PixelSamples(Samples):
                 if self.weights is not None:
                     columns *= self.weights[part]
                 begins = self._begins[first:last] - part.start
-                yield _Images(part, begins, owner, columns, twist[..., images], rows, seen, model)
+                yield _Images(part, begins, owner, columns, twist[..., here], numbers, seen)
 
     def _arm(self, model: ErrorModel, images: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return axes (3, 3, M) and origin (3, M) of the chain's end, and twists (P, 6, M)."""
@@ -218,9 +206,9 @@ class PixelSamples(Samples):
         approach = None if self.approach is None else self.approach[:, images]
         moving = None if velocity is None else velocity[:, images]
         axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
-        twist = np.zeros((len(shift) - 1, 6, origin.shape[1]))
-        twist[:, :3] = shift[:-1]
-        twist[: model.rotations, 3:] = turn[:-1]
+        turning = model.order < model.rotations
+        twist = np.zeros((len(turning), 6, origin.shape[1]))
+        twist[:, :3], twist[turning, 3:] = shift[model.order], turn[model.order[turning]]
         if self.observations.on_flange:  # along the camera's axes, as it moves the other way
             flat = twist.reshape(len(twist), 2, 3, -1)
             twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)

@@ -184,11 +184,10 @@ def _refined(
     poses, best, least = poses.copy(), poses.copy(), np.full(len(poses), np.inf)
     damping, normal = np.full(len(poses), ROUNDING), np.zeros((len(poses), 7, 7))
     for _ in range(ROUNDS):
-        these = np.isin(index, few)
-        seen = _seen(lens, poses[few], np.searchsorted(few, index[these]), points[:, these])
+        seen = _seen(lens, poses[few], index, points)
         rows = np.empty((7, *seen.pixels.shape))
         seen.by_twist(rows[:6])
-        rows[6] = pixels[these].T - seen.pixels
+        rows[6] = pixels.T - seen.pixels
         found = image_products(rows, np.cumsum(count[few]) - count[few])
         fall = least[few] - found[:, 6, 6]
         better, moving = fall > 0.0, ~(np.abs(fall) < HALF_THE_DIGITS * least[few])
@@ -196,9 +195,11 @@ def _refined(
         best[won], least[won], normal[won] = poses[won], found[better, 6, 6], found[better]
         less = np.maximum(0.1 * damping[few], ROUNDING)
         damping[few] = np.where(better, less, 100.0 * damping[few])
-        few = few[moving]
+        few, these = few[moving], moving[index]
         if not len(few):
             break
+        index = (np.cumsum(moving) - 1)[index[these]]
+        points, pixels = points[:, these], pixels[these]
         matrix, gradient = normal[few, :6, :6], normal[few, :6, 6]
         scale = np.sqrt(np.maximum(np.einsum('mpp->mp', matrix), 1e-300))
         scaled = matrix / (scale[:, :, np.newaxis] * scale[:, np.newaxis])

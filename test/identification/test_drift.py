@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, along_path, arm, rms
+from fits import NOISE, SIGMAS, UR10E, along_path, arm, measured_arm, rms
 from scipy.signal import lfilter
 
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -56,7 +56,7 @@ def test_a_drift_is_no_gain_of_the_arm(kind):
     results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(8)]
     assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
-    alone = [all('of a drift' in text for text in result.refusals) for result in results]
+    alone = [all('drift of' in text for text in result.refusals) for result in results]
     assert sum(alone) > 2
 
 
@@ -138,9 +138,7 @@ def test_effects_are_found_though_the_tracker_drifts(kind):
 @pytest.mark.parametrize('count', [2, 3, 8, 12])
 def test_few_poses_with_priors(count):
     """No shift of 8 poses explains the errors of an arm as well as the arm does."""
-    rng = np.random.default_rng(10)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+    *_, seen = measured_arm(10, count)
     priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
     chance = identify(Problem(UR10E, seen, priors=priors, **SIGMAS)).chance
     assert chance == 0.0 if count >= 8 else 0.0 <= chance <= 1.0

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import UR10E, fitted, worst_prediction
+from fits import UR10E, fitted, measured_arm, worst_prediction
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -75,9 +75,7 @@ def test_standard_deviations_are_honest():
     """Deviations from the truth in units of the standard deviation given: spread 1, seeded."""
     scores = []
     for seed in range(40):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        seen = measure(true, UR10E.random_joints(40, rng), rng, 5e-5, 5e-5 / 0.3)
+        _, true, seen = measured_arm(seed, 40, (5e-5, 5e-5 / 0.3))
         scores += scores_of(fitted(Problem(UR10E, seen)), true)
     assert len(scores) == 40 * 30
     assert np.std(scores) == pytest.approx(1.0, abs=0.06)
@@ -255,9 +253,7 @@ def test_errors_shared_by_a_configuration_count_once():
 def test_standard_deviations_follow_the_noise_that_is_there(position, orientation):
     scores = []
     for seed in range(20):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        seen = measure(true, UR10E.random_joints(40, rng), rng, position, orientation)
+        _, true, seen = measured_arm(seed, 40, (position, orientation))
         result = fitted(Problem(UR10E, seen))
         assert not result.noise.consistent
         scores += scores_of(result, true)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, along_path, fitted
+from fits import NOISE, SIGMAS, UR10E, along_path, fitted, measured_arm
 from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
 
@@ -107,9 +107,7 @@ def test_the_correlation_is_that_of_the_errors():
 
 
 def test_distances_drift_as_well():
-    rng = np.random.default_rng(4)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(300, rng), rng)
+    rng, _, seen = measured_arm(4, 300, (0.0, 0.0))
     length = np.linalg.norm(seen.positions, axis=1) + 5e-5 * rng.normal(size=300)
     for drift, shared in ((0.0, ()), (2e-4, ('successive',))):
         wire = replace(seen, distances=length + drift * fading(300, 20.0, rng)[:, 0])
@@ -213,9 +211,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
 
 @pytest.mark.parametrize('count', [2, 7, 8])
 def test_few_poses_do_no_harm(count):
-    rng = np.random.default_rng(10)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+    *_, seen = measured_arm(10, count)
     priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
     result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
     assert result.noise.shared == ()
