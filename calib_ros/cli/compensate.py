@@ -17,8 +17,12 @@ from calib_ros.errors import InputError
 from calib_ros.files.trajectories import read_program
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
+<<<<<<< HEAD
 from calib_ros.settings import Limits
 from calib_ros.shown import some
+=======
+from calib_ros.shown import NAMED
+>>>>>>> people
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -39,8 +43,10 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         )
     if result.refusals:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
-        for each in some([f'{source.places[r.sample]}: {r.reason}' for r in result.refusals]):
-            screen.warn(each, 'refused')
+        for refusal in result.refusals[:NAMED]:
+            screen.warn(refusal.reason, source.places[refusal.sample])
+        if more := result.refusals[NAMED:]:
+            screen.warn(f'and {len(more)} more, up to {source.places[more[-1].sample]}', 'refused')
         return common.NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')

@@ -31,14 +31,12 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
 from calib_ros.settings import Settings
 
-LAYOUT = (
-    *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
-    *('rotation_vector', 'inverse', 'shift', 'separator', 'decimal', 'sheet', 'joints'),
-)
-"""Options of tables of others."""
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
-OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
+OF_TABLES = (
+    *('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', 'preset', 'columns', 'joints'),
+    *(*common.LAYOUT, *DETECTIONS),
+)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 
 

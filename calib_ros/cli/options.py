@@ -38,7 +38,12 @@ OF_BAGS = (
     *SETTINGS['bags: what is read'],
     *SETTINGS['bags: how poses are taken'],
 )
-"""Settings by which samples are made of a bag."""
+"""Settings by which poses are made of a bag."""
+LAYOUT = (
+    *('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector'),
+    *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
+)
+"""Options of tables of others."""
 
 
 def add_each(parser: Group, kind: Callable[[str], Any], *rows: tuple[str, str, Any, str]) -> None:
@@ -152,6 +157,23 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
     add('--joints', type=Path, metavar='FILE', help='log of the joint values, row by row')
 
 
+<<<<<<< HEAD
+=======
+def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
+    """Return how to read a table of others, None where nothing says that it is one."""
+    given = {name: getattr(options, name) for name in LAYOUT}
+    if not (any(given.values()) or options.preset or options.columns or options.joints):
+        return None
+    given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
+    if options.joints_preset and options.joints is None:
+        raise InputError('--joints-preset is of use with --joints FILE only')
+    units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
+    log = layout_of(options.joints_preset, (), {} if options.joints_preset else units)
+    layout = layout_of(options.preset, options.columns, given)
+    return Foreign(layout, chain, options.joints, log if options.joints else Layout())
+
+
+>>>>>>> people
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings that are among the options, the others by default."""
     given: dict[str, Any] = {

@@ -21,16 +21,10 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import verification_report
+from calib_ros.report.verified import STATES, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
-TITLES = {
-    'PASS': ('PASS: the arm is within the tolerance', True),
-    'FAIL': ('FAIL: the arm is beyond the tolerance', False),
-    'UNDECIDED': ('UNDECIDED: too few measurements to tell', None),
-    'JUDGED': ('judged: without --tolerance there is no verdict', None),
-}
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -92,7 +86,8 @@ def show(found: Verification, screen: Screen) -> None:
     tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    screen.title(*TITLES[found.verdict])
+    state = STATES[found.verdict]
+    screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     screen.table(
         (
             ('measured', f'{after.count} times at {found.configurations} poses'),

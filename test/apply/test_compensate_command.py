@@ -194,6 +194,14 @@ def test_nothing_is_written_when_a_sample_is_refused(run, tmp_path, suffix, forc
     assert out.read_text() == 'precious' if force else not out.exists()
 
 
+def test_of_many_refused_points_the_first_are_named(run):
+    q = np.tile(regular(UR, 1), (9, 1))
+    q[:, 2] = 4.0
+    _, _, err = run(joints_csv(q))
+    assert len(err.splitlines()) == 7
+    assert err.endswith('refused: and 4 more, up to line 10\n')
+
+
 def test_options_reach_the_compensator(run):
     q = regular(UR, 1)
     q[0, 4] = 0.0
