@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
-from calib_ros.cli.options import Contents, settings_of
+from calib_ros.cli.options import LAYOUT, Contents, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.foreign import Foreign
@@ -32,9 +32,7 @@ from calib_ros.report.page import (
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
     """Return how to read a table of others, None where nothing says that it is one."""
-    names = [*('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector')]
-    names += ['inverse', 'shift', 'separator', 'decimal', 'sheet']
-    given = {name: getattr(options, name) for name in names}
+    given = {name: getattr(options, name) for name in LAYOUT}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
