@@ -296,17 +296,17 @@ def run(options, seconds, folder):
     probed = {name: int(last[name]) for name in probes}
     lost = {
         'joints': sent['joints'] + probed[probes[0]] - int(last['joint states']),
-        'poses': sent['poses'] + probed[probes[1]] - int(last['measurements']),
+        'poses': sent['poses'] + probed[probes[1]] - int(last['poses']),
     }
     told = sum(int(value) for key, value in last.items() if key.startswith('lost on'))
-    accounted = in_samples + int(last['measurements waiting'])
+    accounted = in_samples + int(last['poses waiting'])
     for key, value in last.items():
         if key.startswith(('dropped measurements', 'not used measurements')):
             accounted += int(value)
-    unaccounted = int(last['measurements']) - accounted
+    unaccounted = int(last['poses']) - accounted
     times, sizes, idles = np.array(memory).T
     grown = slope(times, sizes)
-    kept = round(0.06 * sample_size() * (int(last['poses']) - int(first['poses'])) / span, 1)
+    kept = round(0.06 * sample_size() * (int(last['samples']) - int(first['samples'])) / span, 1)
     return {
         'seconds': round(span, 1),
         'sent': {key: sent[key] for key in ('joints', 'poses')},
@@ -316,7 +316,7 @@ def run(options, seconds, folder):
         'lost on the way, as the node tells': told,
         'lost_uncounted': abs(sum(lost.values()) - told) + abs(unaccounted),
         'lost by the empty node': sent['joints'] + sent['poses'] - sum(other.values()),
-        'samples': int(last['poses']),
+        'samples': int(last['samples']),
         'account': {
             k: v for k, v in last.items() if k.startswith(('dropped', 'not used', 'note'))
         },
@@ -354,7 +354,7 @@ def sample_size(count=1000):
 
 def received(values):
     """Return how many messages the node has counted."""
-    return int(values['joint states']) + int(values['measurements'])
+    return int(values['joint states']) + int(values['poses'])
 
 
 def steady(heard):

@@ -7,11 +7,29 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Literal, TypeAlias, get_args
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
-from calib_ros.values import parse_number
 
+Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
+CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
+"""By which poses are chosen."""
+Aim: TypeAlias = Literal['mean', 'worst']
+AIMS: tuple[Aim, ...] = get_args(Aim)
+"""What a placement is to make small."""
+Model: TypeAlias = Literal['corrected', 'nominal']
+MODELS: tuple[Model, ...] = get_args(Model)
+"""By which an arm is commanded."""
+STORAGES = ('mcap', 'sqlite3')
+"""Of bags."""
+EXCEPTION = 0.1
+"""Share of a whole up to which it is the exception. So many samples fewer, at random, make
+standard deviations 5 % larger, less than their own uncertainty; more may be a part of the
+workspace."""
+GROWTH = 2e-5
+"""Growth of a length [m] per root of a year, if nothing else is said."""
+YEARS = 100.0
+"""Time between false alarms of a robot, of one night each day, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')
 """How samples are taken."""
 STARTUP = (
@@ -19,6 +37,18 @@ STARTUP = (
     *('joint_topics', 'joint_names'),
 )
 """Settings that a running node cannot change."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a `Compensator`, by default."""
+
+    largest_turn: float = 0.1
+    largest_shift: float = 0.05
+    largest_position_error: float = 1e-6
+    largest_orientation_error: float | None = None
+    orientation_weight: float | None = None
+    largest_change: float = 0.5
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
@@ -114,6 +144,8 @@ class Settings:
 
     def for_problem(self) -> dict[str, Any]:
         """Return what an identification needs to know, by the names of `Problem`."""
+        from calib_ros.values import parse_number  # loads numpy, which no `--help` needs
+
         priors = {}
         for text in self.priors:
             name, _, sigma = text.partition('=')

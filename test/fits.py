@@ -26,6 +26,13 @@ def arm(rng, errors=1.0):
     return faulty(UR10E, cell, np.random.default_rng(rng))
 
 
+def measured_arm(rng, count, noise=NOISE, **more):
+    """Return a generator, an arm with errors and poses of it; `rng` may be a seed."""
+    rng = np.random.default_rng(rng)
+    true = arm(rng)
+    return rng, true, measure(true, UR10E.random_joints(count, rng), rng, *noise, **more)
+
+
 def rms(chain, true, q, approach=None):
     """Return the RMS position error [m] against the true arm."""
     error = (chain.forward(q, approach) - true.forward(q, approach))[:, :3, 3]

@@ -236,9 +236,7 @@ class Child:
             for name, value in os.environ.items()
             if name not in ('LD_LIBRARY_PATH', '_ROS_WHEELS_BOOTSTRAP_COMPLETE')
         }
-        self._lock = None
-        if domain is None:
-            self._lock, domain = free_domain()
+        self._lock, domain = free_domain() if domain is None else (None, domain)
         given = [word for name, v in parameters.items() for word in ('-p', f'{name}:={v}')]
         self.process = subprocess.Popen(
             [sys.executable, *command, '--ros-args', *arguments, *given],
@@ -319,24 +317,17 @@ def pose_messages(
 ):
     quats = se3.to_quat(observations.rotations)
     messages = []
-    for k, (stamp, position, quat) in enumerate(
-        zip(observations.stamps_ns, observations.positions.tolist(), quats.tolist(), strict=True)
-    ):
-        head = header(stamp, frame_id)
-        x, y, z = position
-        turn = Quaternion(x=quat[0], y=quat[1], z=quat[2], w=quat[3])
+    for k, (x, y, z) in enumerate(observations.positions.tolist()):
+        head = header(observations.stamps_ns[k], frame_id)
+        turn = Quaternion(**dict(zip('xyzw', quats[k].tolist(), strict=True)))
         pose = Pose(position=Point(x=x, y=y, z=z), orientation=turn)
         if kind is PoseStamped:
             message = PoseStamped(header=head, pose=pose)
         elif kind is PointStamped:
             message = PointStamped(header=head, point=pose.position)
         elif kind is TransformStamped:
-            shift = Vector3(x=x, y=y, z=z)
-            message = TransformStamped(
-                header=head,
-                child_frame_id=child,
-                transform=Transform(translation=shift, rotation=turn),
-            )
+            moved = Transform(translation=Vector3(x=x, y=y, z=z), rotation=turn)
+            message = TransformStamped(header=head, child_frame_id=child, transform=moved)
         elif kind is Range:
             message = Range(header=head, range=float(distances[k]))
         else:

@@ -26,11 +26,10 @@ from scipy import optimize, special
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import YEARS
 
 SLOPES = (0.5, 2.0)
 """References k: shifts of one and of four standard deviations show soonest."""
-YEARS = 100.0
-"""Time between false alarms of a robot, of one night each day, if nothing else is said."""
 
 
 @dataclass(frozen=True, eq=False)

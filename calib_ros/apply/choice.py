@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, TypeAlias, get_args
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +28,8 @@ from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.settings import CRITERIA, Criterion
 
-Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
-CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
 Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
 """Returns the worth (N,) of candidates from information (P, P) and their rows (N, m, P)."""
 

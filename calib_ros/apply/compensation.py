@@ -17,7 +17,7 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,15 +27,12 @@ from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.following import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
 EXACT, COMPROMISE = 1e-6, 0.02
 """Orientation errors [rad] tolerated of arms that can reach every orientation, and of others.
 By the former [rad or m] a command may lie beyond a limit, or a correction change at any time."""
-POSITIVE = (
-    *('largest_turn', 'largest_shift', 'largest_position_error', 'largest_orientation_error'),
-    *('orientation_weight', 'largest_change'),
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,12 +70,12 @@ class Compensator(Shown):
     nominal: Chain
     calibrated: Chain
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    largest_turn: float = 0.1
-    largest_shift: float = 0.05
-    largest_position_error: float = 1e-6
-    largest_orientation_error: float | None = None
-    orientation_weight: float | None = None
-    largest_change: float = 0.5
+    largest_turn: float = Limits.largest_turn
+    largest_shift: float = Limits.largest_shift
+    largest_position_error: float = Limits.largest_position_error
+    largest_orientation_error: float | None = Limits.largest_orientation_error
+    orientation_weight: float | None = Limits.orientation_weight
+    largest_change: float = Limits.largest_change
     region: Region | None = None
 
     def __post_init__(self) -> None:
@@ -94,7 +91,7 @@ class Compensator(Shown):
             )
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():
             raise ConfigError(f'tool must be three finite numbers [m], not {self.tool}')
-        for name in POSITIVE:
+        for name in (item.name for item in fields(Limits)):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {value}')

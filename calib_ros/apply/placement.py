@@ -12,7 +12,6 @@ others from pose to pose.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,11 @@ from scipy.spatial import cKDTree
 
 from calib_ros.apply.workspace import in_base
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.identification.calibration import Calibration, Model
+from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import AIMS, Aim, Model
 from calib_ros.shown import Shown
-
-Aim: TypeAlias = Literal['mean', 'worst']
-AIMS: tuple[Aim, ...] = get_args(Aim)
 
 
 def task_of(poses: FloatArray) -> FloatArray:

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.apply.candidates import travel_times, visit_order
-from calib_ros.apply.choice import Criterion, choose, efficiency
+from calib_ros.apply.choice import choose, efficiency
 from calib_ros.apply.design import Design, accuracy, predicted
 from calib_ros.errors import InputError
 from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Criterion
 from calib_ros.shown import Shown, as_frame
 
 

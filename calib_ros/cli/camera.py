@@ -6,13 +6,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 
 from calib_ros.atomic import write_file
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
@@ -20,28 +18,6 @@ from calib_ros.files.boards import Board, read_board
 from calib_ros.files.detector import detect, marker_cells
 from calib_ros.files.images import SUFFIXES, Image, files_of, image_of, read_image
 from calib_ros.kinematics.chain_file import dump_yaml
-
-
-def _add_board(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('the board')
-    add = group.add_argument
-    add('type', choices=('charuco', 'markers'), help='markers: a grid of them')
-    for name, text in (('columns', 'across'), ('rows', 'down')):
-        add(f'--{name}', type=int, required=True, metavar='N', help=f'squares or markers {text}')
-    add('--square', type=float, required=True, metavar='M', help='from one to the next')
-    add('--marker', type=float, required=True, metavar='M', help='side of a marker')
-    add('--dictionary', default='DICT_5X5_250', metavar='NAME', help='DICT_APRILTAG_36h11, ...')
-    common.add_out(group, 'PDF; its YAML is put beside it', 'FILE', needed=True)
-
-
-def _add_images(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to look at')
-    add = group.add_argument
-    add('images', type=Path, metavar='IMAGES', help='folder of images, or a bag')
-    add('--board', type=Path, required=True, metavar='FILE', help='YAML of the board')
-    add('--topic', default='', metavar='NAME', help='of the images in a bag, if there are several')
-    add('--fewest', type=int, default=6, metavar='N', help='corners that an image must show')
-    common.add_out(group, 'table: image, corner, u, v', 'FILE', needed=True)
 
 
 def _board(options: argparse.Namespace, screen: Screen) -> int:
@@ -104,15 +80,3 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
         return
     for stamp, message in pictures(options.images, options.topic):
         yield str(stamp), image_of(message)
-
-
-COMMANDS = {
-    'board': Command(
-        _add_board,
-        _board,
-        ('board charuco --columns 9 --rows 7 --square 0.03 --marker 0.022 --out board.pdf',),
-    ),
-    'images': Command(
-        _add_images, _images, ('images photographs/ --board board.yaml --out corners.csv',)
-    ),
-}

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The commands, by the groups of the overview; a module is imported when its command is given."""
+"""The commands, by the groups of the overview; what a command needs is imported when it runs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ if TYPE_CHECKING:
 
 
 class Command(NamedTuple):
-    """What a command does: `add` its options to a parser, `run` it and return the exit status.
+    """How to `add` the options of a command to a parser, and its `home`: MODULE.FUNCTION.
 
-    `examples` are whole commands for the foot of its help, without "calib_ros".
+    `examples` are whole commands for the foot of its help, without "calib_ros". Neither options
+    nor help need what the command works with.
     """
 
     add: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[Any, Screen], int]
+    home: str
     examples: tuple[str, ...]
+
+    def run(self, options: Any, screen: Screen) -> int:
+        """Run the command and return the exit status."""
+        module, _, function = self.home.partition('.')
+        loaded = importlib.import_module(f'calib_ros.cli.{module}')
+        status: int = getattr(loaded, function)(options, screen)
+        return status
 
 
 GROUPS = {
@@ -56,18 +64,3 @@ GROUPS = {
 }
 """Commands by the groups of the overview, and what they do."""
 TEXTS = {name: text for group in GROUPS.values() for name, text in group.items()}
-HOMES = {
-    **dict.fromkeys(('chain',), 'robots'),
-    **dict.fromkeys(('demo',), 'simulate'),
-    **dict.fromkeys(('board', 'images'), 'camera'),
-    **dict.fromkeys(('history',), 'fleet'),
-    **dict.fromkeys(('bag2csv', 'csv2bag', 'import'), 'convert'),
-}
-"""Modules of other names than that of their command."""
-
-
-def load(name: str) -> Command:
-    """Return what a command does."""
-    module = importlib.import_module(f'calib_ros.cli.{HOMES.get(name, name)}')
-    found: Command = module.COMMANDS[name]
-    return found

@@ -6,25 +6,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 
-from calib_ros.cli.command import Command
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.cli.screen import Screen
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.identification.difference import difference
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to compare')
-    for name, text in (('first', 'the earlier one'), ('second', 'the later one')):
-        group.add_argument(
-            name,
-            type=Path,
-            metavar=name.upper(),
-            help=f'{text}: calibration.yaml, or the folder of identify --out',
-        )
-    group.add_argument('--json', action='store_true', help='print the difference as JSON')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -38,10 +24,3 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         if not found.same:
             screen.table(found.rows())
     return 0 if found.same else NOT_ACCEPTED
-
-
-COMMANDS = {
-    'compare': Command(
-        _add, _run, ('compare monday/ tuesday/', 'compare before.yaml after.yaml --json')
-    ),
-}

@@ -5,13 +5,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
 from calib_ros.atomic import write_file
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
@@ -24,37 +23,11 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain_file import load_chain
 
 
-def _add_import(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to convert')
-    group.add_argument('table', type=Path, metavar='TABLE', help='CSV, text in columns, or .xlsx')
-    common.add_chain(group, needed=False)
-    common.add_out(group, 'CSV to write', 'FILE', needed=True)
-    common.add_layout(parser)
-
-
-def _add_csv2bag(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to convert')
-    group.add_argument('csv', type=Path, metavar='TABLE', help='the table')
-    group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
-    common.add_chain(group)
-    group.add_argument('--session', metavar='NAME', help='session of the table to use')
-    common.add_storage(group)
-
-
-def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to convert')
-    group.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file')
-    group.add_argument('csv', type=Path, metavar='TABLE', help='CSV to write')
-    group.add_argument('--force', action='store_true', help='replace what is there already')
-    common.add_chain(group)
-    common.add_settings(parser, common.OF_BAGS)
-
-
-def _import(options: argparse.Namespace, screen: Screen) -> int:
+def _convert(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.table, 'import', 'table')
     common.refuse_existing(options, options.out)
     chain = None if options.chain is None else load_chain(options.chain)
-    foreign = common.foreign_of(options, chain) or Foreign(Layout(), chain)
+    foreign = given.foreign_of(options, chain) or Foreign(Layout(), chain)
     with screen.work(f'converting {options.table.name}'):
         columns, notes = foreign.convert(options.table)
         check_table(columns)
@@ -103,22 +76,3 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
         screen.warn(warning)
     screen.say(f'wrote {options.csv}: {len(samples)} rows')
     return 0
-
-
-COMMANDS = {
-    'bag2csv': Command(_add_bag2csv, _bag2csv, ('bag2csv recording/ measured.csv --chain ur10e',)),
-    'csv2bag': Command(
-        _add_csv2bag,
-        _csv2bag,
-        ('csv2bag measured.csv measured_bag --chain ur10e --session monday',),
-    ),
-    'import': Command(
-        _add_import,
-        _import,
-        (
-            'import export.csv --length mm --angle deg --euler ZYX --out measured.csv',
-            'import export.csv --preset optitrack --joints log.csv --joints-preset kuka '
-            '--out measured.csv',
-        ),
-    ),
-}

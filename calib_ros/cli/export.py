@@ -8,7 +8,6 @@ import argparse
 from pathlib import Path
 
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.screen import Screen
 from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
 from calib_ros.files.vendors import VENDOR_FILES, vendor_files
@@ -16,22 +15,6 @@ from calib_ros.files.waypoints import read_joints
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.kinematics.urdf import corrected_urdf
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to export')
-    add = group.add_argument
-    add('calibration', type=Path, metavar='CALIBRATION', help='calibration.yaml of identify --out')
-    common.add_chain(group)
-    common.add_out(group, 'all forms', needed=True)
-    text = 'table with q1 ... qn where tables that cannot be exact are to be best; if not given, '
-    add('--measured', type=Path, metavar='FILE', help=f'{text}the whole joint range')
-    add = parser.add_argument_group('for URDF and drivers').add_argument
-    add('--urdf', type=Path, metavar='FILE', help='nominal URDF of the robot, to correct as well')
-    add('--base-link', metavar='LINK', help='of the URDF: where the arm starts')
-    add('--tip-link', metavar='LINK', help='of the URDF: where the arm ends')
-    text = 'checksum that the driver of Universal Robots prints at its start, for '
-    add('--ur-hash', default='', metavar='calib_...', help=f'{text}ur_kinematics.yaml')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -57,15 +40,3 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
         screen.say(f'{options.out / each.name}: {exact}')
     return 0
-
-
-COMMANDS = {
-    'export': Command(
-        _add,
-        _run,
-        (
-            'export result/calibration.yaml --chain ur10e --out export/',
-            'export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/',
-        ),
-    ),
-}

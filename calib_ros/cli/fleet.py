@@ -6,33 +6,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from pathlib import Path
 
 from calib_ros.atomic import write_file
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
-
-
-def _add_fleet(parser: argparse.ArgumentParser) -> None:
-    from calib_ros.apply.chart import YEARS
-
-    add = parser.add_argument
-    add('plant', type=Path, metavar='PLANT', help='plant.yaml: the robots (docs/fleet.md)')
-    add('--history', required=True, metavar='DIR', help='where results are filed; also a URL')
-    add('--out', type=Path, metavar='FOLDER', help='the report: index.html, a page of each robot')
-    add('--metrics', type=Path, metavar='FILE', help="for Prometheus' text collector")
-    group = parser.add_argument_group('who does the work')
-    add = group.add_argument
-    add('--scheduler', default='', metavar='ADDRESS', help='of a dask cluster: tcp://host:8786')
-    add('--workers', type=int, default=0, metavar='N', help='processes here; default: one a core')
-    add('--memory', default='2GiB', metavar='SIZE', help='of each of these, at most')
-    group = parser.add_argument_group('alarms')
-    text = 'between two false alarms of a robot that is measured every night'
-    group.add_argument('--years', type=float, default=YEARS, metavar='N', help=text)
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
@@ -77,12 +57,6 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     return common.INCOMPLETE if number['unreadable'] else 0
 
 
-def _add_history(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add('history', metavar='DIR', help='folder or URL of a history')
-    add('--robot', metavar='SERIAL', help='this robot only')
-
-
 def _run_history(options: argparse.Namespace, screen: Screen) -> int:
     history = History(options.history)
     serials = history.serials()
@@ -104,16 +78,3 @@ def _line(row: Row) -> str:
     rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
     when = f'{row.time:%Y-%m-%d %H:%M}'
     return f'{when}  {row.kind:8}  {row.verdict:9}  {row.poses:5}  {rms:>8}  {row.source}'
-
-
-COMMANDS = {
-    'fleet': Command(
-        _add_fleet,
-        _run_fleet,
-        (
-            'fleet plant.yaml --history history/ --out report/',
-            'fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786',
-        ),
-    ),
-    'history': Command(_add_history, _run_history, ('history history/ --robot 0042',)),
-}

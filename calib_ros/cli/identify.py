@@ -7,14 +7,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from pathlib import Path
 
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.detections import detected
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.recalibrate import add_previous, recalibrated
+from calib_ros.cli.recalibrate import recalibrated
 from calib_ros.cli.results import (
     RESULT_FILES,
     Identified,
@@ -26,69 +25,19 @@ from calib_ros.cli.results import (
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.boards import POSED, posed_arm
-from calib_ros.files.loading import LARGEST_LOSS, Loaded, of_bag, of_table
+from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.files.rows import identified as row_of
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
 from calib_ros.settings import Settings
 
-LAYOUT = (
-    *('preset', 'columns', 'length', 'angle', 'joint_angle', 'euler', 'quaternion'),
-    *('rotation_vector', 'inverse', 'shift', 'separator', 'decimal', 'sheet', 'joints'),
-)
-"""Options of tables of others."""
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
-OF_TABLES = ('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', *LAYOUT, *DETECTIONS)
+OF_TABLES = (
+    *('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', 'preset', 'columns', 'joints'),
+    *(*common.LAYOUT, *DETECTIONS),
+)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to read')
-    add = group.add_argument
-    text = 'a table of measured poses, or a bag: folder, .mcap or .db3'
-    add('measured', nargs='?', type=Path, metavar='MEASURED', help=text)
-    add('--csv', type=Path, metavar='FILE', help='the same for a table of any name')
-    common.add_chain(group)
-    add('--session', metavar='NAME', help='session of the table; several joined by commas')
-    text = 'the poses are those of a fixed target in a camera on the flange'
-    add('--eye-in-hand', action='store_true', help=text)
-    loss = 'of the messages of a bag, beyond which the result is not accepted; 1: any'
-    common.add_each(
-        group,
-        float,
-        ('--largest-loss', 'SHARE', LARGEST_LOSS, loss),
-        ('--socket-distance', 'M', None, 'between two sockets of a place, 0.05 if not given'),
-        ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
-    )
-    group = parser.add_argument_group('what to write')
-    common.add_out(group, 'calibration, result and report')
-    common.add_history(group)
-    group.add_argument('--json', action='store_true', help='print the result as JSON')
-    group.add_argument(
-        '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
-    )
-    _add_detections(parser)
-    common.add_settings(parser)
-    common.add_layout(parser)
-    common.add_identity(parser, pdf=True)
-    add_previous(parser)
-
-
-def _add_detections(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what a camera saw (docs/images.md)')
-    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
-    common.add_each(
-        group,
-        Path,
-        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
-        ('--board', 'FILE', None, 'YAML of that board'),
-        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
-        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
-    )
-    group.add_argument(
-        '--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given'
-    )
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -98,7 +47,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     if options.previous is not None:
         return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
-    history = common.history_of(options)
+    history = given.history_of(options)
     with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
@@ -106,7 +55,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if history is not None:
         problem, measured = found.loaded.problem, options.csv or options.detections
         sets, measured = (*problem.sets, *problem.judging), measured or options.measured
-        about = common.filing_of(options, problem.chain, sets, measured, options.largest_loss)
+        about = given.filing_of(options, problem.chain, sets, measured, options.largest_loss)
         history.file(row_of(found.result, about, found.warnings))
     for warning in (*found.warnings, *words.remarks(found.result)):
         screen.warn(warning)
@@ -155,18 +104,4 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     loaded, settings = _loaded(options, screen)
     configuration = words.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
-    return identified(loaded, settings, screen, common.origin_of(options, read, configuration))
-
-
-COMMANDS = {
-    'identify': Command(
-        _add,
-        _run,
-        (
-            'identify measured.csv --chain ur10e --out result/',
-            'identify recording/ --chain robot.urdf --out result/ --model auto',
-            'identify export.csv --chain ur10e --length mm --angle deg --euler ZYX',
-            'identify measured.csv --chain ur10e --session monday --json',
-        ),
-    ),
-}
+    return identified(loaded, settings, screen, given.origin_of(options, read, configuration))

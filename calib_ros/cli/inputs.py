@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from calib_ros.cli import given
 from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.files import loading
@@ -34,7 +35,7 @@ def table(
     eye_in_hand: bool = False,
 ) -> Table:
     """Return a table of measurements, laid out as the options say."""
-    foreign = common.foreign_of(options, chain)
+    foreign = given.foreign_of(options, chain)
     with screen.work(f'reading {path.name}'):
         return loading.table(
             path, chain, settings, common.sessions_of(options), eye_in_hand, foreign

@@ -21,7 +21,7 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
-from calib_ros.cli.command import GROUPS, TEXTS, load
+from calib_ros.cli.command import GROUPS, TEXTS
 from calib_ros.cli.screen import Screen, help_width
 from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
 
@@ -89,17 +89,16 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
-    """Return the parser of all commands; only the one given knows its options.
+    """Return the parser of all commands; only the one given knows its options."""
+    from calib_ros.cli.commands import COMMANDS  # the overview does not need them
 
-    Those know modules that take longer than all the rest.
-    """
     parser = argparse.ArgumentParser(prog='calib_ros', add_help=False)
     names = parser.add_subparsers(required=True, metavar='COMMAND')
     for name, text in TEXTS.items():
         if name not in given:
             names.add_parser(name, add_help=False)
             continue
-        command = load(name)
+        command = COMMANDS[name]
         added = names.add_parser(
             name,
             add_help=False,

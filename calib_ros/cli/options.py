@@ -8,32 +8,12 @@ import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from calib_ros.atomic import whole_folder, write_files
-from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.foreign import Foreign
-from calib_ros.files.history import History
-from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.recording import STORAGES
-from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
-from calib_ros.identification.observations import Observations
-from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import shipped_robots
-from calib_ros.report.page import (
-    MISSING,
-    MISSING_PDF,
-    Origin,
-    Report,
-    input_of,
-    inputs_of,
-    on_paper,
-    render,
-)
-from calib_ros.settings import Settings
+from calib_ros.settings import GROWTH, STORAGES, Settings
 
 NOT_ACCEPTED, INCOMPLETE = 3, 4
 """Exit status when the input was used but what came out does not do; of a fleet, when measurements
@@ -58,7 +38,12 @@ OF_BAGS = (
     *SETTINGS['bags: what is read'],
     *SETTINGS['bags: how poses are taken'],
 )
-"""Settings by which samples are made of a bag."""
+"""Settings by which poses are made of a bag."""
+LAYOUT = (
+    *('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector'),
+    *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
+)
+"""Options of tables of others."""
 
 
 def add_each(parser: Group, kind: Callable[[str], Any], *rows: tuple[str, str, Any, str]) -> None:
@@ -82,6 +67,8 @@ def add_chain(parser: Group, default: str | None = None, needed: bool = True) ->
 def _robots(prefix: str, **_: Any) -> list[str]:
     """Return what may be meant by the beginning of the name of a robot or file."""
     from glob import glob
+
+    from calib_ros.kinematics.chain_file import shipped_robots  # loads numpy, no `--help` needs it
 
     return [*shipped_robots(), *glob(f'{prefix}*')]
 
@@ -170,11 +157,11 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
     add('--joints', type=Path, metavar='FILE', help='log of the joint values, row by row')
 
 
+<<<<<<< HEAD
+=======
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
     """Return how to read a table of others, None where nothing says that it is one."""
-    names = [*('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector')]
-    names += ['inverse', 'shift', 'separator', 'decimal', 'sheet']
-    given = {name: getattr(options, name) for name in names}
+    given = {name: getattr(options, name) for name in LAYOUT}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
@@ -186,6 +173,7 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     return Foreign(layout, chain, options.joints, log if options.joints else Layout())
 
 
+>>>>>>> people
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings that are among the options, the others by default."""
     given: dict[str, Any] = {
@@ -231,6 +219,34 @@ def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
         add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
 
 
+def add_detections(parser: argparse.ArgumentParser) -> None:
+    """Add the options of what a camera saw."""
+    group = parser.add_argument_group('what a camera saw (docs/images.md)')
+    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
+    add_each(
+        group,
+        Path,
+        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
+        ('--board', 'FILE', None, 'YAML of that board'),
+        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
+        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
+    )
+    group.add_argument(
+        '--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given'
+    )
+
+
+def add_previous(parser: argparse.ArgumentParser) -> None:
+    """Add the options of an earlier calibration."""
+    group = parser.add_argument_group('an earlier calibration (docs/history.md)')
+    add = group.add_argument
+    text = 'bring this one up to date by a few poses, and say what has changed since'
+    add('--previous', metavar='CALIBRATION', help=text)
+    text = 'by which lengths wander in a year; angles by twice as many mrad'
+    add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
+    add_moved(group)
+
+
 def add_moved(parser: Group) -> None:
     """Add the options that say what of the cell is another one now."""
     add = parser.add_argument
@@ -242,54 +258,3 @@ def add_history(parser: Group) -> None:
     """Add the option that says where a result is filed besides."""
     text = 'file the result there as well, by --serial'
     parser.add_argument('--history', metavar='DIR', help=text)
-
-
-def history_of(options: argparse.Namespace) -> History | None:
-    """Return where a result is filed, if it is to be; refuse one without a serial number."""
-    if options.history is None:
-        return None
-    if not options.serial:
-        raise InputError('--history files by serial number: give --serial as well')
-    return History(options.history)
-
-
-def filing_of(
-    options: argparse.Namespace,
-    nominal: Chain,
-    sets: Sequence[Observations],
-    measured: Path,
-    *judged_by: object,
-) -> Filing:
-    """Return what is filed of a result besides the result."""
-    settings = settings_hash(nominal, settings_of(options), *judged_by)
-    changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
-    content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
-    return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
-
-
-def origin_of(
-    options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
-) -> Origin:
-    """Return whence a result comes: the options, and the files that were read."""
-    chain = Path(options.chain)
-    known = (*inputs, chain if chain.is_file() else None)
-    names = ('operator', 'serial', 'device')
-    told = {name: getattr(options, name, '') for name in names}
-    return Origin(inputs_of(known), settings=settings, **told)
-
-
-def page_of(
-    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
-) -> Contents:
-    """Return a report as the content of files by name; nothing where an extra is missing.
-
-    That is said once. `pdf` asks for report.pdf as well.
-    """
-    found: dict[str, str | bytes | None] = {name: render(report)}
-    if found[name] is None:
-        screen.warn(MISSING, 'note')
-    if pdf:
-        found['report.pdf'] = on_paper(report)
-        if found['report.pdf'] is None:
-            screen.warn(MISSING_PDF, 'note')
-    return {each: content for each, content in found.items() if content is not None}

@@ -11,14 +11,13 @@ import numpy as np
 
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import Visibility, draw_candidates
-from calib_ros.apply.choice import CRITERIA
 from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_file
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import joints_csv, read_joints
@@ -26,39 +25,6 @@ from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.maps import plan_report
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what is wanted')
-    common.add_chain(group)
-    add = group.add_argument
-    add('--poses', type=int, metavar='N', help='how many; 25, or what --accuracy needs')
-    add('--accuracy', type=float, metavar='MM', help='wanted RMS position error at the task poses')
-    add('--iso9283', action='store_true', help='the five test poses of ISO 9283 instead')
-    add('--task', type=Path, metavar='FILE', help='CSV q1..qn; random poses if not given')
-    add('--taken', type=Path, metavar='FILE', help='CSV q1..qn of poses measured already')
-    common.add_out(group, 'CSV q1..qn to write, and its report beside it', 'FILE')
-    add = parser.add_argument_group('poses to choose from').add_argument
-    add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
-    add('--draw', type=int, default=2000, metavar='N', help='random candidates without a file')
-    add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
-    text = 'least move of a joint between poses [rad, m]'
-    add('--apart', type=float, default=1e-3, metavar='X', help=text)
-    text = 'of the joints [rad/s, m/s]'
-    add('--velocity', type=float, nargs='+', default=[1.0], metavar='V', help=text)
-    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    add = parser.add_argument_group('what the device sees').add_argument
-    add('--measured', choices=('pose', 'position'), default='pose', help='at each pose')
-    add('--box', type=float, nargs=6, metavar='M', help='measurable region: lower, upper corner')
-    add('--tracker', type=float, nargs=3, metavar='M', help='where the device stands')
-    forward, text = [0.0, 0.0, 1.0], 'of the target, to face it'
-    add('--axis', type=float, nargs=3, default=forward, metavar='X', help=text)
-    add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
-    add('--world', action='store_true', help='box and tracker are in the world, not in the base')
-    common.add_settings(
-        parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed')
-    )
-    common.add_identity(parser)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -90,11 +56,11 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             design.chain,
             joints,
             words,
-            common.origin_of(options, (options.candidates, options.task, options.taken)),
+            given.origin_of(options, (options.candidates, options.task, options.taken)),
             plan,
             options.accuracy,
         )
-        pages = common.page_of(report, screen, page.name)
+        pages = given.page_of(report, screen, page.name)
         write_file(options.out, joints_csv(joints), overwrite=options.force)
         for text in pages.values():
             write_file(page, text, overwrite=options.force)
@@ -163,16 +129,3 @@ def _check(options: argparse.Namespace) -> None:
 def _page_beside(path: Path) -> Path:
     """Return where the report of a plan is."""
     return path.with_name(f'{path.stem}.report.html')
-
-
-COMMANDS = {
-    'plan': Command(
-        _add,
-        _run,
-        (
-            'plan --chain ur10e --accuracy 0.1 --out plan.csv',
-            'plan --chain ur10e --poses 40 --tracker 3 0 1 --cone 45 --out plan.csv',
-            'plan --chain ur10e --iso9283 --out tests.csv',
-        ),
-    ),
-}

@@ -12,20 +12,9 @@ from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import load_calibration
-from calib_ros.identification.recalibration import GROWTH, Recalibration, recalibrate, years_since
+from calib_ros.identification.recalibration import Recalibration, recalibrate, years_since
 
 FILES = ('calibration.yaml', 'result.json')
-
-
-def add_previous(parser: argparse.ArgumentParser) -> None:
-    """Add the options of an earlier calibration."""
-    group = parser.add_argument_group('an earlier calibration (docs/history.md)')
-    add = group.add_argument
-    text = 'bring this one up to date by a few poses, and say what has changed since'
-    add('--previous', metavar='CALIBRATION', help=text)
-    text = 'by which lengths wander in a year; angles by twice as many mrad'
-    add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
-    common.add_moved(group)
 
 
 def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], screen: Screen) -> int:

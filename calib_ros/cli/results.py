@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calib_ros.cli.options import page_of
+from calib_ros.cli.given import page_of
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import Calibration

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli.command import Command
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import (
@@ -38,16 +37,6 @@ def _robots(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-def _add_chain(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('which arm')
-    add = group.add_argument
-    add('robot', metavar='ROBOT', help='URDF, chain file, or a robot by its name (ur10e, ...)')
-    add('--base-link', metavar='LINK', help='of a URDF: where the arm starts, else its root')
-    add('--tip-link', metavar='LINK', help='of a URDF: where the arm ends, such as tool0')
-    add('--convention', metavar='NAME', help='of the table from a URDF: standard or modified')
-    add('--out', type=Path, metavar='FILE', help='file to write instead')
-
-
 def _chain(options: argparse.Namespace, screen: Screen) -> int:
     names = ('base_link', 'tip_link', 'convention')
     given = {name: getattr(options, name) for name in names if getattr(options, name)}
@@ -70,11 +59,3 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
         write_file(options.out, text)
         screen.say(f'wrote {options.out}')
     return 0
-
-
-COMMANDS = {
-    'robots': Command(lambda parser: None, _robots, ('robots',)),
-    'chain': Command(
-        _add_chain, _chain, ('chain ur10e', 'chain robot.urdf --tip-link tool0 --out robot.yaml')
-    ),
-}

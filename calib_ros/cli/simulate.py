@@ -11,8 +11,8 @@ import numpy as np
 
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
@@ -22,27 +22,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.report import words
 from calib_ros.settings import Settings
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to simulate')
-    group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
-    common.add_chain(group)
-    _add_simulation(group)
-
-
-def _add_demo(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to simulate')
-    common.add_chain(group, 'ur10e')
-    common.add_out(group, 'what it writes', default=Path('demo'))
-    _add_simulation(group)
-
-
-def _add_simulation(parser: argparse._ArgumentGroup) -> None:
-    add = parser.add_argument
-    add('--poses', type=int, default=60, metavar='N', help='poses to measure')
-    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    common.add_storage(parser)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -65,7 +44,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         loaded = of_bag(*replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors from it')
         configuration = words.configuration_yaml(options.chain, settings)
-        origin = common.origin_of(options, [bag], configuration)
+        origin = given.origin_of(options, [bag], configuration)
         found = identified(loaded, settings, screen, origin)
         screen.say('4. writing the report')
         write_files(folder, result_files(found, screen, options.out))
@@ -91,9 +70,3 @@ def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> P
     truth = bag.with_name(f'{bag.name}_truth.yaml')
     write_bag(bag, recording, options.storage, {truth: dump_chain(true, {'source': 'simulation'})})
     return truth
-
-
-COMMANDS = {
-    'demo': Command(_add_demo, _demo, ('demo', 'demo --chain franka_panda --out demo_panda/')),
-    'simulate': Command(_add, _run, ('simulate cell_bag --chain kuka_iiwa14 --poses 60',)),
-}

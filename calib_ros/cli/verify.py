@@ -6,11 +6,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
@@ -22,42 +21,10 @@ from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import verification_report
+from calib_ros.report.verified import STATES, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
-TITLES = {
-    'PASS': ('PASS: the arm is within the tolerance', True),
-    'FAIL': ('FAIL: the arm is beyond the tolerance', False),
-    'UNDECIDED': ('UNDECIDED: too few measurements to tell', None),
-    'JUDGED': ('judged: without --tolerance there is no verdict', None),
-}
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to judge')
-    add = group.add_argument
-    text = 'new measurements: a bag, or a table with q1..qn as reported, x y z ...'
-    add('measured', type=Path, metavar='MEASURED', help=text)
-    common.add_chain(group)
-    common.add_calibration(group)
-    text = 'the program before its correction, q1..qn: judge against the poses that it means'
-    add('--commanded', type=Path, metavar='FILE', help=text)
-    add('--session', metavar='NAME', help='session of the table')
-    common.add_moved(group)
-    group = parser.add_argument_group('how to judge')
-    wanted = 'wanted RMS position error; if not given, errors only, without a verdict'
-    common.add_each(
-        group,
-        float,
-        ('--tolerance', 'MM', None, wanted),
-        ('--confidence', 'SHARE', 0.95, 'of the verdict'),
-    )
-    common.add_out(group, 'the report and the residuals')
-    common.add_history(group)
-    common.add_settings(parser, common.OF_BAGS)
-    common.add_layout(parser)
-    common.add_identity(parser, pdf=True)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -70,7 +37,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
-    history = common.history_of(options)
+    history = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = load_calibration(options.calibration, nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
@@ -90,7 +57,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     if history is not None:
         judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
         hashed = table_hash(arm.chain)
-        about = common.filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
+        about = given.filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)
@@ -102,11 +69,11 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     with screen.work('writing the report'):
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
         report = verification_report(
-            arm.chain, found, poses, common.origin_of(options, read), warnings
+            arm.chain, found, poses, given.origin_of(options, read), warnings
         )
         contents['residuals.csv'] = poses.table()
         contents['verification.txt'] = f'{in_words(found)}\n'
-        contents |= common.page_of(report, screen, pdf=options.pdf)
+        contents |= given.page_of(report, screen, pdf=options.pdf)
     return status
 
 
@@ -119,7 +86,8 @@ def show(found: Verification, screen: Screen) -> None:
     tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    screen.title(*TITLES[found.verdict])
+    state = STATES[found.verdict]
+    screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     screen.table(
         (
             ('measured', f'{after.count} times at {found.configurations} poses'),
@@ -156,16 +124,3 @@ def _sets(
     if not (fitted or held_out):
         raise InputError(f'{options.measured} gives no poses: {session.account()}')
     return (*fitted, *held_out), read.warnings, False
-
-
-COMMANDS = {
-    'verify': Command(
-        _add,
-        _run,
-        (
-            'verify new.csv --chain ur10e --calibration result/',
-            'verify recording/ --chain ur10e --calibration result/ --tolerance 0.3',
-            'verify new.csv --chain ur10e --calibration result/ --commanded tests.csv',
-        ),
-    ),
-}

@@ -5,20 +5,18 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
 from calib_ros.apply import placement, workspace
-from calib_ros.apply.placement import AIMS, task_of
+from calib_ros.apply.placement import task_of
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.cli import given
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import (
-    MODELS,
     Calibration,
     calibration_file,
     load_calibration,
@@ -30,26 +28,6 @@ from calib_ros.report.markdown import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
-
-
-def _add(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to map')
-    add = group.add_argument
-    text = 'folder of identify --out, or a calibrated chain file alone'
-    add('result', type=Path, metavar='RESULT', help=text)
-    common.add_chain(group)
-    common.add_out(group, 'tables, words and figures', needed=True)
-    add('--poses', type=int, default=20_000, metavar='N', help='random poses of the survey')
-    add('--model', choices=MODELS, default='corrected', help='by which the arm is commanded')
-    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    add = parser.add_argument_group('a task to place').add_argument
-    add('--task', type=Path, metavar='FILE', help='CSV x y z qx qy qz qw in the frame of a task')
-    add('--joint-box', type=float, nargs='+', metavar='Q', help='task: lower, then upper values')
-    add('--aim', choices=AIMS, default='mean', help='error over the poses of the task')
-    add('--region', type=float, nargs=6, metavar='M', help='for the task, lower, upper corner')
-    add('--cells', type=int, default=9, metavar='N', help='placements along each axis')
-    add('--turns', type=int, default=1, metavar='N', help='turns about the vertical to try')
-    common.add_identity(parser)
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -88,11 +66,11 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    origin = common.origin_of(options, (calibration_file(options.result),))
+    origin = given.origin_of(options, (calibration_file(options.result),))
     with screen.work('writing the report'):
         report = workspace_report(arm, survey, origin, found)
         contents['workspace.md'] = markdown(report, {})
-        return contents | common.page_of(report, screen)
+        return contents | given.page_of(report, screen)
 
 
 def _show(survey: Survey, screen: Screen) -> None:
@@ -129,15 +107,3 @@ def _task(
         raise InputError('--joint-box: give all lower values first, then all upper ones')
     joints = rng.uniform(lower, upper, (30, size))  # poses that stand for all
     return task_of(in_base(arm.commanded_by(options.model), joints))
-
-
-COMMANDS = {
-    'workspace': Command(
-        _add,
-        _run,
-        (
-            'workspace result/ --chain ur10e --out map/',
-            'workspace result/ --chain ur10e --task task.csv --out map/ --aim max',
-        ),
-    ),
-}

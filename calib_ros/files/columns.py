@@ -70,12 +70,14 @@ class Columns:
         `values` are the numbers of the columns where they are known.
         """
         found = self.numbers(names) if values is None else values
-        nothing = np.isnan(found)
-        if nothing.any():
+        highest = max(found.max(initial=0.0), -found.min(initial=0.0))
+        if np.isnan(highest):
+            nothing = np.isnan(found)
             lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
                 cell_number('', self.where(row, names[int(nothing[row].argmax())]))
-        if max(-np.nanmin(found, initial=0.0), np.nanmax(found, initial=0.0)) > largest:
+            highest = np.nanmax(np.abs(found), initial=0.0)
+        if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
             cell_number(repr(found[row, k]), self.where(row, names[k]), largest)
         return found
@@ -168,9 +170,9 @@ class MadeColumns(Columns):
 
 def numbered(texts: Sequence[str]) -> Codes:
     """Return the number of each text, and the different ones."""
-    known: dict[str, int] = {}
-    numbers = [known.setdefault(text, len(known)) for text in texts]
-    return np.array(numbers, dtype=np.intp), list(known)
+    known = {text: number for number, text in enumerate(dict.fromkeys(texts))}
+    numbers = np.fromiter(map(known.__getitem__, texts), dtype=np.intp, count=len(texts))
+    return numbers, list(known)
 
 
 def check_quaternions(columns: Columns, quat: FloatArray) -> None:

@@ -8,7 +8,6 @@ import csv
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +15,16 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
+from calib_ros.files.decimals import LONGEST, decimals
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, read_text
+from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
 
-IRREGULAR = ('"', '\r', '\0')
+IRREGULAR = (b'"', b'\r', b'\0')
 """What cells are not cut at separators alone with."""
 BLOCK = 2**18
 """Bytes that are looked at together: they stay in the cache."""
+CELLS = BLOCK // 16
+"""Cells that are read together: likewise."""
 WIDEST, FEW = 40, 100
 """Characters of a text, and how many different ones, that are told apart all at once."""
 
@@ -31,33 +33,35 @@ WIDEST, FEW = 40, 100
 class TextColumns(Columns):
     """The columns of a regular text: cells are what is between separators."""
 
-    _rows: Sequence[str]
     _separator: str
-    _bytes: NDArray[np.uint8]
+    _data: bytes
     _ends: NDArray[np.int32]
-    """Where each cell ends (N, C) in the bytes; it begins one after the end of the one before."""
+    """Where each cell ends (N, C) in the text; it begins one after the end of the one before."""
 
     def blank(self, name: str) -> NDArray[np.bool_]:
         """Return (N,) which cells of a column are empty."""
-        return self._empty[:, self.header.index(name)]
+        begins, ends = self._places(name)
+        return np.asarray(begins == ends)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
-        k = self.header.index(name)
-        return [row.split(self._separator, k + 1)[k] for row in self._rows]
+        begins, ends = self._places(name)
+        data, places = self._data, zip(begins.tolist(), ends.tolist(), strict=True)
+        return [data[begin:end].decode() for begin, end in places]
 
     def select(self, rows: NDArray[np.generic] | slice) -> TextColumns:
         """Return some of the rows, by a mask, by indices or by a slice."""
-        index = np.arange(len(self.lines))[rows]
-        text = '\n'.join([self._rows[k] for k in index.tolist()])
-        found = regular(self.path, text, self._separator, self.header)
+        index, width = np.arange(len(self.lines))[rows], len(self.header)
+        begins, ends = self._ends[:-1:width][index] + 1, self._ends[width::width][index]
+        places = zip(begins.tolist(), ends.tolist(), strict=True)
+        data = b'\n'.join([self._data[begin:end] for begin, end in places])
+        found = regular(self.path, data, self._separator, self.header)
         assert found is not None
         return replace(found, lines=self.lines[index])
 
     def codes(self, name: str) -> Codes:
         """Return the number of each row's text, and the texts."""
-        k, width = self.header.index(name), len(self.header)
-        starts, ends = self._ends[k:-1:width] + np.int32(1), self._ends[k + 1 :: width]
+        starts, ends = self._places(name)
         longest = int((ends - starts).max(initial=0))
         if longest == 0:
             return np.zeros(len(starts), dtype=np.intp), ['']
@@ -66,7 +70,7 @@ class TextColumns(Columns):
         place = starts[:, np.newaxis] + np.arange(longest, dtype=np.int32)
         beyond = place >= ends[:, np.newaxis]
         place[beyond] = 0
-        cells = self._bytes[place]
+        cells = np.frombuffer(self._data, dtype=np.uint8)[place]
         cells[beyond] = 0
         words = np.ascontiguousarray(cells).view(f'S{longest}').ravel()
         numbers = np.full(len(words), -1, dtype=np.intp)
@@ -84,45 +88,36 @@ class TextColumns(Columns):
 
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
         columns = [self.header.index(name) for name in names]
-        blank = self._empty[:, columns]
-        lacking = np.asarray(blank.any(axis=0))
-        some = np.flatnonzero(~(lacking & blank.all(axis=0)))
-        if not len(some):
-            return np.full(blank.shape, np.nan)
-        rows = self._filled if lacking[some].any() else self._rows
-        use = [columns[k] for k in some.tolist()]
-        try:
-            read = np.loadtxt(rows, delimiter=self._separator, usecols=use, ndmin=2, comments=None)
-        except (ValueError, OverflowError):
-            return None
-        finite = np.isfinite(read)
-        if not (finite.all() or (finite | blank[:, some]).all()):
-            return None
-        if len(some) == len(names):
-            return read
-        found = np.full(blank.shape, np.nan)
-        found[:, some] = read
+        found = np.full((len(self.lines), len(names)), np.nan)
+        width, height = len(self.header), max(1, CELLS // max(1, len(names)))
+        for row in range(0, len(found), height):
+            places = self._ends[row * width : (row + height) * width + 1].astype(np.intp)
+            ends = places[1:].reshape(-1, width).take(columns, axis=1).ravel()
+            begins = places[:-1].reshape(-1, width).take(columns, axis=1).ravel() + 1
+            filled = begins < ends
+            if not filled.all():
+                begins, ends = begins[filled], ends[filled]
+            numbers, read = decimals(self._data, begins, ends)
+            rest = np.flatnonzero(~read)
+            cells = zip(begins[rest].tolist(), ends[rest].tolist(), strict=True)
+            try:
+                numbers[rest] = [float(self._data[begin:end]) for begin, end in cells]
+            except ValueError:
+                return None
+            if not np.isfinite(numbers).all():
+                return None
+            found[row : row + height].reshape(-1)[filled] = numbers
         return found
 
-    @cached_property
-    def _empty(self) -> NDArray[np.bool_]:
-        """Return which cells (N, C) are empty."""
-        return np.asarray(np.diff(self._ends) == 1).reshape(-1, len(self.header))
-
-    @cached_property
-    def _filled(self) -> list[str]:
-        """Return the rows with NaN in empty cells."""
-        sep = self._separator
-        text = '\n' + '\n'.join(self._rows) + '\n'
-        for _ in range(2):  # neighbours share a separator
-            text = text.replace(sep + sep, f'{sep}nan{sep}')
-        text = text.replace(f'\n{sep}', f'\nnan{sep}').replace(f'{sep}\n', f'{sep}nan\n')
-        return text[1:-1].split('\n')
+    def _places(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return where the cells of a column begin and end."""
+        k, width = self.header.index(name), len(self.header)
+        return self._ends[k:-1:width] + np.int32(1), self._ends[k + 1 :: width]
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
     """Return the columns of a CSV with rows, some of which it needs to have."""
-    return with_rows(columns_of(path, read_text(path, LARGEST_TABLE, InputError)), needed)
+    return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
 
 
 def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
@@ -138,8 +133,8 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
     return found
 
 
-def columns_of(path: Path, text: str) -> Columns:
-    """Return the columns of the text of a CSV.
+def columns_of(path: Path, data: bytes) -> Columns:
+    """Return the columns of the content of a CSV.
 
     Raises
     ------
@@ -148,57 +143,58 @@ def columns_of(path: Path, text: str) -> Columns:
         several columns could be meant with.
 
     """
-    return regular(path, text) or _irregular(path, text)
+    if not data.isascii():
+        data = decoded(data, str(path), InputError).encode()
+    return regular(path, data) or _irregular(path, data.decode())
 
 
 def regular(
-    path: Path, text: str, separator: str = ',', header: Sequence[str] = (), above: int = 0
+    path: Path, data: bytes, separator: str = ',', header: Sequence[str] = (), above: int = 0
 ) -> TextColumns | None:
     """Return the columns of a text, None where it is not regular.
 
     Its first line is the header unless one is given; `above` are lines of the file before it.
     """
-    if '\r' in text:
-        text = text.replace('\r\n', '\n')
-    if not text or any(each in text for each in IRREGULAR):
+    if b'\r' in data:
+        data = data.replace(b'\r\n', b'\n')
+    if not data or any(each in data for each in IRREGULAR):
         return None
-    if not text.endswith('\n'):
-        text += '\n'
-    rows = text.split('\n')[:-1]
-    lines = above + 1 + np.arange(len(rows))
-    if '' in rows:
-        lines = lines[[bool(row) for row in rows]]
-        rows = [row for row in rows if row]
-        text = '\n'.join([*rows, ''])
-    flat = np.frombuffer(text.encode(), dtype=np.uint8)
-    if not header:
-        if not rows:
-            return None
-        flat = flat[len(rows[0].encode()) + 1 :]
-        header, rows, lines = rows[0].split(separator), rows[1:], lines[1:]
-    width = len(header)
-    if not len(lines) or len(set(header)) < width or width > MOST_ENTRIES:
+    if not data.endswith(b'\n'):
+        data += b'\n'
+    begin = 0 if header else data.index(b'\n') + 1
+    names = tuple(header or data[: begin - 1].decode().split(separator))
+    width = len(names)
+    if len(set(names)) < width or width > MOST_ENTRIES:
         return None
-    ends = _ends(flat, separator, width * len(lines))
+    ends = None
+    if begin + 1 < len(data):
+        padded = data if begin >= LONGEST else bytes(LONGEST) + data[begin:]
+        ends = _ends(padded, max(begin, LONGEST), separator, width)
+    if (ends is None or width == 1) and b'\n\n' in b'\n' + data:
+        rows = data.split(b'\n')[:-1]
+        found = regular(path, b'\n'.join(filter(None, rows)), separator, header)
+        lines = above + 1 + np.flatnonzero([bool(row) for row in rows])[int(not header) :]
+        return found and replace(found, lines=lines)
     if ends is None:
         return None
-    if not (flat[ends[width::width]] == ord('\n')).all():
+    lines = above + 1 + int(begin > 0) + np.arange(len(ends) // width)
+    return TextColumns(path, names, lines, separator, padded, ends)
+
+
+def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int32] | None:
+    """Return where the cells of a text end, behind the end of what is before; None if ragged."""
+    flat = np.frombuffer(data, dtype=np.uint8)
+    found = [np.array([begin - 1], dtype=np.int32)]
+    rows = 0
+    for start in range(begin, len(flat), BLOCK):
+        part = flat[start : start + BLOCK]
+        last = part == ord('\n')
+        rows += int(np.count_nonzero(last))
+        found.append((np.flatnonzero(last | (part == ord(separator))) + start).astype(np.int32))
+    ends = np.concatenate(found)
+    if len(ends) != 1 + width * rows or not (flat[ends[width::width]] == ord('\n')).all():
         return None
-    return TextColumns(path, tuple(header), lines, rows, separator, flat, ends)
-
-
-def _ends(flat: NDArray[np.uint8], separator: str, count: int) -> NDArray[np.int32] | None:
-    """Return where the cells of a text end, behind a -1; None where they are not `count`."""
-    ends = np.empty(count + 1, dtype=np.int32)
-    ends[0], known = -1, 1
-    for begin in range(0, len(flat), BLOCK):
-        part = flat[begin : begin + BLOCK]
-        found = np.flatnonzero((part == ord(separator)) | (part == ord('\n')))
-        if known + len(found) > len(ends):
-            return None
-        ends[known : known + len(found)] = found + begin
-        known += len(found)
-    return ends if known == len(ends) else None
+    return ends
 
 
 def _irregular(path: Path, text: str) -> MadeColumns:

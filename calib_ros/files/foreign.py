@@ -195,7 +195,8 @@ class _Table:
             if ours in self._ours:
                 number = self._sheet.number(_bare(self._ours[ours]))
                 assert number is not None
-                found[ours] = self._sheet.columns.texts(number)
+                cells, known = self._sheet.columns.codes(number)
+                found[ours] = [known[cell] for cell in cells.tolist()]
         return found
 
     def values(self) -> dict[str, FloatArray]:

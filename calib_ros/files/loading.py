@@ -14,7 +14,6 @@ from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.tables import Table, read_table
 from calib_ros.identification.identification import Identification
-from calib_ros.identification.levels import EXCEPTION
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
@@ -23,9 +22,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
-
-LARGEST_LOSS = EXCEPTION
-"""Share of the messages of a bag that may be lost."""
 
 
 @dataclass(frozen=True, eq=False)

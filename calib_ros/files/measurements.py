@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +99,7 @@ class Measurements:
                 found[item.name] = (value[0][rows], value[1])
         return replace(self, **found)  # type: ignore[arg-type]
 
-    @property
+    @cached_property
     def codes(self) -> NDArray[np.intp]:
         """Return what frames and sets depend on (N, 6), session, device and target first."""
         words = (self.session[0], self.device[0], self.target[0])
@@ -121,6 +122,8 @@ class Measurements:
                     same.pop()
             rows = sorted(row for same in open_rows.values() for row in same)
             found = self.select(np.array(rows, dtype=np.intp))
+        if (np.diff(found.stamps_ns) > 0).all():
+            return found
         _, number = distinct(found.codes)
         order = np.lexsort((number, found.stamps_ns))
         same_stamp, same_kind = np.diff(found.stamps_ns[order]), np.diff(number[order])
@@ -169,14 +172,14 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     header = columns.header
     _check_header(columns, joints)
     has = [~columns.blank(n) if n in header else np.zeros(len(columns.lines), bool) for n in KINDS]
-    filled = np.column_stack(has)
-    for row in np.flatnonzero(filled.sum(axis=1) > 1)[:1].tolist():
-        kinds = ' and '.join(np.array(KINDS)[filled[row]])
+    filled = np.array(has)
+    for row in np.flatnonzero(filled.sum(axis=0, dtype=np.uint8) > 1)[:1].tolist():
+        kinds = ' and '.join(np.array(KINDS)[filled[:, row]])
         raise InputError(
             f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each kind of '
             'measurement a row of its own'
         )
-    kind = filled.argmax(axis=1)
+    kind = filled.argmax(axis=0)
     placed = kind == POSE
     read = _Blocks(columns, joints)
     count = len(columns.lines)

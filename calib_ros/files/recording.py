@@ -21,8 +21,6 @@ from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import VALIDATION
 
-STORAGES = ('mcap', 'sqlite3')
-
 
 @dataclass(frozen=True, eq=False)
 class Recording:

@@ -80,7 +80,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         if separator == ' ':
             text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
             text = re.sub(r'[ \t]+', ' ', text)
-        rows = _cells(path, '\n'.join(text.split('\n', HEAD)[:-1] or [text]), separator)
+        rows = _cells(path, text[: _after(text, HEAD)], separator)
     decimal = layout.decimal or _decimal(rows, separator, notes)
     at, header = _header(path, rows, names, known)
     used = [header.index(n) for n in names if not n.startswith('#') and n in header]
@@ -93,9 +93,9 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     columns: Columns | None = None
     start = rows[first][0]
     if text:
-        body = text.split('\n', start - 1)[-1]
+        body = text[_after(text, start - 1) :].encode()
         if decimal == ',':
-            body = body.replace(',', '.')
+            body = body.replace(b',', b'.')
         numbers = [f'#{k + 1}' for k in range(width)]
         columns = regular(path, body, separator, numbers, start - 1)
         if columns is None:
@@ -105,6 +105,16 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         columns = _ragged(path, rows[first:], len(header), decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
+
+
+def _after(text: str, lines: int) -> int:
+    """Return where a text goes on after so many lines."""
+    at = 0
+    for _ in range(lines):
+        at = text.find('\n', at) + 1
+        if not at:
+            return len(text)
+    return at
 
 
 def _text(path: Path) -> tuple[str, str]:
@@ -171,7 +181,7 @@ def _cell(value: object) -> str:
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
     """Return the separator by which most lines have the same number of cells, more than one."""
-    lines = [line for line in text.split('\n', HEAD)[:HEAD] if line.strip()]
+    lines = [line for line in text[: _after(text, HEAD)].split('\n') if line.strip()]
     lines = lines[-30:]  # under most of what stands above the header
     if not lines:
         raise InputError(f'{path} has no rows')

@@ -45,7 +45,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.problems import with_lenses
 from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses, socket_pairs
 from calib_ros.shown import Shown
-from calib_ros.texts import LARGEST_TABLE, csv_text, decoded, read_bytes
+from calib_ros.texts import LARGEST_TABLE, csv_text, read_bytes
 
 Sets = tuple[Observations, ...]
 
@@ -115,8 +115,8 @@ def read_table(
     if foreign is not None:
         made, warnings = foreign.convert(path)
         return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
-    text, warnings = _read(path, columns(joints))
-    return table_of(columns_of(path, text), joints, sessions, sigmas, eye_in_hand, warnings)
+    data, warnings = _read(path, columns(joints))
+    return table_of(columns_of(path, data), joints, sessions, sigmas, eye_in_hand, warnings)
 
 
 def table_of(
@@ -209,8 +209,8 @@ def _rates(values: FloatArray | None) -> FloatArray | None:
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
     """Return the samples of a journal, of which there may be none, and warnings."""
-    text, warnings = _read(path, columns(joints))
-    return tuple(_samples(measurements(columns_of(path, text), joints).kept())), warnings
+    data, warnings = _read(path, columns(joints))
+    return tuple(_samples(measurements(columns_of(path, data), joints).kept())), warnings
 
 
 def _samples(made: Measurements) -> Iterator[Sample]:
@@ -288,16 +288,15 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
     return csv_text([row[k] for k in used] for row in (names, *rows))
 
 
-def _read(path: Path, journal: Sequence[str]) -> tuple[str, tuple[str, ...]]:
-    """Return the text of a table, and warnings; `journal` is the header of one."""
+def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
+    """Return the content of a table, and warnings; `journal` is the header of one."""
     data = whole = read_bytes(path, LARGEST_TABLE, InputError)
     if data.startswith(','.join(journal).encode()):
         whole = data[: data.rfind(b'\n') + 1]
-    text = decoded(whole, str(path), InputError)
     if len(whole) < len(data):
         line = whole.count(b'\n') + 1
-        return text, (f'{path}: line {line} was cut off and is left out',)
-    return text, ()
+        return whole, (f'{path}: line {line} was cut off and is left out',)
+    return data, ()
 
 
 def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Columns:

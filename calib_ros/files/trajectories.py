@@ -55,7 +55,7 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
 
 
 def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
-    found = columns_of(path, text)
+    found = columns_of(path, text.encode())
     positions = joint_values(found, len(joints))
     signs = [f's{k + 1}' for k in range(len(joints))]
     signed = set(signs) <= set(found.header)

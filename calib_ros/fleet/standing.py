@@ -10,13 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
-from calib_ros.apply.chart import YEARS, Drift, drift
+from calib_ros.apply.chart import Drift, drift
 from calib_ros.errors import CalibrationError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, results
 from calib_ros.fleet.watch import Watched, watch
+from calib_ros.settings import YEARS
 
 State: TypeAlias = Literal['changed', 'worse', 'unreadable', 'refused', 'beyond tolerance', 'fine']
 STATES: tuple[State, ...] = get_args(State)

@@ -30,7 +30,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from calib_ros.apply.chart import YEARS
 from calib_ros.files.rows import Row
 from calib_ros.identification.changes import (
     Columns,
@@ -43,6 +42,7 @@ from calib_ros.identification.changes import (
 from calib_ros.identification.levels import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import YEARS
 
 LAGS = (1, 2, 4, 8)
 """Nights that a change is looked for in: a large one shows at once, a small one after some."""

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any
 
 import numpy as np
 
@@ -44,11 +44,9 @@ from calib_ros.kinematics.chain_file import (
 )
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import Settings
+from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
 
-Model: TypeAlias = Literal['corrected', 'nominal']
-MODELS: tuple[Model, ...] = get_args(Model)
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
 

@@ -55,12 +55,16 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     number = stops(joints)
     standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
     place = np.concatenate([np.cos(standing), np.sin(standing)], axis=1)  # which knows no turns
-    near, label = _near(standing, place), np.arange(len(standing))
+    close, label = _pairs(place, SCATTER), np.arange(len(standing))
+    # what stands still is nearer than visits may scatter
+    near = close[_still(standing[close[:, 0]] - standing[close[:, 1]])]
     if len(near):
         links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
         _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
-    return np.asarray(_repeats(place[first])[label[number]], dtype=np.intp)
+    if np.isin(close, first).all(axis=1).any():
+        label = _repeats(place[first])[label]
+    return np.asarray(label[number], dtype=np.intp)
 
 
 def _repeats(place: FloatArray) -> NDArray[np.intp]:
@@ -71,7 +75,7 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
     """
     count = len(place)
     apart = np.arange(count)
-    if count < TELLING or not len(_pairs(place, SCATTER)):
+    if count < TELLING:
         return apart
     far, near = cKDTree(place).query(
         place, k=range(2, 2 + min(TELLING, count - 1)), distance_upper_bound=GAP * SCATTER
@@ -98,12 +102,6 @@ def _graph(
     """Return edges (K,) between nodes, whose numbers scipy 1.11 wants in 32 bits."""
     ends = (first.astype(np.int32), second.astype(np.int32))
     return coo_array((lengths, ends), shape=(count, count))
-
-
-def _near(joints: FloatArray, place: FloatArray) -> NDArray[np.intp]:
-    """Return (K, 2) the rows of (N, n), at places (N, 2 n), within STILL of each other."""
-    pairs = _pairs(place, STILL * joints.shape[1] ** 0.5)
-    return np.asarray(pairs[_still(joints[pairs[:, 0]] - joints[pairs[:, 1]])])
 
 
 def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:

@@ -120,24 +120,22 @@ class Shifts:
     def shares(
         self, columns: Columns, known: Sequence[int], groups: Sequence[Sequence[int]]
     ) -> FloatArray:
-        """Return the share (G, S) that each group of columns explains beside those known.
+        """Return the share (G, S) that each group (G, K) of columns explains beside those known.
 
         By shift; each group is taken by itself.
         """
         matrix = columns.matrix[np.ix_(known, known)]
         root = inverse_root(matrix, np.diag(matrix))
         gone = root.T @ columns.products[known]
-        every = [k for group in groups for k in group]
-        cross = root.T @ columns.matrix[np.ix_(known, every)]
-        products = columns.products[every] - cross.T @ gone
-        found, first = [], 0
-        for group in groups:
-            part = slice(first, first + len(group))
-            own, first = columns.matrix[np.ix_(group, group)], part.stop
-            mine = inverse_root(own - cross[:, part].T @ cross[:, part], np.diag(own))
-            found.append(((mine.T @ products[part]) ** 2).sum(axis=0))
+        which = np.array(groups)
+        cross = columns.matrix[which][:, :, known] @ root  # (G, K, P)
+        products = columns.products[which] - cross @ gone
+        own = columns.matrix[which[:, :, np.newaxis], which[:, np.newaxis]]
+        size = np.einsum('gkk->gk', own)
+        mine = inverse_root(own - cross @ np.swapaxes(cross, 1, 2), size)
+        found = ((np.swapaxes(mine, 1, 2) @ products) ** 2).sum(axis=1)
         left = np.maximum(self._energy - (gone**2).sum(axis=0), 1e-300)
-        return np.asarray(np.array(found) / left)
+        return np.asarray(found / left)
 
     def _sampled(self, shifted: FloatArray) -> FloatArray:
         """Return (..., S) of all shifts (..., 2 n) of a set."""
@@ -146,7 +144,9 @@ class Shifts:
 
 def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) -> FloatArray:
     """Return (..., m c, n) the sums over each stop of (..., c, N) with weights (m, N)."""
-    parts = [np.add.reduceat(each * values, begins, axis=-1) for each in weights]
+    parts = [each * values for each in weights]
+    if len(begins) < values.shape[-1]:
+        parts = [np.add.reduceat(part, begins, axis=-1) for part in parts]
     return np.asarray(np.concatenate(parts, axis=-2))
 
 
@@ -199,14 +199,15 @@ def _correlated(
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
-    """Return T (P, k), T T^T being the inverse of (P, P) in the directions that count.
+    """Return T (..., P, P), T T^T being the inverse of (..., P, P) in the directions that count.
 
-    Those are seen with columns scaled to squared lengths `size` (P,).
+    Those are seen with columns scaled to squared lengths `size` (..., P); others are zero.
     """
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-300))
-    sizes, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    sizes, vectors = np.linalg.eigh(matrix * (scale[..., np.newaxis] * scale[..., np.newaxis, :]))
     good = sizes > ROUNDING
-    return np.asarray(scale[:, np.newaxis] * vectors[:, good] / np.sqrt(sizes[good]))
+    lengths = good / np.sqrt(np.where(good, sizes, 1.0))
+    return np.asarray(scale[..., np.newaxis] * vectors * lengths[..., np.newaxis, :])
 
 
 def chance(shares: FloatArray) -> float:

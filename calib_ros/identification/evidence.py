@@ -250,8 +250,10 @@ def _solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (P,) and a root (P, P) of the covariance."""
     scaled, scale = _scaled(matrix, precision)
-    inverse, failed = lapack.dtrtri(np.linalg.cholesky(scaled), lower=1)
-    assert not failed
+    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError('singular posterior')
+    inverse = lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
     inverse *= scale
     return inverse.T @ (inverse @ vector), inverse.T
 

@@ -36,7 +36,7 @@ from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import Region, region_of
-from calib_ros.identification.robust import MANY, OUTLIER, Robust
+from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import Step, find_step
 from calib_ros.identification.validation import (
@@ -251,8 +251,8 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     names = fitted.names
     problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
     frames = [name for name in names if start.owns_frame(name)]
-    if robust.system.count > MANY:
-        start = minimise(start, frames, robust.system.spread(MANY)).chain
+    if robust.system.count > 4 * SOME:
+        start = minimise(start, frames, robust.system.spread(SOME)).chain
     before = minimise(start, frames, robust.system, tolerance=1e-5)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)

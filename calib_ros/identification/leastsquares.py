@@ -32,8 +32,6 @@ STEP_TOLERANCE = 1e-6
 larger, in RMS residuals)."""
 PATIENCE = 3
 """Steps in succession that may raise the cost before they are damped."""
-MOST_ITERATIONS = 1000
-"""Iterations after which a fit that still progresses is given up; curved valleys need 400."""
 STALLED = 50
 """Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
 LEAST_FALL = 1e-3
@@ -250,7 +248,7 @@ def minimise(
     names: Sequence[str],
     system: System,
     tolerance: float = STEP_TOLERANCE,
-    iterations: int = MOST_ITERATIONS,
+    iterations: int = 1000,
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 
@@ -259,7 +257,8 @@ def minimise(
     steps have not brought it below the best, the fit goes back there and steps are damped
     (Levenberg 1944, Marquardt 1963), by the ratio of the gain to the one foreseen (Nielsen 1999).
     It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
-    It ends as well, not converged, where STALLED iterations bring no progress.
+    It ends as well, not converged, where STALLED iterations bring no progress, or after so many
+    `iterations`; curved valleys need 400.
     """
     normal = normal_equations(chain, names, system)
     if not names:

@@ -19,10 +19,6 @@ ALIKE = 1.5
 NEARER = 0.3
 """Ratio of two errors from which what leaves the smaller one explains clearly more
 (benchmarks/mistakes.py)."""
-EXCEPTION = 0.1
-"""Share of a whole up to which it is the exception. So many samples fewer, at random, make
-standard deviations 5 % larger, less than their own uncertainty; more may be a part of the
-workspace."""
 MOST_OUTLIERS = 0.35
 """Share of gross errors beyond which nothing is believed: half of the samples must tell the
 rest."""

@@ -19,10 +19,11 @@ from scipy import special
 
 from calib_ros.identification.configurations import STILL, stops
 from calib_ros.identification.drift import chance
-from calib_ros.identification.levels import CERTAIN, EXCEPTION, SURE
+from calib_ros.identification.levels import CERTAIN, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import EXCEPTION
 
 LEAST_OUTLIERS, LEAST_STOPS = 4, 50
 """Outliers and stops from which on they are compared with the values of joints."""

@@ -14,7 +14,7 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
@@ -83,7 +83,7 @@ def _chosen(
     model = _Linear(problem, geometric)
     chosen: list[str] = []
     verdicts: dict[str, Verdict] = {}
-    groups = {name: model.useful(effects.members(problem.chain, name)) for name in effects.GROUPS}
+    groups = model.useful({name: effects.members(problem.chain, name) for name in effects.GROUPS})
     while True:
         tried = []
         for group, names in groups.items():
@@ -147,14 +147,14 @@ class _Linear:
             blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
         dealings = (self._groups % problem.folds, blocks[self._groups])
         rows = self._rows(self._names)
-        self._columns = stacked(rows)
-        self._residual = np.ascontiguousarray(self._columns[:, -1])
+        self._columns = np.ascontiguousarray(stacked(rows).T)
+        self._residual = self._columns[-1].copy()
         self._number = {name: k for k, name in enumerate([*self._names, ''])}
         self._ends = np.cumsum([each[-1].size for each in rows])
         owner = owners(rows)
         self._folds = [dealing[owner] for dealing in dealings]
         self._products = [
-            np.array([_square(self._columns[folds == k]) for k in range(problem.folds)])
+            np.array([_square(self._columns[:, folds == k].T) for k in range(problem.folds)])
             for folds in self._folds
         ]
         self._pairs = [
@@ -166,22 +166,33 @@ class _Linear:
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
+        self._errors: dict[tuple[int, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
         self._seen: Columns | None = None
 
-    def useful(self, names: Sequence[str]) -> list[str]:
-        """Return those effects whose columns are independent of the geometric model."""
-        basis = np.linalg.qr(self._columns[:, : len(self._names)])[0]
-        kept = []
-        which = self._of(names)
-        for name, column in zip(names, self._columns[:, which].T, strict=True):
-            rest = column - basis @ (basis.T @ column)
-            rest -= basis @ (basis.T @ rest)
-            size = float(np.linalg.norm(rest))
-            if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)) and size > 0.0:
-                basis = np.column_stack([basis, rest / size])
-                kept.append(name)
-        return kept
+    def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+        """Return the effects of each group whose columns are independent of the geometric model.
+
+        What that model leaves of a column stands in the lower rows of a triangular factor.
+        """
+        every = list(dict.fromkeys(name for names in groups.values() for name in names))
+        count = len(self._names)
+        which = self._of([*self._names, *every])
+        factor = np.asarray(np.linalg.qr(self._columns[which].T, mode='r'))
+        number = {name: k for k, name in enumerate(every, count)}
+        found: dict[str, list[str]] = {}
+        for group, names in groups.items():
+            basis = np.zeros((len(factor[count:]), 0))
+            found[group] = kept = list[str]()
+            for name in names:
+                column = factor[:, number[name]]
+                rest = column[count:] - basis @ (basis.T @ column[count:])
+                rest -= basis @ (basis.T @ rest)
+                size = float(np.linalg.norm(rest))
+                if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)) and size > 0.0:
+                    basis = np.column_stack([basis, rest / size])
+                    kept.append(name)
+        return found
 
     def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> Verdict:
         """Compare the errors on configurations left out, with and without some effects."""
@@ -253,9 +264,9 @@ class _Linear:
         """Return the numbers of the columns of effects, each made once."""
         missing = [name for name in names if name not in self._number]
         if missing:
-            added = stacked(self._rows(missing))[:, :-1]
-            self._number |= {name: k for k, name in enumerate(missing, self._columns.shape[1])}
-            self._columns = np.column_stack([self._columns, added])
+            added = stacked(self._rows(missing)).T[:-1]
+            self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
+            self._columns = np.concatenate([self._columns, added])
             self._products = [
                 self._wider(parts, folds, added)
                 for parts, folds in zip(self._products, self._folds, strict=True)
@@ -268,11 +279,11 @@ class _Linear:
         return self._system.rows_of(chain, names)
 
     def _wider(self, parts: FloatArray, folds: NDArray[np.intp], added: FloatArray) -> FloatArray:
-        """Return the products (F, C, C) by fold, those of the last columns (R, K) added."""
-        inside = np.arange(self._problem.folds) == folds[:, np.newaxis]
-        size, count = self._columns.shape[1], added.shape[1]
-        masked = (inside[:, :, np.newaxis] * added[:, np.newaxis]).reshape(len(added), -1)
-        new = (self._columns.T @ masked).reshape(size, -1, count).transpose(1, 0, 2)
+        """Return the products (F, C, C) by fold, those of the last columns (K, R) added."""
+        inside = np.arange(self._problem.folds)[:, np.newaxis, np.newaxis] == folds
+        size, count = len(self._columns), len(added)
+        masked = (inside * added).reshape(-1, added.shape[1])
+        new = np.swapaxes((masked @ self._columns.T).reshape(-1, count, size), 1, 2)
         found = np.zeros((len(new), size, size))
         found[:, :-count, :-count] = parts
         found[:, :, -count:] = new
@@ -282,22 +293,27 @@ class _Linear:
     def _left_out(self, chosen: Sequence[str], dealing: int) -> FloatArray:
         """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
         which = [*range(len(self._names)), *self._of(chosen)]
+        key = (dealing, *which)
+        if key in self._errors:
+            return self._errors[key]
         extra = np.column_stack(self._extra(chosen))
         ends = [*which, self._number['']]
         parts = self._products[dealing][:, ends][:, :, ends]
         rest = parts.sum(axis=0) + _square(extra)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))  # a fold may hold all of it
-        weights = np.zeros((self._columns.shape[1], len(parts)))
+        weights = np.zeros((len(parts), len(self._columns)))
         for fold, part in enumerate(parts):
             left = (rest - part)[:-1]
             scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
             factor = linalg.cho_factor(scaled)
-            weights[which, fold] = scale * linalg.cho_solve(factor, scale * left[:, -1])
-        folds = self._folds[dealing][:, np.newaxis]
-        predicted = np.take_along_axis(self._columns @ weights, folds, axis=1)[:, 0]
+            weights[fold, which] = scale * linalg.cho_solve(factor, scale * left[:, -1])
+        folds = self._folds[dealing][np.newaxis]
+        predicted = np.take_along_axis(weights @ self._columns, folds, axis=0)[0]
         pieces = np.split(self._residual - predicted, self._ends[:-1])
         sets = self._system.sets
-        return np.concatenate([s.position_errors(p) for s, p in zip(sets, pieces, strict=True)])
+        errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]
+        self._errors[key] = np.concatenate(errors)
+        return self._errors[key]
 
     def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""

@@ -52,10 +52,9 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import frames_document, table_hash
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import GROWTH
 from calib_ros.shown import Shown
 
-GROWTH = 2e-5
-"""Growth of a length [m] per root of a year, if nothing else is said."""
 PER_METRE = SIZES['rad'] / SIZES['m']
 """Angles [rad] grow by so much more than lengths [m]."""
 MOST_FOLDS = 20

@@ -16,7 +16,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
-from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -138,19 +137,13 @@ class Samples:
         order = np.arange(size)
         for which, shift, turn, model in self.blocks(chain, names):
             last = len(turn) - 1
-            ends = [shift.shape[2]]
-            if folds is not None:
-                here = folds[which]
-                sorting = np.argsort(here, kind='stable')
-                shift, turn = shift[..., sorting], turn[..., sorting] if last >= 0 else turn
-                ends = np.cumsum(np.bincount(here, minlength=count)).tolist()
-            for (by_position, by_orientation), (first, end) in zip(
-                found, pairwise([0, *ends]), strict=True
-            ):
-                rows = shift[..., first:end].reshape(size, -1)
+            here = None if folds is None else folds[which]
+            for fold, (by_position, by_orientation) in enumerate(found):
+                part = slice(None) if here is None else np.flatnonzero(here == fold)
+                rows = shift[..., part].reshape(size, -1)
                 by_position += rows @ rows.T
                 if last >= 0:
-                    rows = turn[..., first:end].reshape(last + 1, -1)
+                    rows = turn[..., part].reshape(last + 1, -1)
                     products = rows @ rows.T
                     by_orientation[:last, :last] += products[:-1, :-1]
                     by_orientation[:last, -1] += products[:-1, -1]
@@ -171,7 +164,9 @@ class Samples:
             index = groups[first : first + block[0].shape[2]]
             first += len(index)
             begins = np.flatnonzero(np.diff(index, prepend=-1))
-            yield index[begins], tuple(np.add.reduceat(part, begins, axis=2) for part in block)
+            if len(begins) < len(index):
+                block = tuple(np.add.reduceat(part, begins, axis=2) for part in block)
+            yield index[begins], block
 
     def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
         """Return joint values (n, N) at the device's delay, and velocities where it has one."""

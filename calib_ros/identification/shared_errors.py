@@ -22,7 +22,7 @@ the parameters is then H^-1 (J^T V J) H^-1.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -141,19 +141,18 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     }
     sizes = forms.sizes(kernels)
     even = few if share == 1 else _gather(fit.chain, names, system, share, 1)
-    middles = {}
+    middles: dict[int, FloatArray] = {}
+    by_time: dict[int, list[tuple[float, float]]] = {}
     for part in alike:
         white, *rest = sizes[part]
-        middle = white * fit.normal.parts[part]
-        by_time = []
+        middles[part] = white * fit.normal.parts[part]
         for (kind, length), size in zip(kernels[part], rest, strict=True):
             if size and kind == 'near':  # sizes are never negative
-                middle = middle + size * _near(even, part, length, share)
+                middles[part] += size * _near(even, part, length, share)
             elif size:
-                by_time.append((length, size))
-        if by_time:
-            middle = middle + _successive(fit.chain, names, system, part, by_time)
-        middles[part] = middle
+                by_time.setdefault(part, []).append((length, size))
+    for part, middle in _successive(fit.chain, names, system, by_time).items():
+        middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
     return Shared(**correlations, found=found, middles=middles)
 
@@ -202,14 +201,17 @@ class _Forms:
         product = (matrix @ basis.reshape(len(basis), -1)).reshape(basis.shape)
         return np.asarray(product * self._known[part][:, :, np.newaxis])
 
-    def _trace(self, first: _Form, second: _Form) -> float:
-        """Return tr(A B C B) of two forms A and C."""
-        found = float((first.inner * second.inner).sum())
-        if first.part == second.part:
-            known = self._known[first.part]
-            found += float((known * ((first.matrix * second.matrix) @ known)).sum())
-            found -= 2.0 * float((first.product * second.product).sum())
-        return found
+    def _moments(self, forms: Sequence[_Form]) -> FloatArray:
+        """Return (F, F) the traces tr(A B C B) of forms A and C."""
+        inner = _flat(form.inner for form in forms)
+        found = inner @ inner.T
+        for part, known in self._known.items():
+            own = [k for k, form in enumerate(forms) if form.part == part]
+            matrices = _flat(forms[k].matrix for k in own)
+            products = _flat(forms[k].product for k in own)
+            both = (matrices * (known @ known.T).ravel()) @ matrices.T
+            found[np.ix_(own, own)] += both - 2.0 * (products @ products.T)
+        return np.asarray(found)
 
     def test(self, part: int, links: csr_array) -> tuple[float, float]:
         """Return the correlation of linked residuals beyond the expected one, and its score.
@@ -241,7 +243,7 @@ class _Forms:
             matrices = [np.eye(len(self._units))]
             matrices += [self._units.kernel(*kernel) for kernel in kernels.get(part, ())]
             forms += [self._form(part, matrix) for matrix in matrices]
-        moments = np.array([[self._trace(first, second) for second in forms] for first in forms])
+        moments = self._moments(forms)
         scale = np.sqrt(np.diag(moments))
         scaled = moments / np.outer(scale, scale)
         # the covariance of the forms under white noise weighs the equations
@@ -267,6 +269,11 @@ class _Form:
     product: FloatArray
     inner: FloatArray
     value: float
+
+
+def _flat(arrays: Iterable[FloatArray]) -> FloatArray:
+    """Return arrays as rows of one."""
+    return np.array([each.ravel() for each in arrays])
 
 
 def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
@@ -331,31 +338,46 @@ def _successive(
     chain: Chain,
     names: Sequence[str],
     system: System,
-    part: int,
-    kernels: Sequence[tuple[float, float]],
-) -> FloatArray:
-    """Return J^T K J of errors that fade in succession, for (length, size) each.
-
-    The sum over all stops so far follows the recursion y_j = decay y_{j-1} + s_j, of which each
-    step takes in twice as many stops.
-    """
-    found = np.zeros((len(names), len(names)))
-    for samples in system.sets:
-        before = [np.zeros((len(names), samples.width if part == 0 else 3))] * len(kernels)
+    kernels: Mapping[int, Sequence[tuple[float, float]]],
+) -> dict[int, FloatArray]:
+    """Return by part J^T K J of errors that fade in succession, for (length, size) each."""
+    found = {part: np.zeros((len(names), len(names))) for part in kernels}
+    for samples in system.sets if kernels else ():
+        states: dict[int, FloatArray] = {}
         for _, sums in samples.sums(chain, names, samples.observations.stops):
-            if part >= len(sums):
-                continue
-            rows = sums[part][:-1]
-            own, earlier = rows.reshape(len(rows), -1), np.zeros_like(rows)
-            for k, (length, size) in enumerate(kernels):
-                decay = float(np.exp(-1.0 / length))
-                so_far = np.concatenate([before[k][..., np.newaxis], rows], axis=2)
-                step = 1
-                while step < so_far.shape[2] and decay**step > ROUNDING:
-                    so_far[..., step:] += decay**step * so_far[..., :-step]
-                    step *= 2
-                before[k] = so_far[..., -1].copy()
-                earlier += size * decay * so_far[..., :-1]
-            cross = own @ earlier.reshape(len(rows), -1).T
-            found += sum(size for _, size in kernels) * (own @ own.T) + cross + cross.T
+            for part, own_kernels in kernels.items():
+                if part >= len(sums):
+                    continue
+                rows = sums[part][:-1]
+                own = rows.reshape(len(rows), -1)
+                earlier, states[part] = _faded(
+                    rows.reshape(-1, rows.shape[2]), states.get(part), own_kernels
+                )
+                cross = own @ earlier.reshape(own.shape).T
+                found[part] += sum(size for _, size in own_kernels) * (own @ own.T)
+                found[part] += cross + cross.T
     return found
+
+
+def _faded(
+    rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return for each column of (R, n) the faded sum (R, n) of those before it.
+
+    And by kernel (length, size) the sum (R, K) so far, which goes on from `state`. Runs of about
+    the root of n columns make both one product with a small matrix.
+    """
+    lengths, sizes = np.array(kernels).T
+    run = int(np.sqrt(rows.shape[1]))
+    ahead = np.subtract.outer(np.arange(run), np.arange(run))[..., np.newaxis]
+    inside = (np.exp(-np.abs(ahead) / lengths) @ sizes) * (ahead[..., 0] < 0)
+    after = np.exp(-np.arange(run)[:, np.newaxis] / lengths)
+    found = np.empty_like(rows)
+    state = np.zeros((len(rows), len(lengths))) if state is None else state
+    for first in range(0, rows.shape[1], run):
+        part = np.ascontiguousarray(rows[:, first : first + run])
+        width = part.shape[1]
+        fading = np.exp(-np.arange(1, width + 1) / lengths[:, np.newaxis])
+        found[:, first : first + width] = part @ inside[:width, :width] + (state * sizes) @ fading
+        state = state * fading[:, -1] + part @ after[width - 1 :: -1]
+    return found, state

@@ -263,7 +263,7 @@ class _Scan:
         gain = root.T @ (matrix[self._fitted : -1, -1] - cross.T @ self._known)
         sets = list(found.group.sets)
         equations = self._equations[sets].sum()
-        freedom = equations * (1.0 - self._fitted / self._equations.sum()) - root.shape[1]
+        freedom = equations * (1.0 - self._fitted / self._equations.sum()) - root.any(axis=0).sum()
         if freedom <= 0.0:
             return False
         return bool((self._left[sets].sum() - gain @ gain) / freedom < found.variance)

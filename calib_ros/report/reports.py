@@ -171,7 +171,11 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
             'is too small.',
         ),
         figures.against_noise(poses),
-        said=(words.noise_in_words(result), *words.chance_in_words(result)),
+        said=(
+            words.scatter_in_words(result.noise),
+            words.neighbours_in_words(result.noise),
+            *map(words.chance_in_words, () if result.chance is None else (result.chance,)),
+        ),
     )
     if result.outliers:
         yield _outliers(poses)
@@ -278,11 +282,18 @@ def _parameters(result: Identification) -> Section:
 
 
 def _determined(result: Identification) -> Section:
-    """Return what no measurement at these poses can tell."""
+    """Return how well the arm is known, and what no measurement at these poses can tell."""
+    sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
+    text = (
+        f'One sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
+        f'(median), {sigma["max"]:.3f} mm at most.',
+        f'Observability: {words.observability_in_words(result)}.',
+        weak and f'Weakly determined (std above {1e3 * words.WEAK:g} mm or mrad): {weak}.',
+    )
     return Section(
         'determined',
         'What the poses determine',
-        tuple(words.identifiability_in_words(result)),
+        tuple(filter(None, text)),
         head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
         rows=tuple(
             (name, ', '.join(partners) or 'no measured pose depends on it')
@@ -310,13 +321,12 @@ def _correlations(result: Identification) -> Section:
 def _map(result: Identification) -> Section:
     """Return the error map over the workspace."""
     found = survey(Calibration.of(result), SURVEYED, np.random.default_rng(0))
-    where = '' if result.region is None else f'The calibration is {result.region.in_words()}.'
     return Section(
         'map',
         'The error over the workspace',
         (
             f'At {SURVEYED:,} random poses of the whole joint range, by the distance from the '
-            f'axis of the base and the height above it. {where}',
+            'axis of the base and the height above it.',
         ),
         figures.error_map(found),
     )

@@ -24,10 +24,10 @@ from calib_ros.report.sections import (
 )
 
 STATES: dict[str, Verdict] = {
-    'PASS': Verdict('good', 'Passed'),
-    'FAIL': Verdict('bad', 'Failed: the error is beyond the tolerance'),
-    'UNDECIDED': Verdict('open', 'Undecided: more poses are needed'),
-    'JUDGED': Verdict('info', 'Measured: no tolerance was given'),
+    'PASS': Verdict('good', 'PASS: the arm is within the tolerance'),
+    'FAIL': Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
+    'UNDECIDED': Verdict('open', 'UNDECIDED: too few measurements to tell'),
+    'JUDGED': Verdict('info', 'judged: without --tolerance there is no verdict'),
 }
 NEXT: dict[str, tuple[str, ...]] = {
     'PASS': ('Keep this page with the calibration. Verify again after a collision or repair.',),

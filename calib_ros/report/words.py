@@ -244,11 +244,6 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
     return {'median': float(np.median(sigma)), 'max': float(sigma.max())}
 
 
-def noise_in_words(result: Identification) -> str:
-    """Return how large the residuals are against the sigmas given."""
-    return f'{scatter_in_words(result.noise)} {neighbours_in_words(result.noise)}'
-
-
 def scatter_in_words(noise: Noise) -> str:
     """Return how much more is left than the device should leave."""
     text = f'The error left is {noise.position:.2f} times the stated noise in position'
@@ -282,14 +277,12 @@ def neighbours_in_words(noise: Noise) -> str:
     )
 
 
-def chance_in_words(result: Identification) -> list[str]:
-    """Return how well the gain stands against errors in succession, where that can be told."""
-    if result.chance is None:
-        return []
-    return [
-        'The chance that the improvement is only drift of the device is '
-        f'{100.0 * result.chance:.1f} % (share of time-shifted residuals explained just as well).'
-    ]
+def chance_in_words(chance: float) -> str:
+    """Return how well the gain stands against errors in succession."""
+    return (
+        f'The chance that the improvement is only drift of the device is {100.0 * chance:.1f} % '
+        '(share of time-shifted residuals explained just as well).'
+    )
 
 
 def priors_in_words(result: Identification) -> list[str]:
@@ -307,22 +300,6 @@ def priors_in_words(result: Identification) -> list[str]:
     for group, names in groups.items():
         sigma, of = result.priors[names[0]], Parameter(names[0]).unit
         lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
-    return lines
-
-
-def identifiability_in_words(result: Identification) -> list[str]:
-    """Return how well the arm is known, which parameters are weak, and the indices."""
-    sigma = sigma_over_range(result)
-    lines = [
-        f'One sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
-        f'(median), {sigma["max"]:.3f} mm at most.',
-        f'Observability: {observability_in_words(result)}.',
-    ]
-    weak = weakly_determined(result)
-    if weak:
-        lines.append(
-            f'Weakly determined (std above {1e3 * WEAK:g} mm or mrad): {", ".join(weak)}.'
-        )
     return lines
 
 

@@ -11,9 +11,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.levels import EXCEPTION
 from calib_ros.sampling.messages import MessageError
 from calib_ros.sampling.slices import NO_ACCIDENT, Columns
+from calib_ros.settings import EXCEPTION
 from calib_ros.values import MOST_NAMES
 
 Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]

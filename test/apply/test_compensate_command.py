@@ -104,7 +104,7 @@ def test_other_calibrations_are_refused(run, tmp_path):
 def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
     status, said, err = run(TABLE)
     assert (status, err) == (0, '')
-    assert said.startswith('wrote out.csv: 2 of 2 samples corrected, by ')
+    assert said.startswith('wrote out.csv: 2 of 2 points corrected, by ')
     assert 'largest error' in said
     before, after = (
         list(csv.DictReader((tmp_path / name).read_text().splitlines()))
@@ -187,11 +187,19 @@ def test_nothing_is_written_when_a_sample_is_refused(run, tmp_path, suffix, forc
     status, said, err = run(text, *(['--force'] if force else []), suffix=suffix)
     assert (status, said) == (NOT_ACCEPTED, '')
     first, second, third = err.splitlines()
-    assert first.startswith('calib_ros: nothing is written, 1 of 3 samples corrected')
+    assert first.startswith('calib_ros: nothing is written, 1 of 3 points corrected')
     places = ('line 4', 'line 5') if suffix == '.csv' else ('point 2', 'point 3')
     assert second.startswith(f'{places[0]}: near a singularity')
     assert third.startswith(f'{places[1]}: the command 4 of elbow_joint is beyond its limits')
     assert out.read_text() == 'precious' if force else not out.exists()
+
+
+def test_of_many_refused_points_the_first_are_named(run):
+    q = np.tile(regular(UR, 1), (9, 1))
+    q[:, 2] = 4.0
+    _, _, err = run(joints_csv(q))
+    assert len(err.splitlines()) == 7
+    assert err.endswith('refused: and 4 more, up to line 10\n')
 
 
 def test_options_reach_the_compensator(run):

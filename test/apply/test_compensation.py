@@ -329,7 +329,7 @@ def test_the_calibration_of_another_robot_is_refused():
     )
     result = compensate(Compensator(UR, other), regular(UR, 20))
     assert len(result.refusals) == 20
-    assert in_words(Compensator(UR, other), result) == '0 of 20 samples corrected'
+    assert in_words(Compensator(UR, other), result) == '0 of 20 points corrected'
 
 
 def test_a_jump_of_the_correction_is_refused():

@@ -10,8 +10,8 @@ from calib_ros.apply import workspace
 from calib_ros.apply.placement import place, task_of
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.identification.calibration import MODELS
 from calib_ros.kinematics.se3 import exp_rotation, transform
+from calib_ros.settings import MODELS
 
 
 @pytest.fixture(scope='module')

@@ -98,7 +98,7 @@ def test_what_cannot_be_asked_for(folder, capsys):
 
 
 def test_a_scheduler_that_is_lost_is_told_of(folder, capsys, monkeypatch):
-    monkeypatch.setattr(running, 'PATIENCE', 0.5)
+    monkeypatch.setattr(running, 'ANSWER_S', 0.5)
     plants.write_plant(folder, ['A'], 1)
     command = ['fleet', 'plant.yaml', '--history', 'history', '--scheduler', 'tcp://127.0.0.1:1']
     assert main(command) == 1

@@ -26,8 +26,9 @@ from recorded import (
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from calib_ros.errors import InputError
-from calib_ros.files.recording import STORAGES, write_bag
+from calib_ros.files.recording import write_bag
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.settings import STORAGES
 
 
 @pytest.fixture(scope='module')

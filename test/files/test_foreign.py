@@ -229,6 +229,11 @@ def test_exports_of_others(tmp_path, preset):
         np.testing.assert_allclose(found.rotations, TURNED.as_matrix(), atol=1e-9)
 
 
+def test_the_only_row_may_end_without_a_line_break(read):
+    (found,) = read('q1;q2;x;y;z\n0.1;0.2;1;2;3').fitted
+    assert found.joints.tolist() == [[0.1, 0.2]]
+
+
 def test_a_log_of_universal_robots(tmp_path):
     names = [f'actual_q_{k}' for k in range(2)]
     (tmp_path / 'log.csv').write_text(text_of(JOINTS, names=names, separator=' '))

@@ -10,9 +10,9 @@ from recorded import STREAMS, record_in_chunks, session_of, storages
 from rosbags.rosbag2 import Reader
 
 from calib_ros.files.mcap import DATA_END, MAGIC, records
-from calib_ros.files.recording import STORAGES
 from calib_ros.files.stored import CHUNK, STORAGE, read
 from calib_ros.sampling.intake import Stream
+from calib_ros.settings import STORAGES
 
 COMPRESSIONS = [
     *((storage, mode) for storage in sorted(STORAGES) for mode in ('none', 'message', 'file')),

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import UR10E
+from fits import UR10E, measured_arm
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification.identification import Problem, identify
@@ -14,9 +14,7 @@ from calib_ros.kinematics.chain_file import load_chain
 
 
 def test_held_out_pairs_never_influence_the_fit():
-    rng = np.random.default_rng(8)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(50, rng), rng, 1e-4, 1e-4)
+    rng, true, seen = measured_arm(8, 50, (1e-4, 1e-4))
     other = measure(true, UR10E.random_joints(50, rng), rng, 1.0, 1.0)
     first, second = (identify(Problem(UR10E, seen, held_out=each)) for each in (seen, other))
     np.testing.assert_array_equal(first.chain.table, second.chain.table)

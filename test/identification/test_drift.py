@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, along_path, arm, rms
+from fits import NOISE, SIGMAS, UR10E, along_path, arm, measured_arm, rms
 from scipy.signal import lfilter
 
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -15,6 +15,7 @@ from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.reasons import Rule
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics import effects
 from calib_ros.report.words import as_document, chance_in_words
@@ -56,7 +57,7 @@ def test_a_drift_is_no_gain_of_the_arm(kind):
     results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(8)]
     assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
-    alone = [all('drift of' in text for text in result.refusals) for result in results]
+    alone = [all(each.rule is Rule.DRIFT for each in result.refusals) for result in results]
     assert sum(alone) > 2
 
 
@@ -135,18 +136,17 @@ def test_effects_are_found_though_the_tracker_drifts(kind):
     assert rms(auto.chain, true, unseen) < 0.6 * rms(plain.chain, true, unseen)
 
 
-@pytest.mark.parametrize('count', [2, 3, 8, 12])
+@pytest.mark.parametrize('count', [2, 3, 7, 8, 12])
 def test_few_poses_with_priors(count):
     """No shift of 8 poses explains the errors of an arm as well as the arm does."""
-    rng = np.random.default_rng(10)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+    *_, seen = measured_arm(10, count)
     priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
-    chance = identify(Problem(UR10E, seen, priors=priors, **SIGMAS)).chance
-    assert chance == 0.0 if count >= 8 else 0.0 <= chance <= 1.0
+    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
+    assert result.noise.shared == ()
+    assert result.chance == 0.0 if count >= 8 else 0.0 <= result.chance <= 1.0
 
 
 def test_the_report_tells_the_chance():
     result = identify(Problem(UR10E, session(0, 0.0, 'swing'), **SIGMAS))
     assert as_document(result, {})['chance_of_gain'] == result.chance > 0.05
-    assert f'{100 * result.chance:.1f} %' in chance_in_words(result)[0]
+    assert f'{100 * result.chance:.1f} %' in chance_in_words(result.chance)

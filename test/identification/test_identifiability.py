@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, fitted, rms
+from fits import NOISE, SIGMAS, UR10E, fitted, measured_arm, rms
 from scipy import stats
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -37,8 +37,7 @@ def assert_trades_hold(result, q, oriented=True):
 
 @pytest.mark.parametrize('oriented', [True, False])
 def test_trades_of_a_six_axis_arm_with_its_frames(oriented, rng):
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE, oriented=oriented)
+    *_, seen = measured_arm(rng, 60, oriented=oriented)
     result = identify(Problem(UR10E, seen, **SIGMAS))
     gauges = {name: set(partners) for name, partners in result.gauges.items()}
     assert gauges['wrist_3_joint.d'] == {'tool.z'}

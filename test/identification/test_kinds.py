@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import fitted
+from fits import NOISE, SIGMAS, UR10E, fitted
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
@@ -12,12 +12,8 @@ from calib_ros.identification.identification import Problem, identify, residuals
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
 
-UR10E = load_chain('ur10e')
 EXACT = 1e-9
-NOISE = (5e-5, 2e-4)
-SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
 
 
 def wire(chain, count, rng, base='base', tool='tool', noise=0.0):
@@ -34,6 +30,14 @@ def between(chain, count, rng, base='base', tool='tool', noise=(0.0, 0.0), orien
     view = replace(chain, base=chain.frame(base), tool=chain.frame(tool), frames=())
     seen = measure(view, chain.random_joints(count, rng), rng, *noise, oriented=oriented)
     return replace(seen, base=base, tool=tool)
+
+
+def framed(rng, **reach):
+    """Return an arm with errors and more frames, each anywhere within its reach [m]."""
+    true = faulty(UR10E, Cell(), rng)
+    for name, size in reach.items():
+        true = true.with_frame(name, random_frame(rng, size))
+    return true
 
 
 def worst(found, unseen):
@@ -136,9 +140,7 @@ def test_distances_of_gross_error_are_named_and_do_no_harm(count, share, errors)
 
 def test_distances_and_poses_in_one_problem(rng):
     """The wire leaves from somewhere else than the tracker's origin, to another point."""
-    true = faulty(UR10E, Cell(), rng)
-    true = true.with_frame('base_wire', random_frame(rng, 2.0))
-    true = true.with_frame('tool_hook', random_frame(rng, 0.2))
+    true = framed(rng, base_wire=2.0, tool_hook=0.2)
     poses = between(true, 40, rng)
     lengths = wire(true, 60, rng, 'base_wire', 'tool_hook')
     result = identify(Problem(UR10E, poses, more=(lengths,)))
@@ -156,8 +158,7 @@ def test_distances_sharpen_what_few_poses_leave_open():
     errors = []
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        true = true.with_frame('base_wire', random_frame(rng, 2.0))
+        true = framed(rng, base_wire=2.0)
         poses = between(true, 12, rng, noise=NOISE)
         lengths = wire(true, 200, rng, 'base_wire', noise=NOISE[0])
         q = UR10E.random_joints(300, rng)
@@ -170,147 +171,20 @@ def test_distances_sharpen_what_few_poses_leave_open():
     assert together < 0.8 * alone
 
 
-def test_the_camera_on_the_flange(rng):
-    """A camera sees a fixed target: measured is the target in the camera's frame."""
-    true = faulty(UR10E, Cell(), rng)  # from target to camera
-
-    def pictures(count):
-        q = UR10E.random_joints(count, rng)
-        seen = se3.invert(true.forward(q))
-        return Observations.from_arrays(q, seen[:, :3, 3], seen[:, :3, :3].copy())
-
-    result = identify(Problem(UR10E, pictures(50).inverted()))
-    assert result.rank == 30
-    assert_exact(result.chain, pictures(100).inverted())
-    # and back: where the target will be seen
-    again = pictures(20)
-    predicted = se3.invert(result.chain.forward(again.joints))
-    np.testing.assert_allclose(predicted[:, :3, 3], again.positions, rtol=0, atol=1e-8)
-
-
-def random_poses(count, rng):
-    rotations = np.stack([random_frame(rng, 1.0).matrix[:3, :3] for _ in range(count)])
-    return Observations.from_arrays(
-        UR10E.random_joints(count, rng), rng.uniform(-1.0, 1.0, (count, 3)), rotations
-    )
-
-
-def random_covariance(rng, size=1.0):
-    root = size * rng.normal(size=(6, 6))
-    return root @ root.T
-
-
-def test_inverting_twice_changes_nothing(rng):
-    seen = random_poses(20, rng)
-    seen = replace(seen, covariance=np.stack([random_covariance(rng) for _ in range(20)]))
-    again = seen.inverted().inverted()
-    np.testing.assert_allclose(again.positions, seen.positions, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(again.rotations, seen.rotations, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(again.covariance, seen.covariance, rtol=0, atol=1e-10)
-
-
-def shaken(pose, errors):
-    """Return (N, 4, 4): a pose with errors (N, 6) as in `Observations.covariance`."""
-    turned = se3.exp_rotation(errors[:, 3:]) @ pose[:3, :3]
-    return se3.transform(turned, pose[:3, 3] + errors[:, :3])
-
-
-def errors_of(poses, pose):
-    """Return (N, 6) what `shaken` adds to a pose to make these."""
-    turn = se3.log_rotation(poses[:, :3, :3] @ pose[:3, :3].T)
-    return np.concatenate([poses[:, :3, 3] - pose[:3, 3], turn], axis=1)
-
-
-def test_covariances_are_inverted_by_the_numeric_jacobian(rng):
-    for _ in range(10):
-        seen = random_poses(1, rng)
-        covariance = random_covariance(rng)
-        pose = se3.transform(seen.rotations[0], seen.positions[0])
-        inverse = se3.invert(pose[None])[0]
-        step = 1e-6 * np.eye(6)
-        ahead, behind = (
-            errors_of(se3.invert(shaken(pose, sign * step)), inverse) for sign in (1.0, -1.0)
-        )
-        jacobian = (ahead - behind).T / 2e-6
-        found = replace(seen, covariance=covariance[None]).inverted().covariance[0]
-        np.testing.assert_allclose(found, jacobian @ covariance @ jacobian.T, rtol=0, atol=1e-6)
-
-
-def test_covariances_are_inverted_as_in_a_monte_carlo(rng):
-    seen = random_poses(1, rng)
-    covariance = random_covariance(rng, 1e-3)
-    pose = se3.transform(seen.rotations[0], seen.positions[0])
-    errors = rng.multivariate_normal(np.zeros(6), covariance, size=40_000)
-    inverse = se3.invert(pose[None])[0]
-    sampled = np.cov(errors_of(se3.invert(shaken(pose, errors)), inverse).T)
-    found = replace(seen, covariance=covariance[None]).inverted().covariance[0]
-    # in units where the covariance found is 1, sampled ones spread by sqrt(2 / 40,000) = 0.007
-    root = np.linalg.inv(np.linalg.cholesky(found))
-    np.testing.assert_allclose(root @ sampled @ root.T, np.eye(6), rtol=0, atol=0.04)
-
-
-def test_the_depth_of_a_camera_is_its_weak_side():
-    """Samples weighted by their inverted covariances predict better than all alike."""
-    ratios = []
-    sigmas = np.array([5e-5, 5e-5, 2e-3, 1e-4, 1e-4, 1e-4])
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        q = UR10E.random_joints(60, rng)
-        errors = rng.normal(size=(60, 6)) * sigmas
-        poses = np.stack(
-            [
-                shaken(pose, error[None])[0]
-                for pose, error in zip(se3.invert(true.forward(q)), errors, strict=True)
-            ]
-        )
-        plain = Observations.from_arrays(q, poses[:, :3, 3], poses[:, :3, :3].copy())
-        own = replace(plain, covariance=np.tile(np.diag(sigmas**2), (60, 1, 1)))
-        unseen = UR10E.random_joints(300, rng)
-        result = []
-        for each in (plain, own):
-            found = fitted(Problem(UR10E, each.inverted(), loss='none'))
-            error = (found.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-            result.append(np.sqrt((error**2).mean()))
-        assert found.noise.position == pytest.approx(1.0, abs=0.2)
-        ratios.append(result[1] / result[0])
-    assert np.median(ratios) < 0.7
-
-
-def test_positions_cannot_be_inverted(rng):
-    """The camera's place in the target's frame needs the orientation."""
-    seen = Observations.from_arrays(UR10E.random_joints(5, rng), rng.normal(size=(5, 3)))
-    with pytest.raises(InputError, match='orientation'):
-        seen.inverted()
-
-
 @pytest.mark.parametrize('oriented', [True, False])
 def test_several_targets_on_one_flange(oriented, rng):
-    true = faulty(UR10E, Cell(), rng)
-    for name in ('tool_2', 'tool_3'):
-        true = true.with_frame(name, random_frame(rng, 0.3))
-    sets = [
-        between(true, 30, rng, tool=tool, oriented=oriented)
-        for tool in ('tool', 'tool_2', 'tool_3')
-    ]
+    true, tools = framed(rng, tool_2=0.3, tool_3=0.3), ('tool', 'tool_2', 'tool_3')
+    sets = [between(true, 30, rng, tool=each, oriented=oriented) for each in tools]
     result = identify(Problem(UR10E, sets[0], more=sets[1:]))
     assert result.rank == (30 + 2 * 6 if oriented else 27 + 2 * 3)
     assert not result.not_excited
-    assert_exact(
-        result.chain,
-        *(
-            between(true, 100, rng, tool=tool, oriented=oriented)
-            for tool in ('tool', 'tool_2', 'tool_3')
-        ),
-    )
+    unseen = [between(true, 100, rng, tool=each, oriented=oriented) for each in tools]
+    assert_exact(result.chain, *unseen)
 
 
 def test_three_points_on_one_flange_make_a_pose(rng):
     """Positions of several targets tell as much of the arm as full poses do."""
-    true = faulty(UR10E, Cell(), rng)
-    for name in ('tool_2', 'tool_3'):
-        true = true.with_frame(name, random_frame(rng, 0.3))
-    tools = ('tool', 'tool_2', 'tool_3')
+    true, tools = framed(rng, tool_2=0.3, tool_3=0.3), ('tool', 'tool_2', 'tool_3')
     sets = [between(true, 40, rng, tool=tool, oriented=False) for tool in tools]
     result = identify(Problem(UR10E, sets[0], more=sets[1:]))
     fitted = {name for name in result.names if not name.startswith(('base', 'tool'))}
@@ -320,7 +194,7 @@ def test_three_points_on_one_flange_make_a_pose(rng):
 
 @pytest.mark.parametrize('oriented', [True, False])
 def test_several_sessions_with_bases_of_their_own(oriented, rng):
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     first, second = (
         between(true, 40, rng, base=base, oriented=oriented) for base in ('base', 'base_B')
     )
@@ -334,9 +208,7 @@ def test_several_sessions_with_bases_of_their_own(oriented, rng):
 
 def test_both_ends_change_and_kinds_are_mixed(rng):
     """Session A by pose, B by position of another target, B by a wire to the first one."""
-    true = faulty(UR10E, Cell(), rng)
-    true = true.with_frame('base_B', random_frame(rng, 2.0))
-    true = true.with_frame('tool_2', random_frame(rng, 0.3))
+    true = framed(rng, base_B=2.0, tool_2=0.3)
 
     def sets(count):
         return [
@@ -354,9 +226,7 @@ def test_both_ends_change_and_kinds_are_mixed(rng):
 
 def test_sessions_need_not_come_in_the_order_of_the_frames(rng):
     """The first set knows nothing of the frames named base and tool."""
-    true = faulty(UR10E, Cell(), rng)
-    true = true.with_frame('base_B', random_frame(rng, 2.0))
-    true = true.with_frame('tool_2', random_frame(rng, 0.3))
+    true = framed(rng, base_B=2.0, tool_2=0.3)
     seen = between(true, 60, rng, 'base_B', 'tool_2')
     result = identify(Problem(UR10E, seen))
     assert result.rank == 30
@@ -371,13 +241,11 @@ def test_a_known_frame_of_a_second_session_is_kept(rng):
     result = identify(Problem(nominal, first, more=(second,)))
     np.testing.assert_array_equal(result.chain.frame('base_B').matrix, fixed.matrix)
     assert not any(name.startswith('base_B') for name in result.names)
-    assert_exact(
-        result.chain, *(between(true, 100, rng, base=base) for base in ('base', 'base_B'))
-    )
+    assert_exact(result.chain, *(between(true, 100, rng, base=b) for b in ('base', 'base_B')))
 
 
 def test_two_sessions_tell_more_than_one(rng):
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     first, second = (between(true, 40, rng, base=base, noise=NOISE) for base in ('base', 'base_B'))
     one = identify(Problem(UR10E, first, **SIGMAS))
     two = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
@@ -392,14 +260,14 @@ def test_two_sessions_tell_more_than_one(rng):
 
 def test_a_second_session_lends_the_first_what_it_lacks(rng):
     """Session A is too short to fit anything but its base: the arm comes from session B."""
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     few = between(true, 3, rng)
     result = identify(Problem(UR10E, few, more=(between(true, 60, rng, base='base_B'),)))
     assert_exact(result.chain, between(true, 100, rng))
 
 
 def test_held_out_poses_have_frames_too(rng):
-    true = faulty(UR10E, Cell(), rng).with_frame('base_B', random_frame(rng, 2.0))
+    true = framed(rng, base_B=2.0)
     first, second = (between(true, 40, rng, base=base, noise=NOISE) for base in ('base', 'base_B'))
     unseen = between(true, 30, rng, base='base_B', noise=NOISE)
     result = identify(Problem(UR10E, first, more=(second,), held_out=unseen))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NO_PRIOR, UR10E
+from fits import NO_PRIOR, UR10E, measured_arm
 from scipy.optimize import least_squares
 
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -26,9 +26,7 @@ from calib_ros.kinematics.chain_file import load_chain
 
 def test_the_minimum_is_that_of_an_independent_solver():
     """Hold the cost against scipy on the residual written out, with outsize errors and noise."""
-    rng = np.random.default_rng(4)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(50, rng), rng, 2e-3, 2e-2)
+    *_, seen = measured_arm(4, 50, (2e-3, 2e-2))
     result = identify(
         Problem(
             UR10E,
@@ -92,9 +90,7 @@ def test_a_fit_without_progress_ends_and_says_so(monkeypatch):
 
 
 def test_normal_equations_and_triangular_factor_agree_over_blocks():
-    rng = np.random.default_rng(12)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(2 * BLOCK + 7, rng), rng, 1e-4, 1e-4)
+    _, true, seen = measured_arm(12, 2 * BLOCK + 7, (1e-4, 1e-4))
     names = UR10E.parameter_names
     system = System((Samples(seen, 1e-4, 3e-4),))
     normal = normal_equations(true, names, system)

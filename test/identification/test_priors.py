@@ -4,9 +4,9 @@
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, fitted, rms
+from fits import SIGMAS, UR10E, fitted, measured_arm, rms
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, measure
 from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameError
 from calib_ros.identification.identifiability import (
     structurally_independent,
@@ -35,9 +35,7 @@ def test_priors_help_where_poses_are_few(count, oriented, gain):
     errors = []
     noise = (3e-4, 1.5e-3)
     for seed in range(10):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        seen = measure(true, UR10E.random_joints(count, rng), rng, *noise, oriented=oriented)
+        rng, true, seen = measured_arm(seed, count, noise, oriented=oriented)
         unseen = UR10E.random_joints(300, rng)
         options = {'sigma_position': noise[0], 'sigma_orientation': noise[1], 'loss': 'none'}
         without = fitted(Problem(UR10E, seen, priors={'*_joint.*': 1e6}, **options))
@@ -59,9 +57,7 @@ def test_priors_allow_fewer_poses_than_parameters():
     """Four poses have 24 equations for 30 parameters."""
     errors = []
     for seed in range(8):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        seen = measure(true, UR10E.random_joints(4, rng), rng, *NOISE)
+        rng, true, seen = measured_arm(seed, 4)
         with pytest.raises(TooFewObservationsError):
             identify(Problem(UR10E, seen, **SIGMAS))
         result = identify(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
@@ -76,9 +72,7 @@ def test_priors_allow_fewer_poses_than_parameters():
 def test_standard_deviations_are_honest_where_errors_are_drawn_from_the_priors(count):
     scores = []
     for seed in range(25):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
+        _, true, seen = measured_arm(seed, count)
         result = fitted(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
         scores += [
             (p.value - true.value(p.name)) / p.std for p in result.parameters if p.name in prior
@@ -91,8 +85,7 @@ prior = frozenset(manufacture())
 
 
 def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    *_, seen = measured_arm(rng, 60)
     plain = identify(Problem(UR10E, seen, **SIGMAS))
     result = identify(Problem(UR10E, seen, priors={'wrist_3_joint.d': 1e-3}, **SIGMAS))
     row = {p.name: p for p in result.parameters}['wrist_3_joint.d']
@@ -113,8 +106,7 @@ def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
 
 
 def test_priors_are_off_by_default_and_told_when_on(rng):
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    *_, seen = measured_arm(rng, 40)
     without = identify(Problem(UR10E, seen, **SIGMAS))
     assert without.priors == {}
     assert 'prior' not in summary(without)
@@ -127,8 +119,7 @@ def test_priors_are_off_by_default_and_told_when_on(rng):
 
 
 def test_narrow_priors_hold_and_wide_ones_let_go(rng):
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(40, rng), rng, *NOISE)
+    _, true, seen = measured_arm(rng, 40)
     plain = identify(Problem(UR10E, seen, **SIGMAS))
     narrow, wide = (
         identify(Problem(UR10E, seen, priors=manufacture(scale), **SIGMAS))
@@ -146,8 +137,7 @@ def test_narrow_priors_hold_and_wide_ones_let_go(rng):
 
 @pytest.mark.parametrize('sigma', [1e-4, 1e-3])
 def test_cross_validation_with_priors_is_that_of_separate_fits(sigma, rng):
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(30, rng), rng, *NOISE)
+    *_, seen = measured_arm(rng, 30)
     priors = {f'{name}.*': sigma for name in UR10E.joint_names}
     result = identify(Problem(UR10E, seen, priors=priors, loss='none', **SIGMAS))
     folds = seen.configurations % 5

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NO_PRIOR, NOISE, UR10E, fitted, rms
+from fits import NO_PRIOR, NOISE, UR10E, fitted, measured_arm, rms
 
-from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.robust import LOSSES, OUTLIER
@@ -55,9 +55,7 @@ def displaced(seen, true, rng, share, where):
 
 def cell(seed, oriented=True, count=POSES):
     """Return a true arm, its measured poses and unseen joint values."""
-    rng = np.random.default_rng(seed)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE, oriented=oriented)
+    rng, true, seen = measured_arm(seed, count, oriented=oriented)
     return rng, true, seen, UR10E.random_joints(300, rng)
 
 
@@ -301,9 +299,7 @@ def test_an_unknown_loss_is_named():
 
 def test_what_a_simpler_model_explains_is_no_gross_error_for_a_richer_one():
     """Displaced samples keep their weight where the simpler model explains them."""
-    rng = np.random.default_rng(21)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(60, rng), rng, 5e-5, 2e-4)
+    *_, seen = measured_arm(21, 60, (5e-5, 2e-4))
     positions = seen.positions.copy()
     positions[:6] += 5e-3
     problem = Problem(UR10E, replace(seen, positions=positions), priors=NO_PRIOR)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, along_path, fitted
+from fits import NOISE, SIGMAS, UR10E, along_path, fitted, measured_arm
 from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
 
@@ -107,9 +107,7 @@ def test_the_correlation_is_that_of_the_errors():
 
 
 def test_distances_drift_as_well():
-    rng = np.random.default_rng(4)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(300, rng), rng)
+    rng, _, seen = measured_arm(4, 300, (0.0, 0.0))
     length = np.linalg.norm(seen.positions, axis=1) + 5e-5 * rng.normal(size=300)
     for drift, shared in ((0.0, ()), (2e-4, ('successive',))):
         wire = replace(seen, distances=length + drift * fading(300, 20.0, rng)[:, 0])
@@ -168,10 +166,10 @@ def test_errors_in_succession_have_the_kernel_of_their_distance_in_time(monkeypa
     apart = np.abs(np.subtract.outer(np.arange(73), np.arange(73)))
     kernel = sum(size * np.exp(-apart / length) for length, size in kernels)
     rows = samples.rows_of(UR10E, names).T[..., :-1]
+    found = shared_errors._successive(UR10E, names, system, {0: kernels, 1: kernels})
     for part, own in enumerate((rows[:, :3], rows[:, 3:])):
-        found = shared_errors._successive(UR10E, names, system, part, kernels)
         expected = np.einsum('ncp,nm,mcr->pr', own, kernel, own, optimize=True)
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * expected.max())
+        np.testing.assert_allclose(found[part], expected, rtol=1e-9, atol=1e-9 * expected.max())
 
 
 def test_a_part_of_many_stops_tells_nearly_the_same(monkeypatch):
@@ -208,17 +206,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
         if parameter['std'] is not None:
             assert parameter['half_width_95'] > 1.95 * parameter['std']
     _, quiet = run(9, identified=identify)
-    assert 'share no errors' in noise_in_words(quiet)
-
-
-@pytest.mark.parametrize('count', [2, 7, 8])
-def test_few_poses_do_no_harm(count):
-    rng = np.random.default_rng(10)
-    true = faulty(UR10E, Cell(), rng)
-    seen = measure(true, UR10E.random_joints(count, rng), rng, *NOISE)
-    priors = {f'*_joint.{kind}': 1e-3 for kind in ('a', 'd', 'theta', 'alpha', 'beta')}
-    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
-    assert result.noise.shared == ()
+    assert 'share no error' in noise_in_words(quiet)
 
 
 def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
@@ -242,11 +230,12 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
 
     kernels = [('successive', 5.0), ('near', 0.3)]
     cases = [(part, units.kernel(*kernel)) for part in (0, 1) for kernel in kernels]
-    for first in cases:
-        for second in cases:
-            expected = np.trace(whole(*first) @ left @ whole(*second) @ left)
-            found = forms._trace(forms._form(*first), forms._form(*second))
-            assert found == pytest.approx(expected, abs=1e-9)
+    expected = [
+        [np.trace(whole(*first) @ left @ whole(*second) @ left) for second in cases]
+        for first in cases
+    ]
+    found = forms._moments([forms._form(*case) for case in cases])
+    np.testing.assert_allclose(found, expected, atol=1e-9)
     links = units.links('successive')
     dense = whole(1, links.toarray())
     free = left[60:, 60:]

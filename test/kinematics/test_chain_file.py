@@ -244,7 +244,10 @@ def test_a_wrong_chain_file_is_refused_with_the_place(right, wrong, complaint):
     assert 'cell.yaml' in str(caught.value)
 
 
-@pytest.mark.parametrize('text', ['', '3', '[]', 'joints', 'convention: standard\njoints: []\n'])
+OF_3, OF_NONE = (f'convention: standard\njoints: {rows}\n' for rows in ('3', '[]'))
+
+
+@pytest.mark.parametrize('text', ['', '3', '[]', 'joints', OF_3, OF_NONE])
 def test_a_file_that_holds_no_chain_is_refused(text):
     with pytest.raises(ConfigError, match=r'cell\.yaml'):
         parse_chain(text, 'cell.yaml')

@@ -85,7 +85,7 @@ def test_the_other_commands_write_their_pages(solved, tmp_path):
     verified, planned = tmp_path / 'verified', tmp_path / 'plan.csv'
     judged = ['--calibration', str(out), '--tolerance', '1', '--out', str(verified)]
     assert main(['verify', str(new), '--chain', 'ur5e', *judged]) == 0
-    assert 'Passed' in Page((verified / 'report.html').read_text()).text
+    assert 'PASS' in Page((verified / 'report.html').read_text()).text
     assert (verified / 'residuals.csv').read_text().count('\n') == 13
     arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
     assert main(arguments) == 0

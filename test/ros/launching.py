@@ -80,12 +80,12 @@ def nodes(actions):
     }
 
 
-def parameters_of(words, name='calibration_node'):
+def parameters_of(words):
     """Return the parameters that a real node gets by ROS arguments."""
     context = rclpy.Context()
     rclpy.init(context=context, args=[])
     node = Node(
-        name,
+        'calibration_node',
         context=context,
         cli_args=['--ros-args', *words, '--'],
         automatically_declare_parameters_from_overrides=True,

@@ -72,7 +72,7 @@ def cell_and_child(**parameters):
             for publisher, probe in probes:
                 publisher.publish(probe)
             values = {v.key: v.value for r in reports[-1:] for v in r.status[0].values}
-            return all(int(values.get(stream, 0)) for stream in ('joint states', 'measurements'))
+            return all(int(values.get(stream, 0)) for stream in ('joint states', 'poses'))
 
         cell.spin_until(hears)
         yield cell, child

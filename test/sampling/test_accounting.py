@@ -50,7 +50,7 @@ def balance(session):
         count
         for counts in (account.unused, account.dropped)
         for cause, count in counts.items()
-        if cause.startswith('poses')
+        if cause.startswith('measurements')
     )
     return account.poses, sum(s.count for s in session.samples) + account.waiting + lost
 

@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What the options given stand for: layouts, histories, reports."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import Path
+
+from calib_ros.cli.options import Contents, settings_of
+from calib_ros.cli.screen import Screen
+from calib_ros.errors import InputError
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.history import History
+from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.report.page import (
+    MISSING,
+    MISSING_PDF,
+    Origin,
+    Report,
+    input_of,
+    inputs_of,
+    on_paper,
+    render,
+)
+
+
+def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
+    """Return how to read a table of others, None where nothing says that it is one."""
+    names = [*('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector')]
+    names += ['inverse', 'shift', 'separator', 'decimal', 'sheet']
+    given = {name: getattr(options, name) for name in names}
+    if not (any(given.values()) or options.preset or options.columns or options.joints):
+        return None
+    given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
+    if options.joints_preset and options.joints is None:
+        raise InputError('--joints-preset is of use with --joints FILE only')
+    units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
+    log = layout_of(options.joints_preset, (), {} if options.joints_preset else units)
+    layout = layout_of(options.preset, options.columns, given)
+    return Foreign(layout, chain, options.joints, log if options.joints else Layout())
+
+
+def history_of(options: argparse.Namespace) -> History | None:
+    """Return where a result is filed, if it is to be; refuse one without a serial number."""
+    if options.history is None:
+        return None
+    if not options.serial:
+        raise InputError('--history files by serial number: give --serial as well')
+    return History(options.history)
+
+
+def filing_of(
+    options: argparse.Namespace,
+    nominal: Chain,
+    sets: Sequence[Observations],
+    measured: Path,
+    *judged_by: object,
+) -> Filing:
+    """Return what is filed of a result besides the result."""
+    settings = settings_hash(nominal, settings_of(options), *judged_by)
+    changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
+    content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
+    return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
+
+
+def origin_of(
+    options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
+) -> Origin:
+    """Return whence a result comes: the options, and the files that were read."""
+    chain = Path(options.chain)
+    known = (*inputs, chain if chain.is_file() else None)
+    names = ('operator', 'serial', 'device')
+    told = {name: getattr(options, name, '') for name in names}
+    return Origin(inputs_of(known), settings=settings, **told)
+
+
+def page_of(
+    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
+) -> Contents:
+    """Return a report as the content of files by name; nothing where an extra is missing.
+
+    That is said once. `pdf` asks for report.pdf as well.
+    """
+    found: dict[str, str | bytes | None] = {name: render(report)}
+    if found[name] is None:
+        screen.warn(MISSING, 'note')
+    if pdf:
+        found['report.pdf'] = on_paper(report)
+        if found['report.pdf'] is None:
+            screen.warn(MISSING_PDF, 'note')
+    return {each: content for each, content in found.items() if content is not None}
