@@ -17,12 +17,8 @@ from calib_ros.errors import InputError
 from calib_ros.files.trajectories import read_program
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
-<<<<<<< HEAD
 from calib_ros.settings import Limits
-from calib_ros.shown import some
-=======
 from calib_ros.shown import NAMED
->>>>>>> people
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:

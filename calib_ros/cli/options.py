@@ -157,23 +157,6 @@ def add_layout(parser: argparse.ArgumentParser) -> None:
     add('--joints', type=Path, metavar='FILE', help='log of the joint values, row by row')
 
 
-<<<<<<< HEAD
-=======
-def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
-    """Return how to read a table of others, None where nothing says that it is one."""
-    given = {name: getattr(options, name) for name in LAYOUT}
-    if not (any(given.values()) or options.preset or options.columns or options.joints):
-        return None
-    given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
-    if options.joints_preset and options.joints is None:
-        raise InputError('--joints-preset is of use with --joints FILE only')
-    units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
-    log = layout_of(options.joints_preset, (), {} if options.joints_preset else units)
-    layout = layout_of(options.preset, options.columns, given)
-    return Foreign(layout, chain, options.joints, log if options.joints else Layout())
-
-
->>>>>>> people
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings that are among the options, the others by default."""
     given: dict[str, Any] = {

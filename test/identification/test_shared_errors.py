@@ -13,7 +13,7 @@ from calib_ros.identification import samples as samples_module
 from calib_ros.identification import shared_errors
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System
-from calib_ros.report.words import as_document, noise_in_words
+from calib_ros.report.words import as_document, neighbours_in_words
 
 
 def fading(count, length, rng):
@@ -197,7 +197,7 @@ def test_pairs_of_a_stop_with_one_error_tell_no_more_than_one():
 
 def test_the_report_says_what_is_shared_and_what_follows():
     _, drifting = run(9, drift=10.0, amplitude=3e-4, identified=identify)
-    text = noise_in_words(drifting)
+    text = neighbours_in_words(drifting.noise)
     assert 'measured in succession (0.' in text
     assert f'{drifting.noise.widened:.2f} times those of independent errors' in text
     document = as_document(drifting, {})
@@ -206,7 +206,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
         if parameter['std'] is not None:
             assert parameter['half_width_95'] > 1.95 * parameter['std']
     _, quiet = run(9, identified=identify)
-    assert 'share no error' in noise_in_words(quiet)
+    assert 'share no error' in neighbours_in_words(quiet.noise)
 
 
 def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
