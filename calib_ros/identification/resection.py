@@ -40,19 +40,16 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
         When no image shows enough points.
 
     """
-    index = observations.images
-    good = np.flatnonzero(_tell_a_pose(observations, index))
-    first = np.flatnonzero(np.diff(index, prepend=-1))[good]
-    if not len(good):
+    told = _tell_a_pose(observations, observations.images)
+    if not told.any():
         raise InputError(
             'no image shows 4 points of the board that are not in line: nothing tells '
             'where the camera is'
         )
-    rows = observations.select(np.isin(index, good))
+    rows = observations.select(told[observations.images])
     found = resect(rows, lens)
-    alone = replace(rows, pixels=None, points=None, on_flange=False).select(
-        np.searchsorted(np.flatnonzero(np.isin(index, good)), first)
-    )
+    first = np.flatnonzero(np.diff(rows.images, prepend=-1))
+    alone = replace(rows, pixels=None, points=None, on_flange=False).select(first)
     seen = replace(
         alone,
         positions=found.poses[:, :3, 3],
