@@ -222,6 +222,8 @@ def chance_of_gain(
 
     The system is linearised at a chain that is fitted by those before.
     """
+    if not added:
+        return 1.0
     names = [*before, *added]
     rows = system.rows_of(chain, names)
     shifts = Shifts(system, [each[-1] for each in rows])
