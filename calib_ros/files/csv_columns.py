@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
-from calib_ros.files.decimals import LONGEST, decimals
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
 
@@ -23,8 +23,6 @@ IRREGULAR = (b'"', b'\r', b'\0')
 """What cells are not cut at separators alone with."""
 BLOCK = 2**18
 """Bytes that are looked at together: they stay in the cache."""
-CELLS = BLOCK // 16
-"""Cells that are read together: likewise."""
 WIDEST, FEW = 40, 100
 """Characters of a text, and how many different ones, that are told apart all at once."""
 
@@ -88,26 +86,35 @@ class TextColumns(Columns):
 
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
         columns = [self.header.index(name) for name in names]
-        found = np.full((len(self.lines), len(names)), np.nan)
-        width, height = len(self.header), max(1, CELLS // max(1, len(names)))
-        for row in range(0, len(found), height):
-            places = self._ends[row * width : (row + height) * width + 1].astype(np.intp)
-            ends = places[1:].reshape(-1, width).take(columns, axis=1).ravel()
-            begins = places[:-1].reshape(-1, width).take(columns, axis=1).ravel() + 1
-            filled = begins < ends
-            if not filled.all():
-                begins, ends = begins[filled], ends[filled]
-            numbers, read = decimals(self._data, begins, ends)
-            rest = np.flatnonzero(~read)
-            cells = zip(begins[rest].tolist(), ends[rest].tolist(), strict=True)
-            try:
-                numbers[rest] = [float(self._data[begin:end]) for begin, end in cells]
-            except ValueError:
-                return None
-            if not np.isfinite(numbers).all():
-                return None
-            found[row : row + height].reshape(-1)[filled] = numbers
+        blank = (np.diff(self._ends) == 1).reshape(-1, len(self.header))[:, columns]
+        lacking = np.asarray(blank.any(axis=0))
+        some = np.flatnonzero(~(lacking & blank.all(axis=0)))
+        if not len(some):
+            return np.full(blank.shape, np.nan)
+        rows = io.BytesIO(self._filled() if lacking[some].any() else self._data)
+        if not lacking[some].any():
+            rows.seek(int(self._ends[0]) + 1)
+        sep, use = self._separator, [columns[k] for k in some.tolist()]
+        try:  # latin1 knows every byte, whatever the other columns hold
+            read = np.loadtxt(rows, float, None, sep, usecols=use, ndmin=2, encoding='latin1')
+        except (ValueError, OverflowError):
+            return None
+        finite = np.isfinite(read)
+        if not (finite.all() or (finite | blank[:, some]).all()):
+            return None
+        if len(some) == len(names):
+            return read
+        found = np.full(blank.shape, np.nan)
+        found[:, some] = read
         return found
+
+    def _filled(self) -> bytes:
+        """Return the rows with NaN in empty cells."""
+        sep = self._separator.encode()
+        data = b'\n' + self._data[int(self._ends[0]) + 1 :]
+        for _ in range(2):  # neighbours share a separator
+            data = data.replace(sep + sep, sep + b'nan' + sep)
+        return data.replace(b'\n' + sep, b'\nnan' + sep).replace(sep + b'\n', sep + b'nan\n')
 
     def _places(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Return where the cells of a column begin and end."""
@@ -168,8 +175,7 @@ def regular(
         return None
     ends = None
     if begin + 1 < len(data):
-        padded = data if begin >= LONGEST else bytes(LONGEST) + data[begin:]
-        ends = _ends(padded, max(begin, LONGEST), separator, width)
+        ends = _ends(data, begin, separator, width)
     if (ends is None or width == 1) and b'\n\n' in b'\n' + data:
         rows = data.split(b'\n')[:-1]
         found = regular(path, b'\n'.join(filter(None, rows)), separator, header)
@@ -178,7 +184,7 @@ def regular(
     if ends is None:
         return None
     lines = above + 1 + int(begin > 0) + np.arange(len(ends) // width)
-    return TextColumns(path, names, lines, separator, padded, ends)
+    return TextColumns(path, names, lines, separator, data, ends)
 
 
 def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int32] | None:
