@@ -374,7 +374,7 @@ def test_chains_of_other_joints_are_refused():
     [
         (np.zeros((2, 5)), r'shape \(N, 6\), not \(2, 5\)'),
         (np.zeros((0, 6)), r'shape \(N, 6\)'),
-        (np.full((2, 6), np.nan), 'joint values of sample 0'),
+        (np.full((2, 6), np.nan), 'joint values of point 0'),
     ],
 )
 def test_wrong_joint_values_are_refused(joints, complaint):

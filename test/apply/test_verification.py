@@ -138,7 +138,7 @@ def test_pass_fail_and_undecided(cell, arm, program):
     near = verify(arm, seen, 1.2 * rms)
     assert near.verdict == 'UNDECIDED'
     assert 5 < near.needed < 500
-    assert f'about {near.needed} configurations' in in_words(near)
+    assert f'about {near.needed} poses' in in_words(near)
 
 
 @pytest.mark.parametrize('shape', [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.1, 0.1)])
@@ -228,7 +228,7 @@ def test_a_target_that_was_mounted_anew(cell, arm, oriented):
     before, after = found.comparison.figures
     assert 0.5 < before.rms_mm < 5.0
     assert after.rms_mrad is None or after.rms_mrad < 1.0
-    with pytest.raises(InputError, match='7 configurations were measured, at least 8'):
+    with pytest.raises(InputError, match='7 poses were measured, at least 8'):
         verify(arm, [seen[0].select(np.arange(7))], 3e-4, new_base=True, new_tool=True)
 
 
@@ -307,9 +307,9 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
     for tolerance, confidence in ((0.0, 0.95), (1e-3, 0.4), (1e-3, 1.0), (np.nan, 0.95)):
         with pytest.raises(ConfigError, match='tolerance must be positive'):
             verify(arm, [seen], tolerance, confidence)
-    with pytest.raises(InputError, match='4 configurations were measured, at least 5'):
+    with pytest.raises(InputError, match='4 poses were measured, at least 5'):
         verify(arm, [measured(true, joints[:4])], 1e-3)
-    with pytest.raises(InputError, match='6 configurations were measured, at least 7'):
+    with pytest.raises(InputError, match='6 poses were measured, at least 7'):
         verify(arm, [seen], 1e-3, new_base=True)
     with pytest.raises(InputError, match='not base_other and tool'):
         verify(arm, [replace(seen, base='base_other')], 1e-3)
@@ -356,7 +356,7 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
             assert out.startswith(f'{word}: ')
             assert 'RMS over poses like these is above 0.' in out
             assert 'about the calibration' not in out
-            assert '15 times in 5 configurations' in out
+            assert '15 times at 5 poses' in out
             assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
 
 
