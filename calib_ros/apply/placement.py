@@ -85,15 +85,12 @@ def place(
     model : 'corrected' or 'nominal'
         By which the arm is commanded.
     region : (2, 3), optional
-        Lower and upper corner [m], in the base frame, for the origin of the task's frame; all
-        that the arm reaches if None.
-    cells, turns : int
-        Points of the grid along each axis, and turns about the vertical, evenly spread.
-    refinements : int
-        Times that the grid is halved about the best placement.
+        Corners [m, base] for the origin of the task's frame; None: all that the arm reaches.
+    cells, turns, refinements : int
+        Points of the grid along each axis, its turns about the vertical, and the times that it is
+        halved about the best placement.
     starts, drawn : int
-        Configurations from which the first pose of the task is solved, and random ones among
-        which they are looked for.
+        Joint values that the first pose is solved from, and random ones they are taken from.
 
     Raises
     ------
@@ -104,8 +101,8 @@ def place(
     search = _Search(arm, task, aim, model, starts, drawn)
     corners = search.within(region)
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
-    axes.append(2.0 * np.pi * np.arange(turns) / turns)
-    grid = np.stack(np.meshgrid(*axes, indexing='ij'), axis=-1).reshape(-1, 4)
+    angles = 2.0 * np.pi * np.arange(turns) / turns
+    grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
     errors, joints = search.errors(grid)
     reached = ~np.isnan(errors)
     if not reached.any():
@@ -117,13 +114,12 @@ def place(
     centre = int(np.where(reached, away, np.inf).argmin())
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
     for _ in range(refinements):
-        step = 0.5 * step
+        step /= 2.0
         near = _around(grid[np.nanargmin(errors)], step, corners)
         more = search.errors(near)
         both = zip((grid, errors, joints), (near, *more), strict=True)
         grid, errors, joints = map(np.concatenate, both)
-    best = int(np.nanargmin(errors))
-    return Placements(grid[:, :3], grid[:, 3], errors, joints, best, centre)
+    return Placements(grid[:, :3], grid[:, 3], errors, joints, int(np.nanargmin(errors)), centre)
 
 
 def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:

@@ -64,8 +64,7 @@ def solve(
 ) -> Inverse:
     """Return the joint values near a start that bring the target to wanted poses.
 
-    Thousands of small problems at once, array by array, where `leastsquares` solves one of many
-    samples: each has its own damping.
+    Thousands of small problems at once, each with its own damping.
 
     Parameters
     ----------
@@ -107,17 +106,12 @@ def solve(
         tried = _within(chain, q[:, active] + solve_positive(normal, slope))
         new_error, new_columns, new_size = missed(tried, active)
         better = new_size < size[active]
-        damping[active] *= np.where(better, 0.1, 10.0)
-        damping = np.maximum(damping, least)
+        damping[active] = np.maximum(damping[active] * np.where(better, 0.1, 10.0), least)
         moved = active[better]
         q[:, moved], error[:, moved] = tried[:, better], new_error[:, better]
         columns[:, :, moved], size[moved] = new_columns[:, :, better], new_size[better]
-    return Inverse(
-        q.T,
-        np.linalg.norm(error[:3], axis=0),
-        np.linalg.norm(error[3:], axis=0) / LEVER,
-        size <= SAME,
-    )
+    apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / LEVER))
+    return Inverse(q.T, apart, turned, size <= SAME)
 
 
 def _within(chain: Chain, q: FloatArray) -> FloatArray:
