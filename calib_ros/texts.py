@@ -67,7 +67,9 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
     try:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as err:
-        raise error(f'cannot read {where}: {err}') from err
+        raise error(
+            f'cannot read {where}: no UTF-8 ({err.reason} at byte {err.start}), save it as that'
+        ) from err
 
 
 def csv_lines(text: str, where: str) -> io.StringIO:

@@ -79,7 +79,7 @@ class Columns:
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
-            cell_number(repr(found[row, k]), self.where(row, names[k]), largest)
+            cell_number(str(found[row, k]), self.where(row, names[k]), largest)
         return found
 
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
