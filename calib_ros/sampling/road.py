@@ -12,14 +12,20 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
+from calib_ros.sampling.hints import Hint, apart
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.strays import Gate
+from calib_ros.sampling.track import CAUSES
+from calib_ros.sampling.waiting import TOO_LATE
 from calib_ros.settings import Settings
 
 LEAST_FAR = Settings.lateness
 """Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
 what has not come yet; joint states up to `max_gap` apart belong together."""
+
+UNMATCHED = (TOO_LATE, *(f'{POSES}: {cause}' for cause in CAUSES[1:3]))
+"""Causes by which measurements are dropped that were stamped by another clock."""
 
 
 class Road:
@@ -70,6 +76,15 @@ class Road:
         made, shaken = self.collector.maker.take()
         count = self._taken(made)
         self.clocks.watch.wake(self.collector.maker.unrest, count - shaken, count)
+
+    def hints(self, measurements: int) -> list[Hint]:
+        """Return what looks wrong with the stamps, of so many measurements."""
+        ahead = 1e-9 * (self._newest[POSES] - self._newest[JOINTS])
+        collector, lateness = self.collector, self.clocks.settings.lateness
+        unmatched = sum(collector.dropped[cause] for cause in UNMATCHED)
+        hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
+        found = [hint] if hint is not None and all(self._newest.values()) else []
+        return found + self.clocks.hints() + collector.hints(measurements)
 
     def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
         """Yield messages up to one that gives something to do, when those before are kept."""
