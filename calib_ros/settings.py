@@ -28,8 +28,6 @@ standard deviations 5 % larger, less than their own uncertainty; more may be a p
 workspace."""
 GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
-YEARS = 100.0
-"""Time between false alarms of a robot, of one night each day, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')
 """How samples are taken."""
 STARTUP = (

@@ -26,7 +26,6 @@ from scipy import optimize, special
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import YEARS
 
 SLOPES = (0.5, 2.0)
 """References k: shifts of one and of four standard deviations show soonest."""
@@ -56,7 +55,7 @@ class Drift:
     since: tuple[int, ...]
 
 
-def drift(rms: Sequence[float], freedom: Sequence[float], years: float = YEARS) -> Drift:
+def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift:
     """Look for nights from which on an arm is worse.
 
     Parameters

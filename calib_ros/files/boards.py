@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
 from calib_ros.escapes import to_cell
 from calib_ros.files.columns import check_quaternions
 from calib_ros.files.csv_columns import read_columns
@@ -40,8 +40,6 @@ from calib_ros.values import parse_number
 
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
-MOST = 100
-"""Columns and rows of a board."""
 HEADER = ('image', 'corner', 'u', 'v')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
 POSED = 'flange_pose'
@@ -66,9 +64,10 @@ class Board:
             raise UnknownNameError('type of board', self.type, TYPES)
         least = 2 if self.type == 'charuco' else 1
         for name in ('columns', 'rows'):
-            if not least <= getattr(self, name) <= MOST:
+            count = getattr(self, name)
+            if not least <= count <= MOST_ENTRIES:
                 raise ConfigError(
-                    f'{name} of a board must be from {least} to {MOST}, not {getattr(self, name)}'
+                    f'{name} of a board must be from {least} to {MOST_ENTRIES}, not {count}'
                 )
         if not 0.0 < self.marker < self.square:
             raise ConfigError(
