@@ -58,13 +58,8 @@ def is_indexed(file: Path) -> bool:
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, content) of the records, those in chunks included.
 
-    Raises
-    ------
-    EOFError
-        When the last one is cut off, after what it holds.
-    ValueError
-        When a chunk is within another one, or there is more in them than any recording holds.
-
+    One that is cut off is an EOFError, after what it holds; a chunk in another one, or more in
+    them than any recording holds, is a ValueError.
     """
     left = LARGEST_CHUNK + LARGEST_RATIO * len(content)
     while start < len(content):

@@ -32,8 +32,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Float64MultiArray, String
 
-from calib_ros.apply.simulation import Cell as SimulatedCell
-from calib_ros.apply.simulation import faulty, measure, random_frame
+from calib_ros.apply.simulation import Cell as SimulatedCell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag
