@@ -22,12 +22,14 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
 from calib_ros.settings import Settings
 
-STEP = 5e-3
+SMOOTHING = 0.5 * Settings.max_gap
+"""Time over which speeds are taken [s]; short against a move, long against the noise."""
+STEP = SMOOTHING / 10.0
 """Time between two values of the speeds [s]."""
 MOST_DELAY = Settings.lateness
 """Largest delay that is looked for [s]: as late as measurements may come."""
-LEAST_MOTION = 3.0
-"""Time in motion that is needed [s]."""
+LEAST_MOTION = 3.0 * MOST_DELAY
+"""Time in motion that is needed [s]: so that most of it is compared at every delay."""
 ALIKE_ENOUGH = 0.8
 """Least correlation."""
 RISE = 0.02
@@ -36,8 +38,6 @@ IN_MOTION = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
-SMOOTHING = 10.0 * STEP
-"""Time over which speeds are taken [s]; short against a move, long against the noise."""
 
 
 @dataclass(frozen=True)
