@@ -6,11 +6,7 @@ import queue
 import threading
 
 import pytest
-from ros_cell import (
-    STOPS,
-    Cell,
-    topics,
-)
+from ros_cell import STOPS, Cell, topics
 from std_msgs.msg import String
 
 from calib_ros.identification.identification import identify
