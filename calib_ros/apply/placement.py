@@ -35,21 +35,12 @@ def task_of(poses: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placements(Shown):
-    """Where a task's frame may be placed, and the error expected there.
+    """Where a task's frame may be placed, and the `errors` (M,) [m] expected there.
 
-    Attributes
-    ----------
-    positions : (M, 3)
-        Of the task's frame [m] in the arm's base frame.
-    turns : (M,)
-        Turn [rad] of the task's frame about the vertical axis of the base.
-    errors : (M,)
-        Expected error [m]; NaN where the arm does not reach all poses of the task.
-    joints : (M, K, n)
-        Joint values [rad or m] of the task's poses, where it is reached.
-    best, centre : int
-        The placement of least error, and the one nearest to the centre of all that are reached.
-
+    `positions` (M, 3) [m] are in the arm's base frame, `turns` (M,) [rad] about its vertical axis;
+    `joints` (M, K, n) [rad or m] are those of the task's poses. Errors are NaN where not all poses
+    are reached. `best` is the placement of least error, `centre` the one nearest to the centre of
+    all that are reached.
     """
 
     positions: FloatArray

@@ -22,18 +22,10 @@ from calib_ros.shown import Shown, as_frame
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """The next pose to measure, and what it brings.
+    """The next pose to measure, joint values (n,) [rad or m], and what it brings.
 
-    Attributes
-    ----------
-    joints : (n,)
-        Joint values [rad or m].
-    now, then : float
-        Predicted RMS position error [m] at the task poses, without and with it; infinite while
-        parameters are not determined.
-    enough : bool
-        Whether the wanted error is reached already.
-
+    `now` and `then` are the RMS position errors [m] predicted at the task poses without and with
+    it, infinite while parameters are not determined; `enough` tells that it is as small as wanted.
     """
 
     joints: FloatArray
