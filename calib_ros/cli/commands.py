@@ -141,7 +141,6 @@ def _add_identify(parser: argparse.ArgumentParser) -> None:
         group,
         float,
         ('--largest-loss', 'SHARE', EXCEPTION, loss),
-        ('--socket-distance', 'M', None, 'between two sockets of a place, 0.05 if not given'),
         ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
     )
     group = parser.add_argument_group('what to write')

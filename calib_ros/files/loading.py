@@ -91,7 +91,7 @@ def table(
 
 def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return what is to be fitted of a table; what is `given` goes to the problem."""
-    problem = found.problem(chain, **given, **settings.for_problem())
+    problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
     samples = {
         'samples': sum(map(len, found.fitted)),
         'held_out': sum(map(len, found.held_out)),

@@ -43,7 +43,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.problems import with_lenses
-from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, csv_text, read_bytes
 
@@ -67,7 +68,9 @@ class Table(Shown):
     by_line: bool = False
     lenses: Mapping[str, Lens] = field(default_factory=dict)
 
-    def problem(self, chain: Chain, sockets: float = SOCKETS, **more: Any) -> Problem:
+    def problem(
+        self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any
+    ) -> Problem:
         """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
         return Problem(
             with_lenses(chain, self.lenses),
