@@ -19,7 +19,7 @@ def bad_inputs():
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
-    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a number'
+    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'
     yield 'too few rows', (*csv_of, 'few.csv'), '3 measured poses are too few'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
     yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
