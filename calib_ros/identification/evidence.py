@@ -129,6 +129,24 @@ class Posterior(Shown):
         rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
         return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
 
+    def held_at(self, name: str, slope: FloatArray) -> Posterior:
+        """Return it with a length kept nominal as uncertain as lengths are.
+
+        The fitted parameters (F,), which come first, grow by `slope` as that does.
+        """
+        along = np.concatenate([slope, np.zeros(len(self.names) - len(slope)), [1.0]])
+        more = self.sizes['length'] ** 2 * np.outer(along, along)
+        return replace(
+            self,
+            names=(*self.names, name),
+            offsets=np.append(self.offsets, 0.0),
+            shift=np.append(self.shift, 0.0),
+            covariance=np.pad(self.covariance, (0, 1)) + more,
+            doubted=tuple(
+                (w, np.append(m, 0.0), np.pad(c, (0, 1)) + more) for w, m, c in self.doubted
+            ),
+        )
+
     def held(self, name: str) -> float:
         """Return which share of a parameter's variance is that of its prior: 1 if untold."""
         variance = float(self.covariance[self.names.index(name), self.names.index(name)])

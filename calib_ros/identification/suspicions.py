@@ -29,7 +29,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.identification.evidence import SCALE
-from calib_ros.identification.identifiability import excited
+from calib_ros.identification.identifiability import excited, growth
 from calib_ros.identification.leastsquares import System, factor_of, minimise, stacked
 from calib_ros.identification.levels import NEARER
 from calib_ros.identification.observations import Observations
@@ -41,7 +41,6 @@ from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -87,23 +86,19 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
     fitted = [i for i, n in enumerate(result.names) if n in arm and Parameter(n).is_length]
     if len(fitted) < 3 or not lengths:
         return 0.0, np.inf, 0.0
-    grown = np.array([problem.model.value(n) for n in lengths])
     first = problem.sets[0]
-    joints = first.spread().joints
-    names = tuple(dict.fromkeys((*result.names, *lengths)))
-    rows = ErrorModel(chain, names, first.base, first.tool).jacobian(joints)
-    if not first.oriented.any():
-        rows = rows[:, :3]
-    rows = rows.reshape(-1, rows.shape[2])
-    size = len(result.names)
-    reach = np.linalg.norm(rows[:, :size], axis=0)
-    reach[reach == 0.0] = 1.0
-    seen = rows[:, [names.index(n) for n in lengths]] @ grown
-    growth = np.linalg.lstsq(rows[:, :size] / reach, seen, rcond=1e-10)[0] / reach
+    grown = growth(
+        chain,
+        result.names,
+        {n: problem.model.value(n) for n in lengths},
+        (first.base, first.tool),
+        first.spread().joints,
+        bool(first.oriented.any()),
+    )
     offsets: dict[str, float] = {p.name: p.offset for p in result.parameters}
     return _common(
         np.array([offsets[result.names[i]] for i in fitted]),
-        growth[fitted],
+        grown[fitted],
         result.covariance[np.ix_(fitted, fitted)],
     )
 
