@@ -70,7 +70,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
     refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
-    found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
+    found = (scale, sister, _gravity(problem, result), _coupling(result))
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
 
@@ -191,19 +191,28 @@ def _gravity(problem: Problem, result: Identification) -> str:
     )
 
 
-def _coupling(problem: Problem, result: Identification) -> str:
-    """Return in words whether couplings of the wrist explain what is left."""
-    known = [name for name, _ in result.chain.effects]
-    names = [n for n in effects.members(problem.chain, 'coupling') if n not in known]
-    if not names or result.noise.position < SUSPICIOUS:  # nothing is left to explain
-        return ''
-    chain = result.chain.with_effects([*known, *names])
-    share = _explained(problem, chain, result.names, names)
-    if share < EXPLAINED:
+def lacking(
+    problem: Problem, chain: Chain, names: Sequence[str], noise: float
+) -> tuple[tuple[str, ...], float]:
+    """Return the couplings of the wrist, and the share of what a fit has left that they explain.
+
+    None where that is not most of it. `noise` is the size of what is left [sigma given].
+    """
+    known = [name for name, _ in chain.effects]
+    added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
+    if not added or noise < SUSPICIOUS:  # nothing is left to explain
+        return (), 0.0
+    share = _explained(problem, chain.with_effects([*known, *added]), names, added)
+    return (added, share) if share >= EXPLAINED else ((), 0.0)
+
+
+def _coupling(result: Identification) -> str:
+    """Return in words that couplings of the wrist explain what is left."""
+    if not any('.coupling_' in name for name in {*result.posterior.names} - {*result.names}):
         return ''
     return (
-        f'couplings of the last joints explain {100.0 * share:.0f} % of the residuals: are the '
-        'joint values those of the joints, not of the motors? Else add the effects "coupling"'
+        'couplings of the last joints explain most of the residuals: are the joint values those '
+        'of the joints, not of the motors? Else add the effects "coupling"'
     )
 
 
