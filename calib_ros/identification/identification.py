@@ -314,6 +314,7 @@ def _findings(
         own_behaviour=None if step else arms_own(problem, robust),
         may_be_rounding=bool(coarse)
         and may_be_rounding(problem, before.chain, names, coarse, robust.good),
+        sized=fitted.held is None,
     )
 
 
