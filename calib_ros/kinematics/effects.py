@@ -157,12 +157,13 @@ def basis(
 
 def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) with what effects add to them, by their phi (E, B)."""
-    if not names:
+    known = dict(chain.effects)
+    values = [known[name] for name in names]
+    if not any(values):
         return q
-    values = dict(chain.effects)
-    joints = [chain.joint_names.index(Parameter(name).owner) for name in names]
     shares = np.zeros((len(q), len(names)))
-    shares[joints, np.arange(len(names))] = [values[name] for name in names]
+    for k, name in enumerate(names):
+        shares[chain.joint_names.index(Parameter(name).owner), k] = values[k]
     return np.asarray(q + shares @ phi)
 
 

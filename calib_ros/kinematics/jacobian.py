@@ -305,18 +305,18 @@ def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
 
     Notes
     -----
-    E = R_measured R^T is summed from its columns; its vector is log E = angle / sin(angle) *
-    1/2 sum_k r_k x m_k, which is as long as log(R^T R_measured).
+    E = R_measured R^T is summed from its columns; its vector is log E, as long as
+    log(R^T R_measured): angle / sin(angle) times half of what E differs from its transpose.
 
     """
-    sine_vector = 0.5 * se3.cross(model, measured).sum(axis=0)
-    cosine = 0.5 * (np.einsum('kib,kib->b', model, measured) - 1.0)
+    turn = np.einsum('kib,kjb->ijb', measured, model)
+    sine_vector = 0.5 * (turn[[2, 0, 1], [1, 2, 0]] - turn[[1, 2, 0], [2, 0, 1]])
+    cosine = 0.5 * (np.einsum('iib->b', turn) - 1.0)
     sine = np.sqrt(np.einsum('ib,ib->b', sine_vector, sine_vector))
     angle = np.arctan2(sine, cosine)
     least = np.maximum(sine, se3.ROUNDING)
     error: FloatArray = sine_vector * np.where(sine > se3.ROUNDING, angle / least, 1.0)
     half_turn = np.flatnonzero(cosine < -0.99)  # the sine loses the axis near 180 degrees
     if half_turn.size:
-        turned = np.einsum('kib,kjb->bij', measured[..., half_turn], model[..., half_turn])
-        error[:, half_turn] = se3.log_rotation(turned).T
+        error[:, half_turn] = se3.log_rotation(turn[..., half_turn].transpose(2, 0, 1)).T
     return error
