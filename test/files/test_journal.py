@@ -168,6 +168,7 @@ def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
     written(path, [])
     header = path.read_bytes()
     path.write_bytes(header[:20])
+    assert read_journal(path, JOINTS) == ((), ())
     written(path, [plain(1)])
     assert path.read_bytes().startswith(header)
     assert_equal(read_journal(path, JOINTS)[0], [plain(1)])
