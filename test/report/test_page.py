@@ -10,8 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from measured import TEST, TRAIN, TRUE, UR, measured
 from pages import Page, page_of, problem_of, report_of
 from plotly import graph_objects
@@ -43,10 +42,9 @@ def figures_of(page):
 def test_the_figures_are_those_of_the_result(solved):
     _, result = solved
     page = page_of(report_of(*solved))
-    for which in (result.fitted, result.validation):
-        for figures in which.figures:
-            for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
-                assert f'{value:.3f}' in page.text
+    for figures in result.validation.figures:
+        for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
+            assert f'{value:.3f}' in page.text
     for name, partners in result.gauges.items():
         assert f'{name} {", ".join(partners)}' in page.text
     assert table_hash(result.chain) in page.text
@@ -172,6 +170,13 @@ def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
     (coarse,) = advice.advice([Reason(rule, 'little gain')], 47.6)
     assert '48 times' in coarse.steps[0]
     assert coarse.steps[1:] == usual.steps
+
+
+def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
+    rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.CONVERGENCE)
+    told = advice.advice([Reason(rule, rule.name) for rule in rules], 1000.0)
+    assert [bool(each.steps) for each in told] == [True, False, False, True]
+    assert [each.meaning == advice.FOLLOWS for each in told] == [False, True, True, False]
 
 
 def test_a_refused_page_says_why_and_what_to_do():
