@@ -19,7 +19,6 @@ from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
@@ -153,10 +152,8 @@ class _Linear:
         self._ends = np.cumsum([each[-1].size for each in rows])
         owner = owners(rows)
         self._folds = [dealing[owner] for dealing in dealings]
-        self._products = [
-            np.array([_square(self._columns[:, folds == k].T) for k in range(problem.folds)])
-            for folds in self._folds
-        ]
+        self._inside = np.array([d == k for d in self._folds for k in range(problem.folds)])
+        self._products = np.array([_square(self._columns[:, part].T) for part in self._inside])
         self._pairs = [
             effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
@@ -267,28 +264,19 @@ class _Linear:
             added = stacked(self._rows(missing)).T[:-1]
             self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
             self._columns = np.concatenate([self._columns, added])
-            self._products = [
-                self._wider(parts, folds, added)
-                for parts, folds in zip(self._products, self._folds, strict=True)
-            ]
+            size, count = len(self._columns), len(added)
+            masked = (self._inside[:, np.newaxis] * added).reshape(-1, added.shape[1])
+            new = (masked @ self._columns.T).reshape(-1, count, size)
+            known, self._products = self._products, np.zeros((len(new), size, size))
+            self._products[:, :-count, :-count] = known
+            self._products[:, :, -count:] = np.swapaxes(new, 1, 2)
+            self._products[:, -count:] = new
         return [self._number[name] for name in names]
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
         """Return weighted Jacobian and residual (P + 1, c, N) of each set."""
         chain = self._chain.with_effects([name for name in names if name not in self._names])
         return self._system.rows_of(chain, names)
-
-    def _wider(self, parts: FloatArray, folds: NDArray[np.intp], added: FloatArray) -> FloatArray:
-        """Return the products (F, C, C) by fold, those of the last columns (K, R) added."""
-        inside = np.arange(self._problem.folds)[:, np.newaxis, np.newaxis] == folds
-        size, count = len(self._columns), len(added)
-        masked = (inside * added).reshape(-1, added.shape[1])
-        new = np.swapaxes((masked @ self._columns.T).reshape(-1, count, size), 1, 2)
-        found = np.zeros((len(new), size, size))
-        found[:, :-count, :-count] = parts
-        found[:, :, -count:] = new
-        found[:, -count:] = np.swapaxes(new, 1, 2)
-        return found
 
     def _left_out(self, chosen: Sequence[str], dealing: int) -> FloatArray:
         """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
@@ -298,7 +286,8 @@ class _Linear:
             return self._errors[key]
         extra = np.column_stack(self._extra(chosen))
         ends = [*which, self._number['']]
-        parts = self._products[dealing][:, ends][:, :, ends]
+        folds = self._problem.folds
+        parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
         rest = parts.sum(axis=0) + _square(extra)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))  # a fold may hold all of it
         weights = np.zeros((len(parts), len(self._columns)))
@@ -307,8 +296,8 @@ class _Linear:
             scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
             factor = linalg.cho_factor(scaled)
             weights[fold, which] = scale * linalg.cho_solve(factor, scale * left[:, -1])
-        folds = self._folds[dealing][np.newaxis]
-        predicted = np.take_along_axis(weights @ self._columns, folds, axis=0)[0]
+        here = self._folds[dealing][np.newaxis]
+        predicted = np.take_along_axis(weights @ self._columns, here, axis=0)[0]
         pieces = np.split(self._residual - predicted, self._ends[:-1])
         sets = self._system.sets
         errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]
