@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -272,7 +272,7 @@ def typestore() -> Any:
 def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     """Return what makes messages of bytes, also of types that a bag itself defines."""
     if not defined:
-        return lambda data, kind: typestore().deserialize_cdr(data, kind)
+        return lambda data, kind: _decoded(typestore(), data, kind)
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -286,7 +286,21 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
             store.register({k: each for k, each in found.items() if k not in store.fielddefs})
         except Exception as err:  # a damaged definition fails in many ways
             raise InputError(f'the bag defines {kind} by what cannot be read: {err}') from err
-    return store.deserialize_cdr
+    return partial(_decoded, store)
+
+
+def _decoded(store: Any, data: bytes, kind: str) -> Any:
+    """Return a message; up to 12 bytes may stand behind it, of which the library takes 3.
+
+    rclpy leaves as many behind lists that are empty where it serialises for a writer of bags.
+    """
+    try:
+        return store.deserialize_cdr(data, kind)
+    except Exception:  # damaged bytes fail in many ways
+        for behind in (4, 8, 12):
+            with suppress(Exception):
+                return store.deserialize_cdr(data[:-behind], kind)
+        raise
 
 
 def _is_message(stream: Stream, data: object) -> bool:
