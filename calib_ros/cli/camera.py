@@ -74,9 +74,11 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
     if folder and not paths and not (options.images / 'metadata.yaml').exists():
         raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
     for k, path in enumerate(paths):
-        work(path.name, k / len(paths))
+        work(path.name)
+        work(k / len(paths))
         yield path.name, read_image(path)
     if paths:
         return
-    for stamp, message in pictures(options.images, options.topic):
+    for k, (stamp, message) in enumerate(pictures(options.images, options.topic), 1):
+        work(f'image {k}')
         yield str(stamp), image_of(message)

@@ -34,9 +34,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
     with screen.work(f'correcting {options.program.name}') as work:
         source = read_program(options.program, nominal.joint_names)
-        corrected, result = compensate_program(
-            compensator, source.program, lambda share: work(share=share)
-        )
+        corrected, result = compensate_program(compensator, source.program, work)
     if result.refusals:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
         for refusal in result.refusals[:NAMED]:

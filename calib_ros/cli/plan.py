@@ -24,6 +24,7 @@ from calib_ros.files.waypoints import joints_csv, read_joints
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told
 from calib_ros.report.maps import plan_report
 
 
@@ -42,8 +43,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         options.world,
     )
     planned = _tests if options.iso9283 else _measurement
-    with screen.work('choosing poses'):
-        joints, words, plan = planned(options, design, visibility, rng)
+    with screen.work('choosing poses') as work:
+        joints, words, plan = planned(options, design, visibility, rng, work)
     screen.say(words)
     if chain.tool is None:
         x, y, z = ASSUMED_TOOL
@@ -69,7 +70,11 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _measurement(
-    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+    options: argparse.Namespace,
+    design: Design,
+    visibility: Visibility,
+    rng: np.random.Generator,
+    told: Told,
 ) -> tuple[FloatArray, str, Plan | None]:
     """Return the poses to measure in the order of visit, what they promise, and the plan."""
     size = len(design.chain.joints)
@@ -88,7 +93,7 @@ def _measurement(
         candidates = candidates[visibility.sees(design, candidates)]
         if not len(candidates):
             raise InputError(f'the target can be measured at no pose of {options.candidates}')
-    choice = {'criterion': options.criterion, 'apart': options.apart}
+    choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
     needed = None
     if options.accuracy is not None:
         wanted = 1e-3 * options.accuracy
@@ -101,7 +106,11 @@ def _measurement(
 
 
 def _tests(
-    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+    options: argparse.Namespace,
+    design: Design,
+    visibility: Visibility,
+    rng: np.random.Generator,
+    told: Told,
 ) -> tuple[FloatArray, str, Plan | None]:
     """Return the test poses of ISO 9283, and what to do with them; there is no plan."""
     found = iso_9283_poses(design, rng, visibility)

@@ -14,6 +14,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
+from calib_ros.progress import share_of
 from calib_ros.report import words
 from calib_ros.report.advice import advice
 from calib_ros.report.markdown import markdown
@@ -128,14 +129,18 @@ def result_files(
     from calib_ros.report.plots import before_after_png
 
     loaded, result = found.loaded, found.result
-    with screen.work('writing the report'):
+    with screen.work('writing the report') as work:
+        work('residuals.csv, 1 of 3')
         poses = poses_of(loaded.problem, result, loaded.lines)
         contents: dict[str, str | bytes] = {
             'result.json': json.dumps(document(found, tolerance), indent=2) + '\n',
-            'residuals.csv': poses.table(),
-            'before_after.png': before_after_png(result),
+            'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),
             'settings.yaml': found.origin.settings,
         }
+        work('before_after.png, 2 of 3')
+        contents['before_after.png'] = before_after_png(result)
+        work('report.html, 3 of 3')
+        work(2 / 3)
         wanted = None if tolerance is None else 1e-3 * tolerance
         report = identification_report(
             loaded.problem, result, poses, found.origin, found.warnings, wanted

@@ -57,10 +57,9 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
     found = None
     if task is not None:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
-        with screen.work('placing the task'):
-            found = placement.place(
-                arm, task, options.aim, options.model, region, options.cells, options.turns
-            )
+        with screen.work('placing the task') as work:
+            where = (region, options.cells, options.turns)
+            found = placement.place(arm, task, options.aim, options.model, *where, told=work)
         screen.say(placement.in_words(found, options.aim, options.model))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)

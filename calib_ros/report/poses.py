@@ -22,6 +22,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
@@ -103,7 +104,7 @@ class Poses:
         }
         return Poses(**arrays, tools=self.tools, lines=self.lines)
 
-    def table(self) -> str:
+    def table(self, told: Told = nobody) -> str:
         """Return a CSV: a row for each pose, in metres and radians."""
         names = ['line' if self.lines else 'stamp_ns', 'set', 'role', 'outlier', 'size']
         names += [f'q{k + 1}' for k in range(self.joints.shape[1])]
@@ -122,6 +123,7 @@ class Poses:
             columns += np.column_stack([block[rows] for block in blocks]).T.tolist()
             text = '\n'.join(form % row for row in zip(*columns, strict=True))
             parts.append(text.replace('nan', ''))
+            told(min(1.0, rows.stop / len(self)))
         return '\n'.join(parts) + '\n'
 
 

@@ -262,8 +262,14 @@ def test_work_tells_the_time_left(monkeypatch):
     work = screen.Work('reading bag')
     monkeypatch.setattr(time, 'monotonic', lambda: 16.0)
     assert str(work) == 'reading bag, 6 s'
-    work('third file', 0.75)
+    work('third file')
+    work(0.75)
     assert str(work) == 'reading bag (third file), 6 s, 75 %, 2 s left'
+    work(0.5)  # never backwards
+    monkeypatch.setattr(time, 'monotonic', lambda: 17.0)
+    assert str(work) == 'reading bag (third file), 7 s, 75 %, 1 s left'
+    work(1.0)  # all that is measured is done: no bar at its end
+    assert str(work) == 'reading bag (third file), 7 s'
 
 
 def test_a_bag_tells_how_much_of_it_is_read(cell, monkeypatch):
@@ -273,6 +279,45 @@ def test_a_bag_tells_how_much_of_it_is_read(cell, monkeypatch):
     assert told == sorted(told)
     assert len(told) > 5
     assert told[-1] == 1.0
+
+
+@pytest.mark.parametrize(
+    ('command', 'least'),
+    [
+        (('identify', 'measured.csv', '--model', 'auto'), 7),
+        (('csv2bag', 'quoted.csv', 'NEW/bag'), 100),
+        (('identify', 'quoted.csv'), 40),
+    ],
+)
+def test_a_command_tells_how_much_is_left(cell, shown, monkeypatch, command, least):
+    text = (cell / 'measured.csv').read_text().replace('train', '"train"')
+    (cell / 'quoted.csv').write_text(text)
+    shares = []
+
+    class Heard(Work):
+        def __call__(self, at):
+            super().__call__(at)
+            shares.extend([] if isinstance(at, str) else [(id(self), at)])
+
+    monkeypatch.setattr(screen, 'Work', Heard)
+    (cell / 'NEW').mkdir()
+    status, text = shown(*command, *UR5E)
+    shutil.rmtree(cell / 'NEW')
+    assert status == 0, text
+    assert len(shares) >= least
+    last = {}
+    for work, share in shares:
+        assert last.get(work, 0.0) <= share <= 1.0
+        last[work] = share
+    assert max(last.values()) > 0.6
+
+
+def test_a_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, shown):
+    told = []
+    monkeypatch.setattr(Work, '__call__', lambda self, at: told.append(at))
+    assert shown('plan', *UR5E, '--accuracy', '0.1', '--draw', '100')[0] == 0
+    assert re.fullmatch(r'\d+ poses', told[0])
+    assert re.fullmatch(r'\d+ poses, exchange 2', told[1])
 
 
 @pytest.mark.parametrize(
