@@ -56,7 +56,7 @@ def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: st
         with path.open('rb') as file:
             data = file.read(largest + 1)
     except OSError as err:
-        raise error(f'cannot read {what}{path}: {err}') from err
+        raise error(f'cannot read {what}{path}: {err.strerror or err}') from err
     if len(data) > largest:
         raise error(f'{what}{path} is larger than {largest // 10**6} MB: is it the right file?')
     return data

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib_ros.atomic import write_file
+from calib_ros.atomic import write_file, write_together
 from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
@@ -43,9 +43,9 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     words = f'{board.type} {board.columns} x {board.rows}, {board.dictionary}; must measure '
     words += f'{width:.2f} x {height:.2f} mm: print in true size (100 %)'
     described = options.out.with_suffix('.yaml')
-    common.refuse_existing(options, described)
-    write_file(options.out, board_pdf(np.array(rows), board.size, words), overwrite=options.force)
-    write_file(described, dump_yaml(content), overwrite=options.force)
+    common.refuse_existing(options, options.out, described)
+    drawn = {options.out: board_pdf(np.array(rows), board.size, words)}
+    write_together({**drawn, described: dump_yaml(content)}, overwrite=options.force)
     printed = f'{width:.2f} x {height:.2f} mm'
     screen.say(f'wrote {options.out} and {described}: {printed}; measure the print')
     return 0

@@ -23,7 +23,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from calib_ros import __version__
 from calib_ros.cli.command import GROUPS, TEXTS
 from calib_ros.cli.screen import Screen, help_width
-from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
+from calib_ros.errors import CalibrationError, UnknownNameError, shortened, trouble
 
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
@@ -50,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError:
         return _failed('there is not enough memory: give less data, or close other programs')
     except OSError as err:
-        advice = advice_on(err)
-        return _failed(f'{err}; {advice}' if advice else str(err))
+        return _failed(trouble(err))
     except CalibrationError as err:
         return _failed(str(err))
     return status

@@ -15,7 +15,7 @@ from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
-from calib_ros.atomic import write_file
+from calib_ros.atomic import write_together
 from calib_ros.cli import given
 from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
@@ -62,9 +62,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             options.accuracy,
         )
         pages = given.page_of(report, screen, page.name)
-        write_file(options.out, joints_csv(joints), overwrite=options.force)
-        for text in pages.values():
-            write_file(page, text, overwrite=options.force)
+        beside = {options.out.with_name(name): text for name, text in pages.items()}
+        write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
         screen.say(f'wrote {options.out}' + (f' and {page}' if pages else ''))
     return 0
 

@@ -68,10 +68,8 @@ def write_bag(
         try:
             _write_bag(folder, recording, storage, told)
         except (OSError, sqlite3.Error) as err:
-            failed = OSError(f'cannot write {path}: {err}')
             full = errno.ENOSPC if 'full' in str(err) else None
-            failed.errno = getattr(err, 'errno', None) or full
-            raise failed from err
+            raise OSError(getattr(err, 'errno', None) or full, str(err), str(path)) from err
         for file, text in (beside or {}).items():
             write_file(file, text, overwrite=True)
 

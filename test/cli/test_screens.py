@@ -340,6 +340,29 @@ def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error
     assert text.count('\n') == 1
 
 
+@pytest.mark.parametrize('name', ['board', 'chain', 'csv2bag', 'export', 'plan'])
+def test_a_full_disk_leaves_nothing_behind(cell, shown, monkeypatch, name):
+    """It is told in one line that names what was asked for; what was there before stays."""
+    sync, calls = os.fsync, []
+
+    def full(handle):
+        calls.append(handle)
+        if len(calls) > 1 or name == 'chain':
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        sync(handle)
+
+    monkeypatch.setattr(os, 'fsync', full)
+    (cell / 'NEW').mkdir()
+    (cell / 'NEW/notes').write_text('mine')
+    status, text = shown(name, *RESULTS[name][1:])
+    there = [path.name for path in (cell / 'NEW').iterdir()]
+    shutil.rmtree(cell / 'NEW')
+    assert (status, there) == (1, ['notes'])
+    line = text.splitlines()[-1]
+    assert re.match(r'calib_ros: \S*NEW/[^.]\S*: the disk is full: make room', line)
+    assert 'partial' not in text
+
+
 def test_who_reads_no_further_is_no_error():
     command = f'{sys.executable} -m calib_ros.cli.main robots | head -c 1'
     found = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
