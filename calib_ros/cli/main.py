@@ -38,15 +38,15 @@ WAY = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    options = _options(given)
     try:
+        options = _options(given)
         status: int = options.run(options, Screen(options.quiet))
         sys.stdout.flush()
     except BrokenPipeError:  # whoever read it has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13
     except KeyboardInterrupt:
-        return _failed('interrupted: nothing was written', 130)
+        return _failed('interrupted: no file is left half written', 130)
     except MemoryError:
         return _failed('there is not enough memory: give less data, or close other programs')
     except OSError as err:

@@ -326,7 +326,7 @@ def test_a_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, shown)
         (OSError(errno.ENOSPC, 'No space left on device', 'x'), 1, 'make room'),
         (PermissionError(errno.EACCES, 'Permission denied', 'x'), 1, 'choose another place'),
         (MemoryError(), 1, 'not enough memory'),
-        (KeyboardInterrupt(), 130, 'nothing was written'),
+        (KeyboardInterrupt(), 130, 'no file is left half written'),
     ],
 )
 def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error, status, words):
