@@ -16,7 +16,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.rows import verified
 from calib_ros.files.waypoints import read_joints
-from calib_ros.identification.calibration import calibration_file, load_calibration
+from calib_ros.identification.calibration import calibration_file
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
@@ -40,7 +40,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
     history = given.history_of(options)
     nominal = load_chain(options.chain)
-    arm = load_calibration(options.calibration, nominal)
+    arm = given.calibration_of(options.calibration, 'verify', nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
     commanded = None
     if options.commanded is not None:

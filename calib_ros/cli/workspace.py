@@ -19,7 +19,6 @@ from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import (
     Calibration,
     calibration_file,
-    load_calibration,
 )
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -42,7 +41,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
     """Map, place, print what comes out, and return the files of it."""
     from calib_ros.report import plots
 
-    arm = load_calibration(options.result, load_chain(options.chain))
+    arm = given.calibration_of(options.result, 'workspace', load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
     with screen.work('mapping errors over the workspace'):
