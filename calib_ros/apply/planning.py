@@ -204,5 +204,5 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
             'further and in more combinations, or fix these parameters. The figures leave out '
             'what these bring, and hold only where the joints move as in the candidates'
         )
-    lines.append('from the noise of the measurement alone; what the model lacks comes on top')
+    lines.append('from measurement noise alone; errors of the model come on top')
     return '\n'.join(lines)

@@ -364,8 +364,8 @@ def remarks(found: Verification) -> list[str]:
         lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     if not found.by_program:
         lines.append(
-            'this is about the calibration: whether its correction arrives at the arm shows only '
-            'with the program as it was before (--commanded)'
+            'this judges the calibration: give the program before its correction (--commanded) '
+            'to see whether the correction reaches the arm'
         )
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'

@@ -74,7 +74,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     for line in words.cameras_in_words(result):
         screen.bullet(line)
     if out is None:
-        screen.bullet('nothing is kept: --out FOLDER writes the calibration and its report')
+        screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
     else:
         screen.say(f'wrote {out}: open {out / "report.html"}')
 
