@@ -16,12 +16,13 @@ from calib_ros.identification.reasons import Reason, Rule
 
 @dataclass(frozen=True)
 class Advice:
-    """A refusal in plain words: heading, meaning, what to do, and the refusal itself."""
+    """A refusal in plain words: heading, meaning, what to do; the refusal itself and its rule."""
 
     heading: str
     meaning: str
     steps: tuple[str, ...]
     refusal: str = ''
+    rule: Rule | None = None
 
 
 RIGHT_CHAIN = (
@@ -238,6 +239,7 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
             RULES[rule],
             steps=(*_first(rule, left), *RULES[rule].steps),
             refusal='; '.join(texts),
+            rule=rule,
         )
         for rule, texts in found.items()
     )
