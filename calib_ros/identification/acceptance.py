@@ -111,15 +111,16 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
     if not gain > limit:
         yield Reason(
             Rule.GAIN,
-            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
+            f'no gain on held-out poses beyond chance (RMS {before.rms_mm:.3f} mm '
             f'before, {after.rms_mm:.3f} mm after)',
         )
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'the improvement may only be drift of the measuring device: time-shifted residuals '
-            f'are explained just as well in {100.0 * found.chance:.0f} % of cases; measure the '
-            'poses in random order, further apart, or more of them',
+            'drift of the measuring device alone could explain the improvement: time-shifted '
+            f'residuals are explained just as well in {100.0 * found.chance:.0f} % of cases '
+            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %); measure the poses in random order, '
+            'further apart, or more of them',
         )
     elif found.region is None:
         yield Reason(

@@ -16,13 +16,16 @@ from calib_ros.identification.reasons import Reason, Rule
 
 @dataclass(frozen=True)
 class Advice:
-    """A refusal in plain words: heading, meaning, what to do; the refusal itself and its rule."""
+    """A refusal in plain words: heading, meaning, what to do, the refusal itself.
+
+    `again` tells on what to identify then. What follows from another refusal has no steps.
+    """
 
     heading: str
     meaning: str
     steps: tuple[str, ...]
     refusal: str = ''
-    rule: Rule | None = None
+    again: str = 'on the measurements so far and the new ones'
 
 
 RIGHT_CHAIN = (
@@ -111,8 +114,8 @@ RULES: dict[Rule, Advice] = {
         'than the uncorrected one, or only by as much as chance explains. The arm may be as '
         'good as it gets, or the device too coarse to show more.',
         (
-            'Compare the error before with the accuracy of the measuring device. If they are '
-            'alike, the arm is as good as this device can see and needs no calibration.',
+            'Compare the error before with the accuracy of the measuring device. If they '
+            'are similar, stop: this device cannot measure any improvement.',
             'If the error is much larger, check that the arm stood still at each pose, that the '
             'target is fixed to the flange, and the device to the floor.',
             f'Measure more poses, {SPREAD}.',
@@ -121,14 +124,15 @@ RULES: dict[Rule, Advice] = {
     ),
     Rule.DRIFT: Advice(
         'The measuring device may have drifted',
-        'The errors changed slowly during the session. A measuring device that warms up or '
-        'settles does just that. Then the correction would fit the device, not the robot, '
-        'and be wrong tomorrow.',
+        'The errors may have changed slowly during the session, as when a measuring device '
+        'warms up or settles. The correction would then make up for the device, not for the '
+        'robot, and be wrong tomorrow.',
         (
             'Let the measuring device warm up.',
             'Measure the same poses again in random order.',
-            'Measure more poses, with larger moves between them.',
+            'If that is refused as well, measure more poses, with larger movements between them.',
         ),
+        again='on the new measurements alone',
     ),
     Rule.REGION: Advice(
         'The correction is not certain enough to help',
@@ -205,8 +209,12 @@ RULES: dict[Rule, Advice] = {
     ),
     Rule.MISTAKE: Advice(
         'A setting does not match the measurements',
-        'As given, the measurements do not fit this arm. With the change named they do.',
-        ('Check the change named. If it is right, run again with the option named.',),
+        'As given, the measurements do not fit this arm. With the change below they do.',
+        (
+            'Check at the robot and in the data whether it is so.',
+            'If it is, make the change; where there are two, either of them.',
+        ),
+        again='on the same measurements: no new ones are needed',
     ),
     Rule.POSED: Advice(
         'The joint values were not measured',
@@ -216,9 +224,13 @@ RULES: dict[Rule, Advice] = {
 }
 
 
-WRONG_ARM = {Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR}
-"""Where the description does not fit the arm, its lengths are of no scale either."""
+WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
+"""Where the description does not fit the arm; the first of them that is there is the cause."""
+FOLLOWING = {*WRONG_ARM, Rule.GAIN, Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
+"""What a description that does not fit brings by itself."""
 
+
+FOLLOWS = 'This probably follows from a wrong description: mend that first.'
 
 NOISY = 10.0
 """Ratio of what is left to the stated noise that an arm's own errors rarely reach."""
@@ -232,16 +244,16 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
-    if found.keys() & WRONG_ARM:
-        found.pop(Rule.SCALE, None)
+    cause = next((rule for rule in WRONG_ARM if rule in found), None)
     return tuple(
         replace(
             RULES[rule],
-            steps=(*_first(rule, left), *RULES[rule].steps),
+            meaning=RULES[rule].meaning if keeps else FOLLOWS,
+            steps=(*_first(rule, left), *RULES[rule].steps) if keeps else (),
             refusal='; '.join(texts),
-            rule=rule,
         )
         for rule, texts in found.items()
+        for keeps in [cause in (None, rule) or rule not in FOLLOWING]
     )
 
 
@@ -250,7 +262,7 @@ def _first(rule: Rule, left: float) -> tuple[str, ...]:
     if left < NOISY or rule not in {Rule.GAIN, Rule.REGION}:
         return ()
     return (
-        f'The measurements scatter {left:.0f} times as much as stated for the device. Before you '
-        'measure more, check that the target is tight and that the arm stood still; check the '
-        'clocks and the units.',
+        'Before you measure more, check that the target sits firmly, that the arm stood still, '
+        'that the clocks of robot and device agree, and the units: the measurements scatter '
+        f'{left:.0f} times as much as stated for the device.',
     )

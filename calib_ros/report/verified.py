@@ -62,7 +62,7 @@ def verification_report(
         accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
-            {'': found.comparison},
+            found.comparison,
         ),
         picture=distribution(poses),
         steps=NEXT[found.verdict],

@@ -43,10 +43,9 @@ def figures_of(page):
 def test_the_figures_are_those_of_the_result(solved):
     _, result = solved
     page = page_of(report_of(*solved))
-    for which in (result.fitted, result.validation):
-        for figures in which.figures:
-            for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
-                assert f'{value:.3f}' in page.text
+    for figures in result.validation.figures:
+        for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
+            assert f'{value:.3f}' in page.text
     for name, partners in result.gauges.items():
         assert f'{name} {", ".join(partners)}' in page.text
     assert table_hash(result.chain) in page.text
@@ -174,6 +173,13 @@ def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
     assert coarse.steps[1:] == usual.steps
 
 
+def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
+    rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.CONVERGENCE)
+    told = advice.advice([Reason(rule, rule.name) for rule in rules], 1000.0)
+    assert [bool(each.steps) for each in told] == [True, False, False, True]
+    assert [each.meaning == advice.FOLLOWS for each in told] == [False, True, True, False]
+
+
 def test_a_refused_page_says_why_and_what_to_do():
     rng = np.random.default_rng(3)
     rows = measured(chain=UR, count=40)
@@ -208,7 +214,7 @@ def test_an_arm_as_good_as_the_device_can_see_is_no_bad_one(sigma):
 def test_a_mistake_is_named_in_the_verdict():
     problem = Problem(load_chain('ur10'), measured(chain=UR, count=40))
     verdict = report_of(problem, identify(problem)).verdict
-    assert '--chain ur5e' in verdict.text[0]
+    assert '--chain ur5e' in verdict.text[1]
 
 
 def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
