@@ -90,12 +90,8 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:
     """Return the content of a YAML document, None of an empty one; `where` names it in errors.
 
-    Raises
-    ------
-    CalibrationError
-        Of the type `error`, when it is not valid, is several, has a key twice, or is too large or
-        too deep with its aliases written out.
-
+    What is several, has a key twice, or is too large or too deep with its aliases written out is
+    an `error`, as is what is not valid.
     """
     import yaml
 

@@ -87,12 +87,6 @@ def draw_candidates(
     """Draw joint values (count, n) within the limits at which the target can be measured.
 
     The region is out of reach where so many `tries` for each do not find them.
-
-    Raises
-    ------
-    InputError
-        When hardly any can.
-
     """
     found = np.zeros((0, len(design.chain.joints)))
     drawn = 0

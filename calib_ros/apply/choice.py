@@ -44,35 +44,11 @@ def choose(
     apart: float = STILL,
     told: Told = nobody,
 ) -> NDArray[np.intp]:
-    """Choose the poses to measure.
+    """Choose poses to measure among candidates (N, n) [rad or m].
 
-    Parameters
-    ----------
-    design : Design
-        What is to be identified and what is known about it.
-    candidates : (N, n)
-        Joint values [rad or m] that the arm may be moved to.
-    count : int
-        How many of them.
-    criterion : Criterion
-        What is to be large, by its name.
-    task : (T, n), optional
-        Joint values at which the arm is to be accurate, for the criterion `task`.
-    apart : float
-        Least distance of two poses: of the joint that moves most [rad or m].
-    told : Told
-        Of each round of exchange; nobody knows how many there will be.
-
-    Returns
-    -------
-    (count,)
-        Indices of the chosen, the best first: with the first of them alone most is determined.
-
-    Raises
-    ------
-    InputError
-        With fewer candidates than poses, at that distance from each other.
-
+    Return the indices (count,) of the chosen, the best first: with the first of them alone most
+    is determined. The criterion `task` asks for joint values (T, n) at which the arm is to be
+    accurate. Two poses are `apart` by so much [rad or m] of the joint that moves most.
     """
     if count < 1:
         raise ConfigError(f'at least one pose must be chosen, not {count}')

@@ -37,8 +37,8 @@ By the former [rad or m] a command may lie beyond a limit, or a correction chang
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compensator(Shown):
-    """What the controller believes, what the arm is, and how far a correction may go.
+class Compensator(Shown, Limits):
+    """What the controller believes, what the arm is, and how far a correction may go (`Limits`).
 
     Parameters
     ----------
@@ -49,20 +49,6 @@ class Compensator(Shown):
     tool : three floats
         The point [m] in the flange frame whose position counts. It matters for arms that cannot
         reach every orientation, and for the errors reported.
-    largest_turn, largest_shift : float
-        Largest correction of a revolute [rad] and of a prismatic joint [m].
-    largest_position_error : float
-        Position error [m] that may remain.
-    largest_orientation_error : float, optional
-        Orientation error [rad] that may remain; by default 1e-6, and 0.02 of arms that cannot
-        reach every orientation.
-    orientation_weight : float, optional
-        Metres of position error that a radian of orientation error counts for, where not both can
-        vanish. By default 0.3, and 0.001 of arms that cannot reach every orientation: position
-        first.
-    largest_change : float
-        Largest change of the correction between successive samples, relative to the move between
-        them. Beyond it the correction jumps.
     region : Region, optional
         Where the calibration may be used; samples elsewhere are refused.
 
@@ -71,12 +57,6 @@ class Compensator(Shown):
     nominal: Chain
     calibrated: Chain
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    largest_turn: float = Limits.largest_turn
-    largest_shift: float = Limits.largest_shift
-    largest_position_error: float = Limits.largest_position_error
-    largest_orientation_error: float | None = Limits.largest_orientation_error
-    orientation_weight: float | None = Limits.orientation_weight
-    largest_change: float = Limits.largest_change
     region: Region | None = None
 
     def __post_init__(self) -> None:

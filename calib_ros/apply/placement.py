@@ -77,33 +77,13 @@ def place(
     drawn: int = 20_000,
     told: Told = nobody,
 ) -> Placements:
-    """Find the placement of a task with the least expected error.
+    """Find the placement of a task with the least expected error, mean or worst of its poses.
 
-    Parameters
-    ----------
-    arm : Calibration
-        Before and after.
-    task : (K, 4, 4)
-        Poses of the target in the task's frame, whose axes are those of the base at turn 0.
-    aim : 'mean' or 'worst'
-        Over the task's poses.
-    model : 'corrected' or 'nominal'
-        By which the arm is commanded.
-    region : (2, 3), optional
-        Corners [m, base] for the origin of the task's frame; None: all that the arm reaches.
-    cells, turns, refinements : int
-        Points of the grid along each axis, its turns about the vertical, and the times that it is
-        halved about the best placement.
-    starts, drawn : int
-        Joint values that the first pose is solved from, and random ones they are taken from.
-    told : Told
-        Of the share that is done.
-
-    Raises
-    ------
-    InputError
-        When the region is empty, or the arm reaches all poses of the task nowhere in it.
-
+    Poses (K, 4, 4) of the target are in the task's frame, whose axes are those of the base at
+    turn 0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, which
+    is commanded by a `model`, reaches. The grid has so many `cells` along each axis and `turns`
+    about the vertical, and is halved so many times about the best placement. The first pose is
+    solved from so many `starts` out of random joint values `drawn`.
     """
     search = _Search(arm, task, aim, model, starts, drawn, told)
     corners = search.within(region)

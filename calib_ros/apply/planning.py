@@ -148,14 +148,7 @@ def poses_needed(
     apart: float = STILL,
     told: Told = nobody,
 ) -> int:
-    """Return how many poses bring the RMS position error at task poses (T, n) to `wanted` [m].
-
-    Raises
-    ------
-    InputError
-        When not even all candidates do.
-
-    """
+    """Return how many poses bring the RMS position error at task poses (T, n) to `wanted` [m]."""
     excited = design.determined_by(candidates)
     best = predicted(excited.after(candidates), task)
     if best > wanted:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
+from calib_ros.apply.iso9283 import PLANE
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import configurations
@@ -50,8 +51,9 @@ from calib_ros.progress import Told, nobody
 from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
-NEEDED = 5
-"""Configurations from which a verdict is given, those of a fitted frame not counted."""
+NEEDED = 1 + len(PLANE)
+"""Configurations from which a verdict is given, those of a fitted frame not counted: the test
+poses of ISO 9283."""
 DECIDING = 10_000
 """Configurations up to which it is said how many would decide."""
 LOST = {'base': 2, 'tool': 1}

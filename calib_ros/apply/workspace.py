@@ -145,12 +145,8 @@ def rms_map(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the RMS of errors (N,) over cells of two coordinates (N,).
 
-    Returns
-    -------
-    first_edges, second_edges : (cells + 1,)
-    rms : (cells, cells)
-        NaN where there is nothing; the first coordinate counts rows.
-
+    Edges (cells + 1,) of both, and RMS (cells, cells), NaN where there is nothing; the first
+    coordinate counts rows.
     """
     number, first_edges, second_edges = np.histogram2d(first, second, cells)
     edges = (first_edges, second_edges)

@@ -14,7 +14,6 @@ from calib_ros.settings import (
     CRITERIA,
     EXCEPTION,
     MODELS,
-    YEARS,
     Limits,
 )
 
@@ -118,7 +117,7 @@ def _add_fleet(parser: argparse.ArgumentParser) -> None:
     add('--memory', default='2GiB', metavar='SIZE', help='of each of these, at most')
     group = parser.add_argument_group('alarms')
     text = 'between two false alarms of a robot that is measured every night'
-    group.add_argument('--years', type=float, default=YEARS, metavar='N', help=text)
+    group.add_argument('--years', type=float, default=100.0, metavar='N', help=text)
 
 
 def _add_history(parser: argparse.ArgumentParser) -> None:
@@ -375,7 +374,7 @@ COMMANDS = {
         'workspace._run',
         (
             'workspace result/ --chain ur10e --out map/',
-            'workspace result/ --chain ur10e --task task.csv --out map/ --aim max',
+            'workspace result/ --chain ur10e --task task.csv --out map/ --aim worst',
         ),
     ),
     'bag2csv': Command(

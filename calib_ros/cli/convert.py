@@ -9,8 +9,7 @@ import argparse
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen

@@ -8,8 +8,7 @@ import argparse
 import json
 import math
 
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.detections import detected
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others

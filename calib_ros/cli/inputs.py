@@ -7,8 +7,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.files import loading
 from calib_ros.files.bags import Replayed

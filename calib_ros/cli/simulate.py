@@ -11,8 +11,7 @@ import numpy as np
 
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen

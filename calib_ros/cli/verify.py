@@ -8,8 +8,7 @@ import argparse
 from collections.abc import Sequence
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen

@@ -11,8 +11,7 @@ import numpy as np
 from calib_ros.apply import placement, workspace
 from calib_ros.apply.placement import task_of
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import csv_of, joints_csv, read_poses

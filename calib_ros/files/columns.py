@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import InputError
 from calib_ros.escapes import from_cell
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import some
 from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, cell_number
 
 Lines = NDArray[np.intp]
@@ -196,6 +197,4 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
 
 def lines_in_words(lines: Sequence[int]) -> str:
     """Return which lines of a file, the first ones by their numbers."""
-    shown = ', '.join(map(str, lines[:5]))
-    more = f' and {len(lines) - 5} more' if len(lines) > 5 else ''
-    return f'line{"s" if len(lines) > 1 else ""} {shown}{more}'
+    return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'

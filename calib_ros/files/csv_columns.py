@@ -142,15 +142,7 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
 
 
 def columns_of(path: Path, data: bytes, told: Told = nobody) -> Columns:
-    """Return the columns of the content of a CSV.
-
-    Raises
-    ------
-    InputError
-        When it is no table, has more columns or rows than any, or cells that no column or
-        several columns could be meant with.
-
-    """
+    """Return the columns of the content of a CSV; refuse what is no table, or is too large."""
     if not data.isascii():
         data = decoded(data, str(path), InputError).encode()
     return regular(path, data) or _irregular(path, data.decode(), told)

@@ -295,7 +295,10 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
 def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
     """Return the content of a table, and warnings; `journal` is the header of one."""
     data = whole = read_bytes(path, LARGEST_TABLE, InputError)
-    if data.startswith(','.join(journal).encode()):
+    header = ','.join(journal).encode() + b'\n'
+    if data and header.startswith(data):
+        return header, ()
+    if data.startswith(header):
         whole = data[: data.rfind(b'\n') + 1]
     if len(whole) < len(data):
         line = whole.count(b'\n') + 1

@@ -37,7 +37,10 @@ from calib_ros.shown import some
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the rules go by: of a fit, of poses left out, and of what else explains the gain."""
+    """What the rules go by: of a fit, of poses left out, and of what else explains the gain.
+
+    `sized` tells whether anything that was measured tells the size of the arm.
+    """
 
     converged: bool
     parameters: Sequence[ParameterRow]
@@ -47,6 +50,7 @@ class Findings:
     step: Step | None
     own_behaviour: str | None
     may_be_rounding: bool
+    sized: bool = True
 
 
 def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
@@ -123,11 +127,16 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
             'further apart, or more of them',
         )
     elif found.region is None:
+        more = 'more poses, spread further'
+        if not found.sized:
+            more = (
+                'what tells how large the arm is: positions, or two sockets a known distance apart'
+            )
         yield Reason(
             Rule.REGION,
             'too little is known of the arm for the correction to help: what it removes is not '
-            'larger than its own uncertainty, even at the poses measured; measure more poses, '
-            'spread further',
+            'larger than its own uncertainty, even at the poses measured; measure '
+            f'{more}',
         )
 
 

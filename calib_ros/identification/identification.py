@@ -263,9 +263,10 @@ def identify(
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)
-    posterior = fitted.posterior(
-        _size(fitted), considered(chain, names), rounding_errors(problem, coarse)
-    )
+    wrist, share = suspicions.lacking(problem, chain, names, fitted.noise.position)
+    more = (*considered(chain, names), *wrist)
+    size = float(np.sqrt(1.0 - share)) * _size(fitted)
+    posterior = fitted.posterior(size, more, rounding_errors(problem, coarse))
     found = _findings(fitted, before, posterior, validation, parameters, coarse)
     result = Identification(
         chain=chain,
@@ -318,6 +319,7 @@ def _findings(
         own_behaviour=None if step else arms_own(problem, robust),
         may_be_rounding=bool(coarse)
         and may_be_rounding(problem, before.chain, names, coarse, robust.good),
+        sized=fitted.held is None,
     )
 
 

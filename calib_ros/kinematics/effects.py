@@ -157,12 +157,14 @@ def basis(
 
 def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) with what effects add to them, by their phi (E, B)."""
-    values = dict(chain.effects)
-    q = q.copy() if names else q
-    for name, row in zip(names, phi, strict=True):
-        if values[name]:
-            q[chain.joint_names.index(name.partition('.')[0])] += values[name] * row
-    return q
+    known = dict(chain.effects)
+    values = [known[name] for name in names]
+    if not any(values):
+        return q
+    shares = np.zeros((len(q), len(names)))
+    for k, name in enumerate(names):
+        shares[chain.joint_names.index(Parameter(name).owner), k] = values[k]
+    return np.asarray(q + shares @ phi)
 
 
 @lru_cache(maxsize=256)
@@ -201,8 +203,13 @@ def _torques(
     turned[np.abs(turned) < ROUNDING * np.linalg.norm(down)] = 0.0  # of a vertical axis
     turned *= chain.walk.signs[..., np.newaxis]
     if ends is not None:
-        arms = places[ends.astype(int), 3] - points[joints]
-        return np.asarray(np.einsum('ecb,ecb->eb', arms, turned[joints]) / np.linalg.norm(down))
+        torques = np.empty((len(joints), q.shape[1]))
+        turned /= np.linalg.norm(down)
+        for i, axis in enumerate(turned):
+            here = np.flatnonzero(joints == i)
+            arms = places[ends[here].astype(int), 3] - points[i]
+            torques[here] = np.einsum('ecb,cb->eb', arms, axis)
+        return torques
     masses = np.array([joint.mass for joint in chain.joints])
     centres = np.einsum('ik,ikcb->icb', [(*joint.com, 1.0) for joint in chain.joints], places)
     carried = np.arange(len(masses)) >= joints[:, np.newaxis]  # (E, n)

@@ -11,13 +11,15 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
+from calib_ros.settings import Settings
 
 JOINTS, POSES = 'joints', 'measurements'
-NO_ACCIDENT = 20
-"""So many messages that differ from the others are no accident."""
-SILENCE = 5.0
+NO_ACCIDENT = round(1.0 / (1.0 - CONFIDENT))
+"""So many messages that differ from the others are no accident: one in so many may be."""
+SILENCE = 5.0 * Settings.lateness
 """A joint or topic that was heard before and is silent for so long [s] is told."""
 
 

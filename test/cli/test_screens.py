@@ -11,6 +11,7 @@ import errno
 import io
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -25,7 +26,8 @@ from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.cli import screen
 from calib_ros.cli.command import TEXTS
-from calib_ros.cli.main import main
+from calib_ros.cli.commands import COMMANDS
+from calib_ros.cli.main import _parser, main
 from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
 from calib_ros.files import bags
@@ -115,6 +117,14 @@ def test_the_help_of_a_command(shown, name):
     assert status == 0
     assert_shown(f'{name}_help', text)
     assert 'default: None' not in text
+
+
+@pytest.mark.parametrize('name', TEXTS)
+def test_the_examples_of_a_help_are_right(name):
+    for example in COMMANDS[name].examples:
+        given = shlex.split(example)
+        assert given[0] == name
+        assert _parser(given).parse_args(given)
 
 
 UR5E = ('--chain', 'ur5e')

@@ -171,7 +171,7 @@ FAULTS = [
         '\n'.join(FRAMES.splitlines()[:-1]),
         r'different frames: world \(lines 2, 6\), map \(line 5\); one is needed',
     ),
-    (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7 and 3 more\)'),
+    (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7, and 3 more\)'),
 ]  # fmt: skip
 
 

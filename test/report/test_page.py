@@ -10,8 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from measured import TEST, TRAIN, TRUE, UR, measured
 from pages import Page, page_of, problem_of, report_of
 from plotly import graph_objects
