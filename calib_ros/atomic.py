@@ -60,8 +60,7 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     """Write new files by name into a folder, which is made if there is none."""
     folder.mkdir(exist_ok=True)
-    for name, content in contents.items():
-        write_file(folder / name, content)
+    write_together({folder / name: content for name, content in contents.items()})
 
 
 @contextmanager

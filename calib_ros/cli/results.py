@@ -42,11 +42,6 @@ class Identified:
     result: Identification
     origin: Origin
 
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Return what was strange in the input."""
-        return self.loaded.warnings
-
 
 def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origin) -> Identified:
     """Identify with a sign of life."""
@@ -110,7 +105,7 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
 def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
     """Return the content of result.json; `tolerance` is the wanted error [mm]."""
     content = words.as_document(found.result, found.loaded.samples)
-    content |= {'warnings': list(found.warnings), 'tolerance_mm': tolerance}
+    content |= {'warnings': list(found.loaded.warnings), 'tolerance_mm': tolerance}
     return content | {'origin': found.origin.document()}
 
 
@@ -143,7 +138,7 @@ def result_files(
         work(2 / 3)
         wanted = None if tolerance is None else 1e-3 * tolerance
         report = identification_report(
-            loaded.problem, result, poses, found.origin, found.warnings, wanted
+            loaded.problem, result, poses, found.origin, found.loaded.warnings, wanted
         )
         contents['report.md'] = markdown(report, loaded.samples)
         contents |= page_of(report, screen, pdf=pdf)
