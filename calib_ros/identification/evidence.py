@@ -234,7 +234,7 @@ def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float]]:
     chain = chain.with_effects(travels)
     names = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
-    return chain, {n: chain.value(n) for n in names} | dict.fromkeys(travels, 1.0)
+    return chain, {n: chain.value(n) for n in names} | dict.fromkeys(map(str, travels), 1.0)
 
 
 def _told(
