@@ -22,7 +22,7 @@ IIWA = replace(load_chain('kuka_iiwa14'), base=None, tool=None)
 
 def led_to(chain, q, points):
     """Return joint values near q (N, n) that bring the target to points (N, 3)."""
-    model = ErrorModel(chain, [f'{name}.theta' for name in chain.joint_names])
+    model = ErrorModel(chain, [joint.driven for joint in chain.joints])
     signs, q = np.array([joint.sign for joint in chain.joints]), q.copy()
     for _ in range(200):
         left = points - chain.forward(q)[:, :3, 3]

@@ -27,6 +27,7 @@ from calib_ros.files.salvage import (
 )
 from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.progress import Told, nobody
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import BATCH, Deserialise, Stream, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
@@ -91,9 +92,7 @@ def _share(expected: int | None, found: int) -> float:
     return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
-def replay(
-    path: Path, session: CalibrationSession, told: Callable[[float], None] = lambda share: None
-) -> Replayed:
+def replay(path: Path, session: CalibrationSession, told: Told = nobody) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
     Parameters
@@ -102,8 +101,8 @@ def replay(
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
         Takes the messages; its settings name topics where the types leave a choice.
-    told : callable, optional
-        Called with the share of the messages that are read.
+    told : Told
+        Of the share of the messages that are read.
 
     """
     if not (path.is_dir() or path.is_file()):
@@ -113,9 +112,7 @@ def replay(
         return _replay(path, folder, session, told)
 
 
-def _replay(
-    path: Path, folder: Path, session: CalibrationSession, told: Callable[[float], None]
-) -> Replayed:
+def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -> Replayed:
     """Feed the files in a folder, which are those of a bag or were unpacked from it."""
     rosbag2()  # damaged or not, nothing is read without
     try:

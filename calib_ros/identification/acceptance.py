@@ -32,11 +32,15 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
 from calib_ros.identification.validation import COUNTS, Comparison, ParameterRow, log_gain
+from calib_ros.shown import some
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the rules go by: of a fit, of poses left out, and of what else explains the gain."""
+    """What the rules go by: of a fit, of poses left out, and of what else explains the gain.
+
+    `sized` tells whether anything that was measured tells the size of the arm.
+    """
 
     converged: bool
     parameters: Sequence[ParameterRow]
@@ -46,6 +50,7 @@ class Findings:
     step: Step | None
     own_behaviour: str | None
     may_be_rounding: bool
+    sized: bool = True
 
 
 def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
@@ -77,18 +82,21 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
     not_excited = [p.name for p in found.parameters if p.status == 'not excited']
     if not_excited:
+        frames = dict.fromkeys(n.owner for n in not_excited if problem.model.owns_frame(n))
+        known = f' ({", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
         yield Reason(
             Rule.EXCITATION,
             f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            'in more combinations, or fix these parameters',
+            f'in more combinations, or fix these parameters{known}',
         )
-    for p in found.parameters:
-        if p.beyond(problem.largest_length, problem.largest_angle):
-            yield Reason(
-                Rule.COMMON_SENSE,
-                f'{p.name} is off by {1e3 * p.offset:.0f} m{p.name.unit}, '
-                'more than a faulty robot of this kind can be: is it the right chain file?',
-            )
+    limits = (problem.largest_length, problem.largest_angle)
+    if beyond := [p for p in found.parameters if p.beyond(*limits)]:
+        far = [f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond]
+        yield Reason(
+            Rule.COMMON_SENSE,
+            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be: is it the '
+            'right chain file?',
+        )
 
 
 def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> Iterator[Reason]:
@@ -109,22 +117,28 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
     if not gain > limit:
         yield Reason(
             Rule.GAIN,
-            f'no gain on held-out poses beyond its uncertainty (RMS {before.rms_mm:.3f} mm '
+            f'no gain on held-out poses beyond chance (RMS {before.rms_mm:.3f} mm '
             f'before, {after.rms_mm:.3f} mm after)',
         )
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'the improvement may only be drift of the measuring device: time-shifted residuals '
-            f'are explained just as well in {100.0 * found.chance:.0f} % of cases; measure the '
-            'poses in random order, further apart, or more of them',
+            'drift of the measuring device alone could explain the improvement: time-shifted '
+            f'residuals are explained just as well in {100.0 * found.chance:.0f} % of cases '
+            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %); measure the poses in random order, '
+            'further apart, or more of them',
         )
     elif found.region is None:
+        more = 'more poses, spread further'
+        if not found.sized:
+            more = (
+                'what tells how large the arm is: positions, or two sockets a known distance apart'
+            )
         yield Reason(
             Rule.REGION,
             'too little is known of the arm for the correction to help: what it removes is not '
-            'larger than its own uncertainty, even at the poses measured; measure more poses, '
-            'spread further',
+            'larger than its own uncertainty, even at the poses measured; measure '
+            f'{more}',
         )
 
 

@@ -129,6 +129,24 @@ class Posterior(Shown):
         rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
         return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
 
+    def held_at(self, name: str, slope: FloatArray) -> Posterior:
+        """Return it with a length kept nominal as uncertain as lengths are.
+
+        The fitted parameters (F,), which come first, grow by `slope` as that does.
+        """
+        along = np.concatenate([slope, np.zeros(len(self.names) - len(slope)), [1.0]])
+        more = self.sizes['length'] ** 2 * np.outer(along, along)
+        return replace(
+            self,
+            names=(*self.names, name),
+            offsets=np.append(self.offsets, 0.0),
+            shift=np.append(self.shift, 0.0),
+            covariance=np.pad(self.covariance, (0, 1)) + more,
+            doubted=tuple(
+                (w, np.append(m, 0.0), np.pad(c, (0, 1)) + more) for w, m, c in self.doubted
+            ),
+        )
+
     def held(self, name: str) -> float:
         """Return which share of a parameter's variance is that of its prior: 1 if untold."""
         variance = float(self.covariance[self.names.index(name), self.names.index(name)])
@@ -180,9 +198,9 @@ def posterior_of(
     chain = chain.with_effects(more)
     every = (*names, *more)
     beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
-    lengths = _lengths(chain, system) if more else {}
+    whole, lengths = _lengths(chain, system) if more else (chain, {})
     beside += [(lengths, SCALE)] if lengths else []
-    told = _told(chain, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
+    told = _told(whole, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
     offsets = np.zeros(len(matrix))
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
@@ -203,19 +221,20 @@ def posterior_of(
     return Posterior(chain, every, offsets[arm], shift, root @ root.T, priors, sizes, doubted)
 
 
-def _lengths(chain: Chain, system: System) -> dict[str, float]:
+def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float]]:
     """Return all lengths [m] that positions are made of; none where no device has a scale.
 
-    Balls in sockets and touched planes are where they are, and a prismatic joint has a length of
-    its own.
+    Balls in sockets and touched planes are where they are. The travel of a prismatic joint grows
+    by its ratio, which the chain returned has.
     """
     sets = [samples.observations for samples in system.sets]
-    touching = any(each.socket or each.plane for each in sets)
-    if touching or any(joint.type == 'prismatic' for joint in chain.joints):
-        return {}
-    names = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
+    if any(each.socket or each.plane for each in sets):
+        return chain, {}
+    travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
+    chain = chain.with_effects(travels)
+    names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
-    return {name: chain.value(name) for name in names}
+    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}
 
 
 def _told(

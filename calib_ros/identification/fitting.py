@@ -26,6 +26,7 @@ from calib_ros.identification.leastsquares import (
 )
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.noise import Noise, noise_of
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.robust import Robust, reweighted, thorough_fit
 from calib_ros.identification.start import start_frames
@@ -54,7 +55,8 @@ class Fitted:
     """A robust fit with what follows from its residuals.
 
     `problem` has the last priors; `size` [sigma given] is that of the noise before the data told
-    any.
+    any. Where nothing tells the size of the arm, `held` is the length kept nominal for that, and
+    the growth (P,) of the fitted parameters with it.
     """
 
     problem: Problem
@@ -64,6 +66,7 @@ class Fitted:
     noise: Noise
     uncertainty: identifiability.Uncertainty
     size: float
+    held: tuple[str, FloatArray] | None = None
 
     @property
     def chain(self) -> Chain:
@@ -85,9 +88,10 @@ class Fitted:
         """Return what the data of the fit tell, with `more` effects considered."""
         model, given, names = self.problem.model, self.problem.given, self.names
         known = None if more else self.robust.fit.normal
-        return posterior_of(
+        found = posterior_of(
             self.chain, model, names, self.system, noise, given, more, doubts, known, judging
         )
+        return found if self.held is None else found.held_at(*self.held)
 
 
 def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
@@ -96,11 +100,35 @@ def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ..
     structural = identifiability.structurally_independent(
         model, problem.free, problem.kinds, separations
     )
+    held = identifiability.untold_size(model, problem.free, problem.kinds, structural)
+    if held is not None:
+        structural = identifiability.structurally_independent(
+            model, [n for n in problem.free if n != held], problem.kinds, separations
+        )
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
     sigmas = (problem.sigma_position, problem.sigma_orientation)
     start = start_frames(model, problem.sets, *sigmas, problem.loss)
     names, factor = _excited_names(problem, structural, start)
-    return structural, start, _fit_all(problem, names, start, factor, simpler)
+    fitted = _fit_all(problem, names, start, factor, simpler)
+    return structural, start, fitted if held is None else _sized(fitted, held)
+
+
+def _sized(fitted: Fitted, held: str) -> Fitted:
+    """Return a fit with the size of the arm as uncertain as the length that was held nominal."""
+    first, chain = fitted.problem.sets[0], fitted.chain
+    every = [n for joint in chain.joints for n in joint.parameters if n.is_length]
+    size = chain.value(held)
+    grown = {str(n): chain.value(n) / size for n in every if n != held}
+    ends = (first.base, first.tool)
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    slope = identifiability.growth(chain, fitted.names, grown, ends, joints, False)
+    std = fitted.posterior(fitted.size, judging=False).sizes['length']
+    shared = std**2 * np.outer(slope, slope)
+    uncertainty = identifiability.Uncertainty(
+        np.concatenate([fitted.uncertainty.parts, shared[np.newaxis]]),
+        np.append(fitted.uncertainty.freedom, np.inf),
+    )
+    return replace(fitted, uncertainty=uncertainty, held=(held, slope))
 
 
 def _excited_names(
@@ -132,11 +160,11 @@ def _fit_all(
     """
     problem = _guarded(problem, names, factor, simpler)
     rough = start
-    few = problem.system([each.spread(SOME) for each in problem.sets])
     if simpler is not None:
         rough = simpler.chain.with_effects([name for name, _ in problem.model.effects])
-    elif few.count < sum(map(len, problem.sets)) // 2:
-        rough = minimise(start, names, few, tolerance=1e-2).chain
+    few = problem.system([each.spread(SOME) for each in problem.sets])
+    if few.count < sum(map(len, problem.sets)) // 2:
+        rough = minimise(rough, names, few, tolerance=1e-2).chain
     fitted = _fit(problem, rough, names, simpler)
     guarded = _guarded(problem, names, fitted.factor, simpler)
     if guarded is not problem:  # without its outliers a session tells less
@@ -171,9 +199,7 @@ def _fit(
         distances = None if simpler is None else simpler.distances
         robust = reweighted(chain, names, system, problem.loss, distances)
     fit = robust.fit
-    factor = fit.normal.factor()
-    if factor is None:
-        factor = triangular_factor(fit.chain, names, robust.system)
+    factor = factor_of(fit.chain, names, robust.system, fit.normal)
     noise, uncertainty = noise_of(fit, names, robust.system, factor)
     return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
 

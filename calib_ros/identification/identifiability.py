@@ -9,7 +9,7 @@ matrix, which squares the condition number.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,6 +138,49 @@ def structurally_independent(
     rows = np.concatenate([rows, np.eye(len(names))[lens]])
     factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
     return independent(factor, names)
+
+
+def untold_size(
+    chain: Chain, names: Sequence[str], kinds: Sequence[Kind], told: Sequence[str]
+) -> Parameter | None:
+    """Return the longest length of the arm where nothing that is measured tells its size.
+
+    Sockets and planes alone would be met as well by a larger arm in a larger cell: a gauge of what
+    is measured, but not of positions elsewhere. Of all lengths the longest, kept nominal, spoils
+    the size least. `told` are the parameters that arbitrary poses would determine.
+    """
+    if not all(kind.socket or kind.plane for kind in kinds):
+        return None
+    base, tool = kinds[0].base, kinds[0].tool
+    arm = {name for name in names if not chain.owns_frame(name)}
+    every = [*parameters_of(base), *parameters_of(tool), *(name for name in names if name in arm)]
+    seen = structurally_independent(chain, every, (Kind(False, base=base, tool=tool),))
+    if arm & {*seen} <= {*told}:
+        return None
+    lengths = [Parameter(name) for name in seen if name in arm and Parameter(name).is_length]
+    return max(lengths, key=lambda name: abs(chain.value(name)), default=None)
+
+
+def growth(
+    chain: Chain,
+    names: Sequence[str],
+    lengths: Mapping[str, float],
+    ends: tuple[str, str],
+    joints: FloatArray,
+    oriented: bool,
+) -> FloatArray:
+    """Return the growth (P,) of named parameters as `lengths` [m] of a chain grow.
+
+    What is none of them shows in others, by poses or positions between the ends at (N, n).
+    """
+    every = tuple(dict.fromkeys((*names, *lengths)))
+    rows = ErrorModel(chain, every, *ends).jacobian(joints)[:, : 6 if oriented else 3]
+    rows = rows.reshape(-1, len(every))
+    reach = np.linalg.norm(rows[:, : len(names)], axis=0)
+    reach[reach == 0.0] = 1.0
+    seen = rows[:, [every.index(n) for n in lengths]] @ [*lengths.values()]
+    found = np.linalg.lstsq(rows[:, : len(names)] / reach, seen, rcond=1e-10)[0]
+    return np.asarray(found / reach)
 
 
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:

@@ -216,18 +216,27 @@ class _Scan:
             left = self._left[list(group.sets)].sum()
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
-            share = np.minimum((along**2 * inverse).sum(axis=1) / left, 1.0 - 1e-12)
+            gain = (along**2 * inverse).sum(axis=1)
+            share = np.minimum(gain / left, 1.0 - 1e-12)
             k = int(np.argmax(share))
-            more, rest = max(int(rank[k]), 1), (1.0 - share[k]) / (freedom - rank[k])
+            rest = (1.0 - share[k]) / (freedom - rank[k])
             beyond = 1.0 - rest * freedom
-            trials = PLACES * len(self._groups)
-            chance = trials * special.fdtrc(more, freedom - rank[k], share[k] / more / rest)
+            chance = PLACES * len(self._groups) * self._chance(float(gain[k]), int(rank[k]))
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
             if beyond > least and chance < 1.0 - SURE and criterion < lowest:
                 lowest = criterion
                 change = size[k] * (axes[k] @ (along[k] * inverse[k]))
                 found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))
         return found
+
+    def _chance(self, gain: float, rank: int) -> float:
+        """Return how probable it is that a step explains as many of the squares of white noise.
+
+        Of those of all sets: what is left of one with few equations may be no freedom at all.
+        """
+        freedom = float(self._equations.sum()) - self._fitted - rank
+        rest = max(float(self._left.sum()) - gain, 1e-300)
+        return float(special.fdtrc(max(rank, 1), freedom, gain / max(rank, 1) * freedom / rest))
 
     def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
         """Return (B, K, P + 1) the products of what may have moved with all columns.

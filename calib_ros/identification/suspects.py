@@ -61,7 +61,8 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     if not any(each.socket for each in sets):
         yield from _units(degrees)
         if all(each.oriented.any() for each in sets):
-            yield from _conventions(degrees, any(each.inverse for each in sets))
+            whole = all(each.oriented.all() for each in sets)
+            yield from _conventions(degrees, any(each.inverse for each in sets), whole)
         yield Suspect(
             'the axes of the measuring device are left-handed',
             'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
@@ -104,8 +105,11 @@ def _units(degrees: Change) -> Iterator[Suspect]:
             )
 
 
-def _conventions(degrees: Change, inverse: bool) -> Iterator[Suspect]:
-    """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too."""
+def _conventions(degrees: Change, inverse: bool, whole: bool) -> Iterator[Suspect]:
+    """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too.
+
+    Only `whole` poses, all with an orientation, may be those of a camera on the flange.
+    """
     flange = (
         'the poses are those of the world in the target, as by a camera on the flange',
         '--eye-in-hand (or --inverse, where the device stands)',
@@ -132,7 +136,7 @@ def _conventions(degrees: Change, inverse: bool) -> Iterator[Suspect]:
         (*flange, _as_it_is if inverse else Observations.inverted),
     )
     in_mm = _scaled(SCALES['mm'])
-    for what, remedy, change in ways:
+    for what, remedy, change in ways if whole else ways[:-1]:
         for more, option, others in (
             ('', '', ()),
             (', and the positions in mm', ' --length mm', (in_mm,)),

@@ -29,7 +29,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.identification.evidence import SCALE
-from calib_ros.identification.identifiability import excited
+from calib_ros.identification.identifiability import excited, growth
 from calib_ros.identification.leastsquares import System, factor_of, minimise, stacked
 from calib_ros.identification.levels import NEARER
 from calib_ros.identification.observations import Observations
@@ -41,7 +41,6 @@ from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -71,7 +70,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
     refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
-    found = (scale, sister, _gravity(problem, result), _coupling(problem, result))
+    found = (scale, sister, _gravity(problem, result), _coupling(result))
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
 
@@ -87,23 +86,19 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
     fitted = [i for i, n in enumerate(result.names) if n in arm and Parameter(n).is_length]
     if len(fitted) < 3 or not lengths:
         return 0.0, np.inf, 0.0
-    grown = np.array([problem.model.value(n) for n in lengths])
     first = problem.sets[0]
-    joints = first.spread().joints
-    names = tuple(dict.fromkeys((*result.names, *lengths)))
-    rows = ErrorModel(chain, names, first.base, first.tool).jacobian(joints)
-    if not first.oriented.any():
-        rows = rows[:, :3]
-    rows = rows.reshape(-1, rows.shape[2])
-    size = len(result.names)
-    reach = np.linalg.norm(rows[:, :size], axis=0)
-    reach[reach == 0.0] = 1.0
-    seen = rows[:, [names.index(n) for n in lengths]] @ grown
-    growth = np.linalg.lstsq(rows[:, :size] / reach, seen, rcond=1e-10)[0] / reach
+    grown = growth(
+        chain,
+        result.names,
+        {n: problem.model.value(n) for n in lengths},
+        (first.base, first.tool),
+        first.spread().joints,
+        bool(first.oriented.any()),
+    )
     offsets: dict[str, float] = {p.name: p.offset for p in result.parameters}
     return _common(
         np.array([offsets[result.names[i]] for i in fitted]),
-        growth[fitted],
+        grown[fitted],
         result.covariance[np.ix_(fitted, fitted)],
     )
 
@@ -196,19 +191,28 @@ def _gravity(problem: Problem, result: Identification) -> str:
     )
 
 
-def _coupling(problem: Problem, result: Identification) -> str:
-    """Return in words whether couplings of the wrist explain what is left."""
-    known = [name for name, _ in result.chain.effects]
-    names = [n for n in effects.members(problem.chain, 'coupling') if n not in known]
-    if not names or result.noise.position < SUSPICIOUS:  # nothing is left to explain
-        return ''
-    chain = result.chain.with_effects([*known, *names])
-    share = _explained(problem, chain, result.names, names)
-    if share < EXPLAINED:
+def lacking(
+    problem: Problem, chain: Chain, names: Sequence[str], noise: float
+) -> tuple[tuple[str, ...], float]:
+    """Return the couplings of the wrist, and the share of what a fit has left that they explain.
+
+    None where that is not most of it. `noise` is the size of what is left [sigma given].
+    """
+    known = [name for name, _ in chain.effects]
+    added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
+    if not added or noise < SUSPICIOUS:  # nothing is left to explain
+        return (), 0.0
+    share = _explained(problem, chain.with_effects([*known, *added]), names, added)
+    return (added, share) if share >= EXPLAINED else ((), 0.0)
+
+
+def _coupling(result: Identification) -> str:
+    """Return in words that couplings of the wrist explain what is left."""
+    if not any('.coupling_' in name for name in {*result.posterior.names} - {*result.names}):
         return ''
     return (
-        f'couplings of the last joints explain {100.0 * share:.0f} % of the residuals: are the '
-        'joint values those of the joints, not of the motors? Else add the effects "coupling"'
+        'couplings of the last joints explain most of the residuals: are the joint values those '
+        'of the joints, not of the motors? Else add the effects "coupling"'
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification.configurations import distinct
+from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise, without_each
 from calib_ros.identification.levels import CONFIDENT, KNOWN
 from calib_ros.identification.observations import Observations, numbered
@@ -21,7 +22,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown, as_frame
 
@@ -347,11 +348,15 @@ def _leave_one_place_out(
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]
     for place in places:
-        own = [name for name in names if Parameter(name).owner in place]
+        own = [n for base in sorted(place) for n in parameters_of(base)[:3] if n in problem.free]
+        others, left = part(place, inside=False), part(place, inside=True)
+        kinds = [kind for kind in problem.kinds if kind.base not in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
-            elsewhere = [name for name in fitted if name not in own]
-            trained = minimise(chain, elsewhere, part(place, inside=False)).chain
-            found.append(minimise(trained, own, part(place, inside=True)).chain)
+            rest = [name for name in fitted if name not in own]
+            # the place left out may have been the one that held a gauge
+            told = structurally_independent(problem.model, rest, kinds, others.separation_rows)
+            rest = [name for name in rest if name in told or name in problem.prior_sigmas]
+            found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)
     number = {base: k for k, place in enumerate(places) for base in place}
     parts = [
         compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])

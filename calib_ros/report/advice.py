@@ -16,16 +16,20 @@ from calib_ros.identification.reasons import Reason, Rule
 
 @dataclass(frozen=True)
 class Advice:
-    """A refusal in plain words: heading, meaning, what to do, and the refusal itself."""
+    """A refusal in plain words: heading, meaning, what to do, the refusal itself.
+
+    `again` tells on what to identify then. What follows from another refusal has no steps.
+    """
 
     heading: str
     meaning: str
     steps: tuple[str, ...]
     refusal: str = ''
+    again: str = 'on the measurements so far and the new ones'
 
 
 RIGHT_CHAIN = (
-    'Check that --chain names the arm that was measured: type, size and generation.',
+    'Check that --chain names the arm measured: type, size and generation.',
     'Check the units of the table: joint values in radians, positions in metres.',
     'Check that the columns q1, q2, ... are in the order of the arm, from its foot to its tool.',
 )
@@ -34,11 +38,11 @@ SPREAD = 'spread over the whole workspace, with every joint moved through most o
 RULES: dict[Rule, Advice] = {
     Rule.ENCODER: Advice(
         'A joint lost its zero while you measured',
-        'From one pose on, one joint reads differently than before. Measurements from before '
-        'describe an arm that no longer exists.',
+        'From one pose on, one joint reads differently than before. Earlier measurements no '
+        'longer describe the arm.',
         (
-            'Check the mastering (zero position) of the joint that is named.',
-            'Keep only what was measured after the slip, or measure again.',
+            'Check the mastering (zero position) of the joint named.',
+            'Keep only the measurements after the slip, or measure again.',
         ),
     ),
     Rule.MOVED: Advice(
@@ -51,24 +55,24 @@ RULES: dict[Rule, Advice] = {
         ),
     ),
     Rule.OWN_BEHAVIOUR: Advice(
-        'The poses that were left out are the arm itself',
-        'Some poses did not fit and were set aside as faulty measurements. But they all go '
-        'with one joint, so it is the arm that behaves like this, not the device.',
+        'The poses set aside show the arm itself',
+        'Some poses did not fit and were set aside as faulty measurements. But they all depend '
+        'on one joint: the cause is the arm, not the device.',
         (
-            'Run again with --model auto: it looks for such behaviour of the arm.',
-            'Or run with --loss none, which sets no pose aside.',
+            'Run again with --model auto: it looks for such effects.',
+            'Or run with --loss none to set no pose aside.',
         ),
     ),
     Rule.CONVERGENCE: Advice(
         'The computation found no stable answer',
-        'The measurements contradict each other or the description of the arm so much that '
-        'no set of corrections fits.',
+        'The measurements contradict each other, or the description of the arm, too much: no '
+        'set of corrections fits.',
         (*RIGHT_CHAIN, f'Measure more poses, {SPREAD}.'),
     ),
     Rule.EXCITATION: Advice(
         'Some joints hardly moved',
-        'An error of a joint shows only when that joint moves. The poses say nothing about '
-        'the parameters that are named.',
+        'A joint shows its errors only when it moves. These poses say nothing about the '
+        'parameters named.',
         (
             f'Add poses {SPREAD}. `calib_ros plan` chooses them.',
             'If a joint cannot move, hold its parameters with --fixed.',
@@ -77,21 +81,21 @@ RULES: dict[Rule, Advice] = {
     Rule.COMMON_SENSE: Advice(
         'This does not look like the right arm',
         'A correction as large as this cannot come from manufacturing or wear. Most often '
-        'the description is that of another arm, or units or columns are mixed up. Little error '
-        'after it proves nothing: so large a correction makes one arm of another.',
+        'the description is that of another arm, or units or columns are mixed up. A small error '
+        'afterwards proves nothing: so large a correction turns one arm into another.',
         RIGHT_CHAIN,
     ),
     Rule.LARGEST_ERROR: Advice(
         'The arm does not behave like its description',
-        'Even after the correction a large error is left. Most often the description is '
+        'A large error remains even after the correction. Most often the description is '
         'that of another arm, or units or columns are mixed up.',
         RIGHT_CHAIN,
     ),
     Rule.CONFIGURATIONS: Advice(
         'Too few poses were measured',
-        'A correction must be tested on poses that it was not computed from. There are not '
-        'enough poses for both.',
-        (f'Measure at least 30 different poses in all, {SPREAD}. Those that you have count.',),
+        'A correction must be tested on poses not used to compute it. There are not enough '
+        'poses for both.',
+        (f'Measure at least 30 different poses in all, {SPREAD}. Those you have count.',),
     ),
     Rule.OUTLIERS: Advice(
         'Too many measurements do not fit',
@@ -106,28 +110,29 @@ RULES: dict[Rule, Advice] = {
     ),
     Rule.GAIN: Advice(
         'The correction does not make the arm better',
-        'On poses that were not used to compute it, the corrected arm is no closer to the '
-        'measurements than the uncorrected one, or not by more than chance explains. The '
-        'arm may be as good as it gets, or the device too coarse to show more.',
+        'On poses not used to compute it, the corrected arm is no closer to the measurements '
+        'than the uncorrected one, or only by as much as chance explains. The arm may be as '
+        'good as it gets, or the device too coarse to show more.',
         (
             'Compare the error before with the accuracy of the measuring device. If they '
-            'are alike, the arm needs no calibration that this device can measure.',
-            'If it is much larger, check that the arm stood still at each pose, that the target '
-            'is fixed to the flange, and the device to the floor.',
+            'are similar, stop: this device cannot measure any improvement.',
+            'If the error is much larger, check that the arm stood still at each pose, that the '
+            'target is fixed to the flange, and the device to the floor.',
             f'Measure more poses, {SPREAD}.',
             'Try --model auto: the error may come from gears or gravity.',
         ),
     ),
     Rule.DRIFT: Advice(
         'The measuring device may have drifted',
-        'The errors changed slowly during the session. A measuring device that warms up or '
-        'settles does just that. Then the correction would fit the device, not the robot, '
-        'and be wrong tomorrow.',
+        'The errors may have changed slowly during the session, as when a measuring device '
+        'warms up or settles. The correction would then make up for the device, not for the '
+        'robot, and be wrong tomorrow.',
         (
             'Let the measuring device warm up.',
             'Measure the same poses again in random order.',
-            'Measure more poses, further apart from one to the next.',
+            'If that is refused as well, measure more poses, with larger movements between them.',
         ),
+        again='on the new measurements alone',
     ),
     Rule.REGION: Advice(
         'The correction is not certain enough to help',
@@ -136,7 +141,7 @@ RULES: dict[Rule, Advice] = {
         (
             f'Measure more poses, {SPREAD}. `calib_ros plan --chain ROBOT --accuracy MM` says how '
             'many.',
-            'Or measure with a more accurate device; orientation too, if it was position only.',
+            'Or use a more accurate device, and measure orientation too if it was position only.',
         ),
     ),
     Rule.GAIN_WITH_OUTLIERS: Advice(
@@ -144,14 +149,14 @@ RULES: dict[Rule, Advice] = {
         'Some poses were set aside as faulty measurements. Counting them, the corrected arm '
         'is worse than before. Perhaps they were right.',
         (
-            'Look at the poses marked as outliers below, and measure these again.',
+            'Look at the poses marked as outliers, and measure them again.',
             'Run with --model auto or --loss none.',
         ),
     ),
     Rule.ROUNDING: Advice(
         'The joint values are too coarse',
-        'The recording rounds the joint values. The improvement found is no larger than '
-        'what this rounding alone could cause.',
+        'The recording rounds the joint values. This rounding alone could cause the whole '
+        'improvement.',
         (
             'Record the joint values with all their digits, as the controller knows them.',
             'Measure different poses rather than the same ones many times.',
@@ -159,8 +164,8 @@ RULES: dict[Rule, Advice] = {
     ),
     Rule.ORIENTATION: Advice(
         'The position gets better, the orientation worse',
-        'On poses that were not used to compute it, the corrected arm points less precisely '
-        'than before. Often the stated accuracy of the device is wrong.',
+        'On poses not used to compute it, the corrected arm points less precisely than before. '
+        'Often the stated accuracy of the device is wrong.',
         (
             'Check --sigma-position and --sigma-orientation against the data sheet of the device.',
             'Check that the target sits rigidly on the flange.',
@@ -169,43 +174,47 @@ RULES: dict[Rule, Advice] = {
     Rule.SCALE: Advice(
         'The measuring device is out of scale',
         'All lengths of the arm came out too long or too short by the same factor. No arm '
-        'is built like that; a measuring device with a wrong scale shows just this.',
+        'is built like that; a measuring device with a wrong scale looks just like it.',
         (
-            'Check the scale of the device with a length that you know, such as a scale bar.',
-            'Check the temperature and pressure that are set in the device.',
+            'Check the scale of the device with a known length, such as a scale bar.',
+            'Check the temperature and pressure set in the device.',
         ),
     ),
     Rule.UNKNOWN_LOSS: Advice(
         'Nobody can tell how much of the recording is missing',
-        'The recording does not say how many messages it should hold. What is missing could '
-        'be just the poses that matter.',
+        'The recording does not say how many messages it should hold. Those missing could be '
+        'just the poses that matter.',
         (
             'Repair the recording: `ros2 bag reindex`.',
-            'If you know that it is complete, run with --largest-loss 1.',
+            'If you know it is complete, run with --largest-loss 1.',
         ),
     ),
     Rule.UNREADABLE: Advice(
         'A part of the recording cannot be read',
-        'The recording is damaged. What is missing could be just the poses that matter.',
+        'The recording is damaged. The missing part could be just the poses that matter.',
         (
             'Copy the recording again from the computer that made it.',
-            'If what is left is enough, run with the --largest-loss that is named.',
+            'If the rest is enough, run with the --largest-loss named.',
         ),
     ),
     Rule.DROPPED: Advice(
-        'Much of what was recorded could not be used',
-        'Joint values and measurements are matched by their time stamps. Too many had stamps '
-        'that match nothing.',
+        'Much of the recording could not be used',
+        'Joint values and measurements are matched by their time stamps. Too many stamps match '
+        'nothing.',
         (
             'Make the clocks of robot and measuring device agree (NTP or PTP).',
             'Record both from the same computer.',
-            'If what is left is enough, run with the --largest-loss that is named.',
+            'If the rest is enough, run with the --largest-loss named.',
         ),
     ),
     Rule.MISTAKE: Advice(
         'A setting does not match the measurements',
-        'As given, the measurements do not fit this arm. With the change that is named they do.',
-        ('Check whether it is so. If it is, run again with the option that is named.',),
+        'As given, the measurements do not fit this arm. With the change below they do.',
+        (
+            'Check at the robot and in the data whether it is so.',
+            'If it is, make the change; where there are two, either of them.',
+        ),
+        again='on the same measurements: no new ones are needed',
     ),
     Rule.POSED: Advice(
         'The joint values were not measured',
@@ -215,9 +224,13 @@ RULES: dict[Rule, Advice] = {
 }
 
 
-WRONG_ARM = {Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR}
-"""Where the description does not fit the arm, its lengths are of no scale either."""
+WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
+"""Where the description does not fit the arm; the first of them that is there is the cause."""
+FOLLOWING = {*WRONG_ARM, Rule.GAIN, Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
+"""What a description that does not fit brings by itself."""
 
+
+FOLLOWS = 'This probably follows from a wrong description: mend that first.'
 
 NOISY = 10.0
 """Ratio of what is left to the stated noise that an arm's own errors rarely reach."""
@@ -231,15 +244,16 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
-    if found.keys() & WRONG_ARM:
-        found.pop(Rule.SCALE, None)
+    cause = next((rule for rule in WRONG_ARM if rule in found), None)
     return tuple(
         replace(
             RULES[rule],
-            steps=(*_first(rule, left), *RULES[rule].steps),
+            meaning=RULES[rule].meaning if keeps else FOLLOWS,
+            steps=(*_first(rule, left), *RULES[rule].steps) if keeps else (),
             refusal='; '.join(texts),
         )
         for rule, texts in found.items()
+        for keeps in [cause in (None, rule) or rule not in FOLLOWING]
     )
 
 
@@ -248,7 +262,7 @@ def _first(rule: Rule, left: float) -> tuple[str, ...]:
     if left < NOISY or rule not in {Rule.GAIN, Rule.REGION}:
         return ()
     return (
-        f'The measurements scatter {left:.0f} times as much as the device is said to. Before you '
-        'measure more, check that the target sits firmly, that the arm stood still, the clocks '
-        'and the units.',
+        'Before you measure more, check that the target sits firmly, that the arm stood still, '
+        'that the clocks of robot and device agree, and the units: the measurements scatter '
+        f'{left:.0f} times as much as stated for the device.',
     )

@@ -16,7 +16,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
-from calib_ros.report.advice import SPREAD, advice
+from calib_ros.report.advice import SPREAD, Advice, advice
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
@@ -44,30 +44,27 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
+    reasons = advice(result.refusals, result.noise.position)
     limits = limits_of(judged, 1, CONFIDENT)
-    compared = {'fitted: ': result.fitted}
-    if result.validation is not None:
-        compared = {'': result.validation} | compared
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
-        verdict=_verdict(result, limits, tolerance),
-        advice=advice(result.refusals, result.noise.position),
+        verdict=_verdict(result, reasons, limits, tolerance),
+        advice=reasons,
         accuracy=accuracy_section(
             f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
             (
                 f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
-                f'{result.validated_by}. "Fitted" are the poses that the correction was computed '
-                'from: they prove nothing.',
+                f'{result.validated_by}.',
                 'RMS (root mean square) is the usual size of the error; its interval is that over '
                 'poses like these. 1 mrad of orientation moves the tip of a tool of 1 m by 1 mm.',
                 ISO_9283,
             ),
-            compared,
+            judged,
             judged.figures_of_all[1] if judged.outliers else None,
         ),
         picture=distribution(poses),
-        steps=_steps(result, limits, tolerance),
+        steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *words.remarks(result)),
         identity=identity_of(
             result.chain,
@@ -83,23 +80,15 @@ def identification_report(
 
 
 def _verdict(
-    result: Identification, limits: tuple[float, float], tolerance: float | None
+    result: Identification,
+    reasons: Sequence[Advice],
+    limits: tuple[float, float],
+    tolerance: float | None,
 ) -> Verdict:
     both = gain(result.validation or result.fitted)
     if not result.accepted:
-        return Verdict(
-            'bad',
-            'Not accepted: the robot stays as it was',
-            (
-                f'Why: {"; ".join(each.heading for each in advice(result.refusals))}.',
-                'No correction was written or published. The figures below show what was tried.',
-                *_left(result),
-            ),
-        )
-    how = (
-        'Before and after, on poses that were not used to compute the correction; in brackets '
-        'the 95 % interval.'
-    )
+        return _refused(result, reasons)
+    how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(each for each in (how, where) if each)
     if tolerance is None:
@@ -115,25 +104,46 @@ def _verdict(
     )
 
 
+def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
+    """Return why nothing is corrected: an arm with no error that the device sees is no bad one."""
+    tried = 'No correction was saved or sent to the robot. The figures show what was tried.'
+    noise = result.noise
+    if {each.rule for each in result.refusals} == {Rule.GAIN} and (
+        noise.consistent or noise.position < 1.0
+    ):
+        why = (
+            'Not accepted, because the error is within the stated noise of the measuring device: '
+            'the arm is as good as this device can see.'
+        )
+        heading = 'Nothing to correct: the robot stays as it was'
+        return Verdict('info', heading, (why, tried, *_left(result)))
+    whys = '. '.join(each.heading for each in reasons if each.steps)
+    found = [f'What was found: {x}.' for x in result.refusals if x.rule is Rule.MISTAKE]
+    heading = 'Not accepted: the robot stays as it was'
+    return Verdict('bad', heading, (f'Why: {whys}.', *found, tried, *_left(result)))
+
+
 def _left(result: Identification) -> Iterator[str]:
     """Yield in figures that a correction brought nothing."""
     if result.validation is not None and any(each.rule is Rule.GAIN for each in result.refusals):
         before, after = result.validation.figures
         yield (
-            f'The usual error was {before.rms_mm:.3f} mm; with the best correction found it '
+            f'The RMS error was {before.rms_mm:.3f} mm; with the best correction found it '
             f'would be {after.rms_mm:.3f} mm.'
         )
 
 
 def _steps(
-    result: Identification, limits: tuple[float, float], tolerance: float | None
+    result: Identification,
+    reasons: Sequence[Advice],
+    limits: tuple[float, float],
+    tolerance: float | None,
 ) -> tuple[str, ...]:
     """Return what to do with a result."""
     if not result.accepted:
         return (
-            'Do what is said above under "What to do", the first point first.',
-            'Then identify again. Nothing is lost: the measurements so far can be used with the '
-            'new ones.',
+            'Follow the steps above, those of the first reason first.',
+            f'Then identify again, {reasons[0].again}.',
         )
     found = []
     if tolerance is not None and limits[0] > tolerance:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
 from datetime import datetime, timezone
 
 import numpy as np
@@ -24,9 +23,9 @@ from calib_ros.report.poses import Poses
 INTERVAL = 0.5 + 0.5 * CONFIDENT
 """One-sided confidence of each limit of an interval of 95 %."""
 ISO_9283 = (
-    'Terms as in ISO 9283: the position accuracy AP is the distance between the pose commanded '
-    'and the mean of the poses attained. Where a pose was measured once, its repeatability is '
-    'part of the figure.'
+    'Errors are position accuracies in the terms of ISO 9283: the distance between the pose '
+    'commanded and the mean of the poses attained. Where a pose was measured once, its '
+    'repeatability is part of the figure.'
 )
 LABELS = (
     '',
@@ -66,17 +65,13 @@ def limits_of(which: Comparison, when: int, confidence: float) -> tuple[float, f
 def accuracy_section(
     title: str,
     text: tuple[str, ...],
-    judged: Mapping[str, Comparison],
+    judged: Comparison,
     with_outliers: ErrorFigures | None = None,
 ) -> Section:
-    """Return the table of accuracy: before and after of each comparison, by its prefix.
-
-    The first is what counts: it has intervals.
-    """
+    """Return the table of accuracy, before and after."""
     columns = [
-        _column(f'{prefix}{name}', found, None if k else limits_of(which, when, INTERVAL))
-        for k, (prefix, which) in enumerate(judged.items())
-        for when, (name, found) in enumerate(zip(('before', 'after'), which.figures, strict=True))
+        _column(name, found, limits_of(judged, when, INTERVAL))
+        for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
     ]
     if with_outliers is not None:
         columns.append(_column('after, with outliers', with_outliers))

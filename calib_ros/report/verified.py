@@ -27,7 +27,7 @@ STATES: dict[str, Verdict] = {
     'PASS': Verdict('good', 'PASS: the arm is within the tolerance'),
     'FAIL': Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
     'UNDECIDED': Verdict('open', 'UNDECIDED: too few measurements to tell'),
-    'JUDGED': Verdict('info', 'judged: without --tolerance there is no verdict'),
+    'JUDGED': Verdict('info', 'no verdict: --tolerance MM gives PASS or FAIL'),
 }
 NEXT: dict[str, tuple[str, ...]] = {
     'PASS': ('Keep this page with the calibration. Verify again after a collision or repair.',),
@@ -62,7 +62,7 @@ def verification_report(
         accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
-            {'': found.comparison},
+            found.comparison,
         ),
         picture=distribution(poses),
         steps=NEXT[found.verdict],

@@ -24,9 +24,6 @@ LEAST_FAR = Settings.lateness
 """Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
 what has not come yet; joint states up to `max_gap` apart belong together."""
 
-UNMATCHED = (TOO_LATE, *(f'{POSES}: {cause}' for cause in CAUSES[1:3]))
-"""Causes by which measurements are dropped that were stamped by another clock."""
-
 
 class Road:
     """Keeps messages by slices up to a joint state after which there is something to do.
@@ -81,7 +78,7 @@ class Road:
         """Return what looks wrong with the stamps, of so many measurements."""
         ahead = 1e-9 * (self._newest[POSES] - self._newest[JOINTS])
         collector, lateness = self.collector, self.clocks.settings.lateness
-        unmatched = sum(collector.dropped[cause] for cause in UNMATCHED)
+        unmatched = collector.dropped[f'{POSES}: {CAUSES[2]}' if ahead > 0.0 else TOO_LATE]
         hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
         found = [hint] if hint is not None and all(self._newest.values()) else []
         return found + self.clocks.hints() + collector.hints(measurements)

@@ -112,6 +112,13 @@ def test_a_refusal_begins_with_the_mistake_and_nothing_is_applied():
     assert len(result.refusals) > 1
 
 
+def test_mistakes_are_named_where_some_orientations_are_missing():
+    seen = seen_of()
+    some = np.arange(len(seen)) % 2 == 0
+    partly = replace(seen, oriented=some, positions=1e3 * seen.positions)
+    assert '--length mm' in str(explained(Problem(UR, partly)))
+
+
 def test_quarters_are_what_their_names_say():
     assert {float(name): np.degrees(angle) for name, angle in QUARTERS.items()} == pytest.approx(
         {90.0: 90.0, -90.0: -90.0, 180.0: 180.0}

@@ -112,3 +112,16 @@ def test_motor_angles_are_noticed():
         identify(Problem(UR, seen, effects=('coupling',), priors={'*.coupling_*': 0.01})).remarks
         == ()
     )
+
+
+def test_couplings_that_the_model_lacks_are_uncertainty_elsewhere():
+    wrist = ('wrist_3_joint.coupling_wrist_2_joint', 'wrist_2_joint.coupling_wrist_1_joint')
+    coupled = dict(zip(wrist, (2e-3, 1e-3), strict=True))
+    true = arm().with_effects(list(coupled)).with_offsets(coupled)
+    rng = np.random.default_rng(0)
+    near, far = 0.5 * UR.random_joints(60, rng), UR.random_joints(300, rng)
+    result = identify(Problem(UR, measure(true, near, rng, 5e-5, 2e-4)))
+    error = (true.forward(far) - result.chain.forward(far))[:, :3, 3]
+    axes = result.confidence_ellipsoid(far)
+    along = np.einsum('nki,ni->nk', axes, error) / (axes**2).sum(axis=2)
+    assert ((along**2).sum(axis=1) < 1.0).mean() > 0.9

@@ -16,6 +16,7 @@ from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples, residual_arrays
+from calib_ros.identification.suspicions import _apart
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
@@ -87,6 +88,24 @@ def test_planes_tell_the_arm_but_not_its_size():
     sizes = [result.chain.value(n) / true.value(n) for n in lengths if abs(true.value(n)) > 0.1]
     assert np.ptp(sizes) < 1e-8
     assert sizes[0] != pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize('seed', [0, 4])
+def test_the_size_that_planes_do_not_tell_is_as_uncertain_as_lengths_are(seed):
+    true, sets = cell(seed)
+    result = identify(Problem(UR, sets[0], more=sets[1:], sigma_touch=SIGMA))
+    assert result.accepted, result.refusals
+    assert UR.joint_names[1] + '.a' in result.unidentifiable  # the longest of its lengths
+    q = true.random_joints(200, np.random.default_rng(0))
+    before, after = (_apart(chain, true, q) for chain in (UR, result.chain))
+    assert after < 0.6 * before
+    assert after < 2.0 * np.median(result.region.sigma(q))
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_few_touches_do_not_look_as_if_something_had_moved(seed):
+    _, sets = cell(seed, count=14)
+    assert identify(Problem(UR, sets[0], more=sets[1:], sigma_touch=SIGMA)).step is None
 
 
 def with_positions(seed):
