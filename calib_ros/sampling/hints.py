@@ -48,12 +48,12 @@ def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
 def apart(
     waiting: int, unmatched: int, measurements: int, ahead: float, lateness: float
 ) -> Hint | None:
-    """Tell that clocks disagree by more than can be looked for, if many measurements say so.
+    """Tell that clocks disagree by more than can be looked for, if most measurements say so.
 
     Measurements wait for joint states, or have found none; they are `ahead` of those [s].
     """
-    many = unmatched > max(EXCEPTION * measurements, NO_ACCIDENT)
-    if abs(ahead) <= lateness or not (many or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
+    most = unmatched > max(measurements // 2, NO_ACCIDENT)
+    if abs(ahead) <= lateness or not (most or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
         return None
     words = f'{abs(ahead):.0f} s {"after" if ahead > 0.0 else "before"}'
     return Hint(

@@ -78,7 +78,8 @@ class Road:
         """Return what looks wrong with the stamps, of so many measurements."""
         ahead = 1e-9 * (self._newest[POSES] - self._newest[JOINTS])
         collector, lateness = self.collector, self.clocks.settings.lateness
-        unmatched = collector.dropped[f'{POSES}: {CAUSES[2]}' if ahead > 0.0 else TOO_LATE]
+        causes = (TOO_LATE, *(f'{POSES}: {cause}' for cause in CAUSES[1:3]))
+        unmatched = sum(collector.dropped[cause] for cause in causes)
         hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
         found = [hint] if hint is not None and all(self._newest.values()) else []
         return found + self.clocks.hints() + collector.hints(measurements)
