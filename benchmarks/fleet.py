@@ -89,7 +89,7 @@ def nights_part(folder, robots, nights, number, cluster):
         begin = time.monotonic()
         done = run(plant, history, cluster, out)
         middle = time.monotonic()
-        stood = standings(plant, history, done)
+        stood = standings(plant, history, done, 100.0)
         later = time.monotonic()
         write_report(out, stood, done)
         end = time.monotonic()

@@ -12,32 +12,23 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib_ros.apply.compensation import Compensator as Compensator
-    from calib_ros.apply.compensation import compensate as compensate
-    from calib_ros.apply.planning import Plan as Plan
-    from calib_ros.apply.planning import plan as plan
+    from calib_ros.apply.compensation import Compensator as Compensator, compensate as compensate
+    from calib_ros.apply.planning import Plan as Plan, plan as plan
     from calib_ros.apply.program import Program as Program
-    from calib_ros.apply.verification import Verification as Verification
-    from calib_ros.apply.verification import verify as verify
+    from calib_ros.apply.verification import Verification as Verification, verify as verify
     from calib_ros.errors import CalibrationError as CalibrationError
     from calib_ros.files.bags import replay as replay
     from calib_ros.files.tables import read_table as read_table
     from calib_ros.identification.calibration import (
         Calibration as Calibration,
-    )
-    from calib_ros.identification.calibration import (
         load_calibration as load_calibration,
     )
     from calib_ros.identification.difference import (
         Difference as Difference,
-    )
-    from calib_ros.identification.difference import (
         difference as difference,
     )
     from calib_ros.identification.identification import (
         Identification as Identification,
-    )
-    from calib_ros.identification.identification import (
         identify as identify,
     )
     from calib_ros.identification.model_choice import identify_model as identify_model
@@ -45,17 +36,12 @@ if TYPE_CHECKING:
     from calib_ros.identification.problem import Problem as Problem
     from calib_ros.identification.recalibration import (
         Recalibration as Recalibration,
-    )
-    from calib_ros.identification.recalibration import (
         recalibrate as recalibrate,
     )
     from calib_ros.kinematics.chain import Chain as Chain
-    from calib_ros.kinematics.chain_file import dump_chain as dump_chain
-    from calib_ros.kinematics.chain_file import load_chain as load_chain
+    from calib_ros.kinematics.chain_file import dump_chain as dump_chain, load_chain as load_chain
     from calib_ros.kinematics.urdf import (
         chain_from_urdf as chain_from_urdf,
-    )
-    from calib_ros.kinematics.urdf import (
         corrected_urdf as corrected_urdf,
     )
     from calib_ros.sampling.session import CalibrationSession as CalibrationSession

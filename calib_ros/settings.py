@@ -28,8 +28,6 @@ standard deviations 5 % larger, less than their own uncertainty; more may be a p
 workspace."""
 GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
-YEARS = 100.0
-"""Time between false alarms of a robot, of one night each day, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')
 """How samples are taken."""
 STARTUP = (
@@ -39,9 +37,28 @@ STARTUP = (
 """Settings that a running node cannot change."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Limits of a `Compensator`, by default."""
+    """How far a correction of joint commands may go.
+
+    Parameters
+    ----------
+    largest_turn, largest_shift : float
+        Largest correction of a revolute [rad] and of a prismatic joint [m].
+    largest_position_error : float
+        Position error [m] that may remain.
+    largest_orientation_error : float, optional
+        Orientation error [rad] that may remain; by default 1e-6, and 0.02 of arms that cannot
+        reach every orientation.
+    orientation_weight : float, optional
+        Metres of position error that a radian of orientation error counts for, where not both can
+        vanish. By default 0.3, and 0.001 of arms that cannot reach every orientation: position
+        first.
+    largest_change : float
+        Largest change of the correction between successive samples, relative to the move between
+        them. Beyond it the correction jumps.
+
+    """
 
     largest_turn: float = 0.1
     largest_shift: float = 0.05
@@ -73,6 +90,7 @@ class Settings:
     sigma_pixel: float = _setting(
         0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
     )
+    socket_distance: float = _setting(0.05, 'between the two sockets of a location [m]', 1e-6)
     max_gap: float = _setting(
         0.1, 'longest time between the two joint states that bracket a measurement [s]', 0.0
     )

@@ -44,13 +44,11 @@ from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from calib_ros.apply.simulation import Cell as SimulatedCell
-from calib_ros.apply.simulation import drive, faulty, measure
+from calib_ros.apply.simulation import Cell as SimulatedCell, drive, faulty, measure
 from calib_ros.files.recording import Recording
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.ros import advisor as advisor_module
-from calib_ros.ros import node as node_module
+from calib_ros.ros import advisor as advisor_module, node as node_module
 from calib_ros.ros.node import CalibrationNode
 from calib_ros.sampling.intake import Stream, feed
 from calib_ros.sampling.messages import JOINT_STATE

@@ -4,16 +4,7 @@
 
 import numpy as np
 from fits import NOISE, SIGMAS
-from streams import (
-    POSE,
-    TRACKER,
-    joint_state,
-    of_joints,
-    pose,
-    stamps,
-    stops,
-    take,
-)
+from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.kinematics.chain_file import load_chain

@@ -26,7 +26,6 @@ from scipy import optimize, special
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import YEARS
 
 SLOPES = (0.5, 2.0)
 """References k: shifts of one and of four standard deviations show soonest."""
@@ -34,20 +33,10 @@ SLOPES = (0.5, 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What a chart of one robot shows.
+    """What a chart of one robot shows: nights of `alarms`, and the night `since` which, for each.
 
-    Attributes
-    ----------
-    scores : (N,)
-        How large each night's error is against those before, as a normal variable; NaN in the
-        first night and in the first after an alarm.
-    sums : (N, 2)
-        Of both charts, as shares of their heights: beyond 1 is an alarm.
-    alarms : tuple of int
-        Nights in which it is too large.
-    since : tuple of int
-        The night from which on it has been, for each alarm.
-
+    `scores` (N,) are errors against those before as normal variables, NaN in the first night and
+    in the first after an alarm; `sums` (N, 2) shares of the heights of both charts.
     """
 
     scores: FloatArray
@@ -56,23 +45,11 @@ class Drift:
     since: tuple[int, ...]
 
 
-def drift(rms: Sequence[float], freedom: Sequence[float], years: float = YEARS) -> Drift:
+def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift:
     """Look for nights from which on an arm is worse.
 
-    Parameters
-    ----------
-    rms : (N,)
-        Errors of the nights, in any unit.
-    freedom : (N,)
-        Their degrees of freedom, as of `Verification.freedom`.
-    years : float
-        Between two false alarms of one robot, on average, with a night each day.
-
-    Raises
-    ------
-    InputError
-        When they are no errors.
-
+    Errors of the nights (N,) are in any unit, with their degrees of freedom (N,) as of
+    `Verification.freedom`; `years` pass between two false alarms, with a night each day.
     """
     errors, nus = np.asarray(rms, dtype=float), np.asarray(freedom, dtype=float)
     if errors.shape != nus.shape or not (np.isfinite(errors) & (errors > 0.0) & (nus > 0.0)).all():

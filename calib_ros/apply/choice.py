@@ -28,6 +28,7 @@ from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import CRITERIA, Criterion
 
 Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
@@ -41,34 +42,13 @@ def choose(
     criterion: Criterion = 'd',
     task: FloatArray | None = None,
     apart: float = STILL,
+    told: Told = nobody,
 ) -> NDArray[np.intp]:
-    """Choose the poses to measure.
+    """Choose poses to measure among candidates (N, n) [rad or m].
 
-    Parameters
-    ----------
-    design : Design
-        What is to be identified and what is known about it.
-    candidates : (N, n)
-        Joint values [rad or m] that the arm may be moved to.
-    count : int
-        How many of them.
-    criterion : Criterion
-        What is to be large, by its name.
-    task : (T, n), optional
-        Joint values at which the arm is to be accurate, for the criterion `task`.
-    apart : float
-        Least distance of two poses: of the joint that moves most [rad or m].
-
-    Returns
-    -------
-    (count,)
-        Indices of the chosen, the best first: with the first of them alone most is determined.
-
-    Raises
-    ------
-    InputError
-        With fewer candidates than poses, at that distance from each other.
-
+    Return the indices (count,) of the chosen, the best first: with the first of them alone most
+    is determined. The criterion `task` asks for joint values (T, n) at which the arm is to be
+    accurate. Two poses are `apart` by so much [rad or m] of the joint that moves most.
     """
     if count < 1:
         raise ConfigError(f'at least one pose must be chosen, not {count}')
@@ -76,10 +56,13 @@ def choose(
     score = _score(space, criterion, task)
     first = score if criterion == 'task' else _by_determinant
     pick = _Pick(space, apart)
+    told(f'{count} poses')
     for _ in range(count):
         pick.add(pick.best(first))
+    rounds = 1
     while pick.exchange(score):
-        pass
+        rounds += 1
+        told(f'{count} poses, exchange {rounds}')
     again = _Pick(space, apart)
     for _ in range(count):
         again.add(again.best(first, pick.chosen))

@@ -16,7 +16,7 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -27,6 +27,7 @@ from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.following import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
@@ -36,8 +37,8 @@ By the former [rad or m] a command may lie beyond a limit, or a correction chang
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Compensator(Shown):
-    """What the controller believes, what the arm is, and how far a correction may go.
+class Compensator(Shown, Limits):
+    """What the controller believes, what the arm is, and how far a correction may go (`Limits`).
 
     Parameters
     ----------
@@ -48,20 +49,6 @@ class Compensator(Shown):
     tool : three floats
         The point [m] in the flange frame whose position counts. It matters for arms that cannot
         reach every orientation, and for the errors reported.
-    largest_turn, largest_shift : float
-        Largest correction of a revolute [rad] and of a prismatic joint [m].
-    largest_position_error : float
-        Position error [m] that may remain.
-    largest_orientation_error : float, optional
-        Orientation error [rad] that may remain; by default 1e-6, and 0.02 of arms that cannot
-        reach every orientation.
-    orientation_weight : float, optional
-        Metres of position error that a radian of orientation error counts for, where not both can
-        vanish. By default 0.3, and 0.001 of arms that cannot reach every orientation: position
-        first.
-    largest_change : float
-        Largest change of the correction between successive samples, relative to the move between
-        them. Beyond it the correction jumps.
     region : Region, optional
         Where the calibration may be used; samples elsewhere are refused.
 
@@ -70,12 +57,6 @@ class Compensator(Shown):
     nominal: Chain
     calibrated: Chain
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    largest_turn: float = Limits.largest_turn
-    largest_shift: float = Limits.largest_shift
-    largest_position_error: float = Limits.largest_position_error
-    largest_orientation_error: float | None = Limits.largest_orientation_error
-    orientation_weight: float | None = Limits.orientation_weight
-    largest_change: float = Limits.largest_change
     region: Region | None = None
 
     def __post_init__(self) -> None:
@@ -147,12 +128,12 @@ def compensate(
     compensator: Compensator,
     joints: FloatArray,
     approach: FloatArray | None = None,
-    heard: Callable[[float], None] | None = None,
+    told: Told = nobody,
 ) -> Compensation:
     """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
 
     `approach` (N, n) holds the signs of the velocities before, for backlash;
-    `heard` is called with the share that is done.
+    `told` is called with the share that is done.
 
     Raises
     ------
@@ -170,7 +151,7 @@ def compensate(
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
-    solution = follower.solve(command, approach, heard=heard)
+    solution = follower.solve(command, approach, told=told)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))

@@ -64,13 +64,7 @@ class Design(Shown):
         With the result of an identification, or an estimate while samples come, that is known as
         well, and poses to come have the noise that it found. Measured values do not count
         otherwise: `simulation.measure` can make the observations of a problem before anything is
-        measured.
-
-        Raises
-        ------
-        InputError
-            When neither poses nor positions are measured.
-
+        measured. Distances are refused.
         """
         kind = problem.kinds[0]
         if kind.distance or problem.separations:

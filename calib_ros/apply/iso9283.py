@@ -61,14 +61,8 @@ def iso_9283_poses(
 ) -> TestPoses:
     """Return the test poses in the largest cube that the arm reaches, and the device sees.
 
-    Cubes are grown about so many reachable centres.
-
-    Raises
-    ------
-    InputError
-        When the arm keeps its orientation in no cube, as with fewer than six joints, or the
-        target is not seen.
-
+    Cubes are grown about so many reachable centres. An arm that keeps its orientation in none, as
+    with fewer than six joints, is refused.
     """
     middle = draw_candidates(design, centres, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)

@@ -126,12 +126,7 @@ def photograph(
     """Return images of all points (M, 3) of a board, with normally distributed noise [px].
 
     The board faces the camera from anywhere in its view; the arm holds it with its joints anyhow.
-
-    Raises
-    ------
-    InputError
-        When the arm hardly reaches what the camera sees: after so many `tries`.
-
+    After so many `tries` it counts as out of reach.
     """
     size = len(points)
     joints = np.zeros((0, len(chain.joints)))
@@ -186,13 +181,8 @@ def drive(
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
     """Move an arm smoothly from one configuration (K, n) to the next, standing at each.
 
-    Returns
-    -------
-    stamps_ns, joints : (M,), (M, n)
-        Joint samples at the joint rate.
-    pose_stamps_ns : (K * poses_per_dwell,)
-        When the poses are measured, within the dwells.
-
+    Return stamps (M,) [ns] and joint values (M, n) at the joint rate, and the stamps
+    (K * poses_per_dwell,) [ns] of the poses, within the dwells.
     """
     period = cell.move + cell.dwell
     times = np.arange(0.0, period * len(configurations), 1.0 / cell.joint_rate)

@@ -9,8 +9,7 @@ import argparse
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import given
-from calib_ros.cli import options as common
+from calib_ros.cli import given, options as common
 from calib_ros.cli.inputs import replayed
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
@@ -56,8 +55,8 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     )
     judging = np.arange(len(rows)) >= len(fitted)
     recording = Recording.of_dwells(chain.joint_names, rows, judging)
-    with screen.work(f'writing {options.bag.name}'):
-        write_bag(options.bag, recording, options.storage)
+    with screen.work(f'writing {options.bag.name}') as work:
+        write_bag(options.bag, recording, options.storage, told=work)
     screen.say(f'wrote {options.bag}: {len(fitted)} poses to fit, {len(held_out)} held out')
     return 0
 

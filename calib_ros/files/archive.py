@@ -76,13 +76,17 @@ class Archive:
         self.write()
 
     def write(self) -> None:
-        """Write what waits, as far as that is possible; `error` tells whether it was."""
+        """Write what waits, as far as that is possible; `error` tells whether it was.
+
+        A journal that is no longer there goes on in another file, with all that was in it.
+        """
         try:
-            if self._journal is None and (self._waiting or self._due):
-                self.folder.mkdir(parents=True, exist_ok=True)
-                write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
-                self._journal = Journal(self._path, self._joints)
-                self._due = False
+            if self._journal is not None and self._journal.gone:
+                if self._path == self._journal.path:
+                    self._path = self._new_path(JOURNAL)
+                self._begin(self._journal.content)
+            elif self._journal is None and (self._waiting or self._due):
+                self._begin()
             while self._journal is not None and self._waiting:
                 self._journal.add(*self._waiting[0])
                 del self._waiting[0]
@@ -90,6 +94,17 @@ class Archive:
             self.error = str(err)
         else:
             self.error = ''
+
+    def _begin(self, content: bytes = b'') -> None:
+        """Begin the journal, with what was in one before."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
+        if content:
+            write_file(self._path, content, overwrite=True)
+        before, self._journal = self._journal, Journal(self._path, self._joints)
+        if before is not None:
+            before.close()
+        self._due = False
 
     def begin_anew(self) -> Path | None:
         """Begin another journal, unless samples would be lost; return the path of the old one.

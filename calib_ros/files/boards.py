@@ -15,8 +15,7 @@ the upper left corner of the first square, or of the first marker.
 
 from __future__ import annotations
 
-import csv
-import io
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +23,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
 from calib_ros.escapes import to_cell
 from calib_ros.files.columns import check_quaternions
 from calib_ros.files.csv_columns import read_columns
@@ -35,13 +35,12 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import parse_yaml, read_text
+from calib_ros.shown import some
+from calib_ros.texts import csv_text, parse_yaml, read_text
 from calib_ros.values import parse_number
 
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
-MOST = 100
-"""Columns and rows of a board."""
 HEADER = ('image', 'corner', 'u', 'v')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
 POSED = 'flange_pose'
@@ -66,9 +65,10 @@ class Board:
             raise UnknownNameError('type of board', self.type, TYPES)
         least = 2 if self.type == 'charuco' else 1
         for name in ('columns', 'rows'):
-            if not least <= getattr(self, name) <= MOST:
+            count = getattr(self, name)
+            if not least <= count <= MOST_ENTRIES:
                 raise ConfigError(
-                    f'{name} of a board must be from {least} to {MOST}, not {getattr(self, name)}'
+                    f'{name} of a board must be from {least} to {MOST_ENTRIES}, not {count}'
                 )
         if not 0.0 < self.marker < self.square:
             raise ConfigError(
@@ -192,14 +192,9 @@ class Detections:
 
     def as_csv(self) -> str:
         """Return the table of a row per corner."""
-        text = io.StringIO(newline='')
-        writer = csv.writer(text, lineterminator='\n')
-        writer.writerow(HEADER)
-        for image, corner, (u, v) in zip(
-            self.image.tolist(), self.corner.tolist(), self.pixels.tolist(), strict=True
-        ):
-            writer.writerow([to_cell(self.names[image]), corner, f'{u:.4f}', f'{v:.4f}'])
-        return text.getvalue()
+        numbers = zip(self.image.tolist(), self.corner.tolist(), self.pixels.tolist(), strict=True)
+        rows = ((to_cell(self.names[k]), n, f'{u:.4f}', f'{v:.4f}') for k, n, (u, v) in numbers)
+        return csv_text([HEADER, *rows])
 
 
 def read_detections(path: Path, board: Board) -> Detections:
@@ -245,15 +240,10 @@ def posed_arm() -> Chain:
 
 def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
     """Return the joint values (N, 6) with which the virtual arm is at poses of the flange."""
-    sine = np.clip(rotations[:, 0, 2], -1.0, 1.0)
-    first = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
-    cosine, along = np.cos(first), np.sin(first)
-    last = np.arctan2(
-        cosine * rotations[:, 1, 0] + along * rotations[:, 2, 0],
-        cosine * rotations[:, 1, 1] + along * rotations[:, 2, 1],
-    )
-    x, y, z = positions.T
-    return np.column_stack([z, x, y, first, np.arcsin(sine), last])
+    with warnings.catch_warnings():  # at a quarter about y any turn about x will do
+        warnings.simplefilter('ignore')
+        turns = Rotation.from_matrix(rotations).as_euler('XYZ')
+    return np.column_stack([positions[:, [2, 0, 1]], turns])
 
 
 def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
@@ -292,10 +282,10 @@ def observed(
             f'as {next(iter(found.names), "")!r} and {next(iter(places), "")!r} are not'
         )
     lost = [name for name, yes in zip(found.names, known.tolist(), strict=True) if not yes]
-    warnings = (f'no joint values for {len(lost)} images: {", ".join(lost[:5])}',) if lost else ()
+    told = (f'no joint values for {len(lost)} images: {", ".join(some(lost))}',) if lost else ()
     kept = known[found.image]
     image = found.image[kept]
     joints = np.array([places[found.names[k]] for k in image.tolist()])
     points = board.corners[found.corner[kept]]
     seen = Observations.from_pixels(joints, found.pixels[kept], points, image, on_flange)
-    return seen, warnings
+    return seen, told

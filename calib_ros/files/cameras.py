@@ -24,18 +24,7 @@ NO_INFO = Refusal('before any CameraInfo', 'no CameraInfo of it has come')
 
 
 class BoardCamera:
-    """Finds a board in the images of one source.
-
-    Parameters
-    ----------
-    source : Source
-
-    Raises
-    ------
-    ConfigError
-        When the board cannot be read, or OpenCV is missing.
-
-    """
+    """Finds a board, which its source names, in the images of that source."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -66,14 +55,7 @@ class BoardCamera:
 
 
 def lens_in(info: Any) -> Lens:
-    """Return the lens that a CameraInfo tells.
-
-    Raises
-    ------
-    ConfigError
-        When the camera is not calibrated, its image cut out or binned, or its model unknown.
-
-    """
+    """Return the lens that a CameraInfo tells; refuse that of an image cut out or binned."""
     matrix, distortion = [[float(x) for x in values] for values in (info.k, info.d)]
     if not any(matrix):
         raise ConfigError('CameraInfo: the camera is not calibrated, k is zero')

@@ -93,14 +93,8 @@ class Detector:
     """Finds the corners of one board.
 
     Markers are sought in an image of half the size or less, and those that must be in view and
-    were not found in larger ones. Corners are refined in the image as it is.
-
-    Parameters
-    ----------
-    board : Board
-    fewest : int
-        Corners that an image must show.
-
+    were not found in larger ones. Corners are refined in the image as it is, of which it must show
+    the `fewest`.
     """
 
     def __init__(self, board: Board, fewest: int = FEWEST) -> None:

@@ -55,14 +55,7 @@ def decoded(data: NDArray[np.uint8]) -> Image:
 
 
 def image_of(message: Any) -> Image:
-    """Return a sensor_msgs/Image or CompressedImage in grey.
-
-    Raises
-    ------
-    InputError
-        For an encoding or a size that cannot be used.
-
-    """
+    """Return a sensor_msgs/Image or CompressedImage in grey."""
     data = np.frombuffer(message.data, dtype=np.uint8)
     if hasattr(message, 'format'):
         return decoded(data)
@@ -70,14 +63,7 @@ def image_of(message: Any) -> Image:
 
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
-    """Return the content of a sensor_msgs/Image in grey.
-
-    Raises
-    ------
-    InputError
-        For an encoding or a size that cannot be used.
-
-    """
+    """Return the content of a sensor_msgs/Image in grey; refuse unknown encodings and sizes."""
     cv2 = opencv()
     known = {  # channels, and how they become grey; OpenCV names a Bayer pattern by its second row
         'mono8': (1, None),

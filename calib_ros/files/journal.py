@@ -42,6 +42,19 @@ class Journal:
         """Write a sample, or that it was taken back; what is there stays whole."""
         self._write(cells(sample, 'removed' if removed else None))
 
+    @property
+    def gone(self) -> bool:
+        """Tell whether the file was deleted, moved or replaced, so that nobody finds its rows."""
+        try:
+            return not os.path.samestat(os.stat(self.path), os.fstat(self._file))
+        except FileNotFoundError:
+            return True
+
+    @property
+    def content(self) -> bytes:
+        """Return what was written, wherever the file is now."""
+        return os.pread(self._file, os.fstat(self._file).st_size, 0)
+
     def close(self) -> None:
         """Close the file."""
         os.close(self._file)
@@ -71,9 +84,7 @@ class Journal:
             os.ftruncate(self._file, 0)
             self._write(header)
             return
-        size = os.fstat(self._file).st_size
-        if os.pread(self._file, 1, size - 1) != b'\n':
-            os.ftruncate(self._file, _last_line(self._file, size))
+        os.ftruncate(self._file, self.content.rfind(b'\n') + 1)
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
@@ -84,9 +95,3 @@ class Journal:
         if written < len(data):  # the disk is full: no half row may stay
             os.ftruncate(self._file, begin)
             raise OSError(f'{self.path}: the disk is full, the pose was not written')
-
-
-def _last_line(file: int, size: int) -> int:
-    """Return where the last, unfinished line begins."""
-    data = os.pread(file, min(size, 1 << 16), max(0, size - (1 << 16)))
-    return size - len(data) + data.rfind(b'\n') + 1

@@ -14,6 +14,8 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+from calib_ros.texts import LARGEST_TABLE
+
 MAGIC = b'\x89MCAP0\r\n'
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 CHUNK_INDEX, STATISTICS = 0x08, 0x0B
@@ -29,7 +31,7 @@ Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
 
 
-LARGEST_CHUNK = 64_000_000
+LARGEST_CHUNK = LARGEST_TABLE
 """Bytes of a chunk when it is unpacked; recorders make chunks of one to ten million."""
 LARGEST_RATIO = 1000
 """How much larger than its file a recording can be when all of it is unpacked, chunks aside."""
@@ -56,13 +58,8 @@ def is_indexed(file: Path) -> bool:
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, content) of the records, those in chunks included.
 
-    Raises
-    ------
-    EOFError
-        When the last one is cut off, after what it holds.
-    ValueError
-        When a chunk is within another one, or there is more in them than any recording holds.
-
+    One that is cut off is an EOFError, after what it holds; a chunk in another one, or more in
+    them than any recording holds, is a ValueError.
     """
     left = LARGEST_CHUNK + LARGEST_RATIO * len(content)
     while start < len(content):

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import Columns, MadeColumns
+from calib_ros.files.columns import Columns, MadeColumns, lines_in_words
 from calib_ros.files.csv_columns import regular
 from calib_ros.files.layouts import SEPARATORS, Layout
+from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD = 100
@@ -50,10 +51,9 @@ class Sheet:
             return name if 0 < int(name[1:]) <= len(self.header) else None
         count = self.header.count(name)
         if count > 1:
-            where = [k + 1 for k, each in enumerate(self.header) if each == name]
-            shown = ', '.join(f'#{k}' for k in where[:5])
+            where = some([f'#{k}' for k, each in enumerate(self.header, 1) if each == name])
             raise InputError(
-                f'column "{name}" comes {count} times: name it by its number ({shown})'
+                f'column "{name}" comes {count} times: name it by its number ({", ".join(where)})'
             )
         return f'#{self.header.index(name) + 1}' if count else None
 
@@ -270,8 +270,8 @@ def _first(
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]
         if not used or any(_is_number(cell, decimal) for cell in cells):
             if k > at + 1:
-                left = ', '.join(str(line) for line, _ in rows[at + 1 : k][:5])
-                notes.append(f'line {left} holds no numbers and is left out')
+                left = lines_in_words([line for line, _ in rows[at + 1 : k]])
+                notes.append(f'there are no numbers in {left}: left out')
             return k
     raise InputError(f'{path} has no rows of numbers in the columns that are named')
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
+from calib_ros.errors import MOST_ENTRIES
 from calib_ros.files.mcap import LARGEST_CHUNK, LARGEST_RATIO, logged, unpacked, unpacked_size
 from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
@@ -22,8 +23,8 @@ STORAGE = ('chunks', 'connections', 'path')
 TIMES = ('message_start_time', 'message_end_time')
 CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompressed_size')
 """What the library does not promise: without them, it is asked for the messages itself."""
-LARGEST_MESSAGE = 65_536
-"""Bytes of a message; a joint state of a thousand joints has fewer."""
+LARGEST_MESSAGE = 64 * MOST_ENTRIES
+"""Bytes of a message: those of a joint in a joint state, its name and three numbers, for each."""
 LARGEST_IMAGE = 2 * LARGEST_TABLE
 """Bytes of an image, as a message or a file."""
 

@@ -15,8 +15,7 @@ from calib_ros.atomic import write_file
 from calib_ros.fleet.run import Run, page_path
 from calib_ros.fleet.standing import MEANING, Standing, State, counts
 from calib_ros.fleet.work import PLOTLY
-from calib_ros.report.page import MARKS, MISSING, filled, plotly_script
-from calib_ros.report.page import State as Mark
+from calib_ros.report.page import MARKS, MISSING, State as Mark, filled, plotly_script
 
 MOST_ROBOTS, MOST_NIGHTS = 1000, 100
 """Robots, the worst ones, and nights of each, that the page shows; the history has all."""

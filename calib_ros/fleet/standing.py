@@ -17,7 +17,6 @@ from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, results
 from calib_ros.fleet.watch import Watched, watch
-from calib_ros.settings import YEARS
 
 State: TypeAlias = Literal['changed', 'worse', 'unreadable', 'refused', 'beyond tolerance', 'fine']
 STATES: tuple[State, ...] = get_args(State)
@@ -103,7 +102,7 @@ class Standing:
 
 
 def standings(
-    robots: Sequence[Robot], history: History, done: Run, years: float = YEARS
+    robots: Sequence[Robot], history: History, done: Run, years: float
 ) -> tuple[Standing, ...]:
     """Return how robots stand, the worst first."""
     found = [Standing.of(r, history, done.errors.get(r.serial, {}), years) for r in robots]

@@ -42,7 +42,6 @@ from calib_ros.identification.changes import (
 from calib_ros.identification.levels import KNOWN
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import YEARS
 
 LAGS = (1, 2, 4, 8)
 """Nights that a change is looked for in: a large one shows at once, a small one after some."""
@@ -85,7 +84,7 @@ class Watched:
     changes: tuple[Change, ...] = ()
 
 
-def watch(rows: Sequence[Row], years: float = YEARS) -> Watched:
+def watch(rows: Sequence[Row], years: float) -> Watched:
     """Look for changes in identifications in the order of their times.
 
     Those that are not accepted, or tell other parameters than the first, are left out.

@@ -193,8 +193,9 @@ def _correlated(
     Summed over the components c; (P, c, 2 n) of `each` if asked.
     """
     length = _period(series.shape[-1])
-    spectrum = np.conj(fft.rfft(series, length)) * circle
-    found = fft.irfft(spectrum if each else spectrum.sum(axis=1), length)
+    spectrum = fft.rfft(series, length)
+    np.conj(spectrum, out=spectrum)
+    found = fft.irfft(np.einsum('pck,ck->pck' if each else 'pck,ck->pk', spectrum, circle), length)
     return np.asarray(found[..., : 2 * series.shape[-1]])
 
 

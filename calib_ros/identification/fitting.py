@@ -160,11 +160,11 @@ def _fit_all(
     """
     problem = _guarded(problem, names, factor, simpler)
     rough = start
-    few = problem.system([each.spread(SOME) for each in problem.sets])
     if simpler is not None:
         rough = simpler.chain.with_effects([name for name, _ in problem.model.effects])
-    elif few.count < sum(map(len, problem.sets)) // 2:
-        rough = minimise(start, names, few, tolerance=1e-2).chain
+    few = problem.system([each.spread(SOME) for each in problem.sets])
+    if few.count < sum(map(len, problem.sets)) // 2:
+        rough = minimise(rough, names, few, tolerance=1e-2).chain
     fitted = _fit(problem, rough, names, simpler)
     guarded = _guarded(problem, names, fitted.factor, simpler)
     if guarded is not problem:  # without its outliers a session tells less
@@ -199,9 +199,7 @@ def _fit(
         distances = None if simpler is None else simpler.distances
         robust = reweighted(chain, names, system, problem.loss, distances)
     fit = robust.fit
-    factor = fit.normal.factor()
-    if factor is None:
-        factor = triangular_factor(fit.chain, names, robust.system)
+    factor = factor_of(fit.chain, names, robust.system, fit.normal)
     noise, uncertainty = noise_of(fit, names, robust.system, factor)
     return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
 

@@ -202,9 +202,14 @@ def products_of(
     return found
 
 
-def factor_of(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
-    """Return R (P, P), upper triangular, with R^T R the normal matrix, by the shortest way."""
-    factor = normal_equations(chain, names, system).factor()
+def factor_of(
+    chain: Chain, names: Sequence[str], system: System, normal: Normal | None = None
+) -> FloatArray:
+    """Return R (P, P), upper triangular, with R^T R the normal matrix, by the shortest way.
+
+    `normal` are the normal equations there, if they are known.
+    """
+    factor = (normal or normal_equations(chain, names, system)).factor()
     return triangular_factor(chain, names, system) if factor is None else factor
 
 
@@ -249,6 +254,7 @@ def minimise(
     system: System,
     tolerance: float = STEP_TOLERANCE,
     iterations: int = 1000,
+    normal: Normal | None = None,
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 
@@ -258,9 +264,9 @@ def minimise(
     (Levenberg 1944, Marquardt 1963), by the ratio of the gain to the one foreseen (Nielsen 1999).
     It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
     It ends as well, not converged, where STALLED iterations bring no progress, or after so many
-    `iterations`; curved valleys need 400.
+    `iterations`; curved valleys need 400. `normal` are the equations at the start, if known.
     """
-    normal = normal_equations(chain, names, system)
+    normal = normal or normal_equations(chain, names, system)
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain

@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import CERTAIN, TELLING
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -238,10 +238,12 @@ class _Forms:
         """Return, by part, the sizes (1 + K,) of what is independent and of each kernel."""
         from scipy import optimize  # as below, what most fits do not need
 
+        white = np.eye(len(self._units))
+        every = dict.fromkeys(kernel for own in kernels.values() for kernel in own)
+        known = {kernel: self._units.kernel(*kernel) for kernel in every}
         forms = []
         for part in self.parts:
-            matrices = [np.eye(len(self._units))]
-            matrices += [self._units.kernel(*kernel) for kernel in kernels.get(part, ())]
+            matrices = [white, *(known[kernel] for kernel in kernels.get(part, ()))]
             forms += [self._form(part, matrix) for matrix in matrices]
         moments = self._moments(forms)
         scale = np.sqrt(np.diag(moments))
@@ -310,7 +312,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
                 rows[:, : added.shape[1]] = added / np.sqrt(count)
             parts[part].append(rows)
         q = few.observations.joints[begins]
-        turned = [np.cos(q[:, circular]), np.sin(q[:, circular]), q[:, ~circular]]
+        turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
         places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
         times.append(numbers[begins] + ELSEWHERE * number)
         counts.append(count)
@@ -353,16 +355,14 @@ def _successive(
                 earlier, states[part] = _faded(
                     rows.reshape(-1, rows.shape[2]), states.get(part), own_kernels
                 )
-                cross = own @ earlier.reshape(own.shape).T
-                found[part] += sum(size for _, size in own_kernels) * (own @ own.T)
-                found[part] += cross + cross.T
-    return found
+                found[part] += own @ earlier.reshape(own.shape).T
+    return {part: cross + cross.T for part, cross in found.items()}
 
 
 def _faded(
     rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return for each column of (R, n) the faded sum (R, n) of those before it.
+    """Return for each column of (R, n) the faded sum (R, n) of those before it and half of itself.
 
     And by kernel (length, size) the sum (R, K) so far, which goes on from `state`. Runs of about
     the root of n columns make both one product with a small matrix.
@@ -370,8 +370,8 @@ def _faded(
     lengths, sizes = np.array(kernels).T
     run = int(np.sqrt(rows.shape[1]))
     ahead = np.subtract.outer(np.arange(run), np.arange(run))[..., np.newaxis]
-    inside = (np.exp(-np.abs(ahead) / lengths) @ sizes) * (ahead[..., 0] < 0)
-    after = np.exp(-np.arange(run)[:, np.newaxis] / lengths)
+    inside = (np.exp(-np.abs(ahead) / lengths) @ sizes) * np.heaviside(-ahead[..., 0], 0.5)
+    after = np.exp(-np.arange(run)[::-1, np.newaxis] / lengths)
     found = np.empty_like(rows)
     state = np.zeros((len(rows), len(lengths))) if state is None else state
     for first in range(0, rows.shape[1], run):
@@ -379,5 +379,5 @@ def _faded(
         width = part.shape[1]
         fading = np.exp(-np.arange(1, width + 1) / lengths[:, np.newaxis])
         found[:, first : first + width] = part @ inside[:width, :width] + (state * sizes) @ fading
-        state = state * fading[:, -1] + part @ after[width - 1 :: -1]
+        state = state * fading[:, -1] + part @ after[run - width :]
     return found, state

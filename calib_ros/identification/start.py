@@ -26,7 +26,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import DEGENERATE, excited
-from calib_ros.identification.leastsquares import System, factor_of, minimise
+from calib_ros.identification.leastsquares import (
+    System,
+    factor_of,
+    minimise,
+    normal_equations,
+)
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
@@ -123,9 +128,10 @@ def _start_one(
     for candidates in (_closed_form(chain, arm, subset), cube):
         for rotation in candidates:
             start = _complete(chain, arm, subset, rotation)
-            if not determined:
-                determined = excited(factor_of(start, names, system), names)
-            fitted = minimise(start, determined, system, tolerance=1e-3).chain
+            normal = normal_equations(start, names, system)
+            determined = determined or excited(factor_of(start, names, system, normal), names)
+            known = normal if len(determined) == len(names) else None
+            fitted = minimise(start, determined, system, tolerance=1e-3, normal=known).chain
             error = _typical_error(fitted, subset)
             if error < best_error:
                 best, best_error = fitted, error

@@ -31,10 +31,12 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.joint import ANYWHERE
-from calib_ros.kinematics.joint import Frame as Frame
-from calib_ros.kinematics.joint import Joint as Joint
-from calib_ros.kinematics.joint import JointType as JointType
+from calib_ros.kinematics.joint import (
+    ANYWHERE,
+    Frame as Frame,
+    Joint as Joint,
+    JointType as JointType,
+)
 from calib_ros.kinematics.parameter import (
     DELAY,
     DH_KINDS,

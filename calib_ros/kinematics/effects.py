@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cross
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cos_sin, cross
 
 if TYPE_CHECKING:
     from calib_ros.kinematics.chain import Chain
@@ -146,8 +146,8 @@ def basis(
         elif kind == 'coupling':
             phi[rows] = q[others.astype(int)]
         elif kind in WAVES:
-            wave = np.sin if kind == 'sin' else np.cos
-            phi[rows] = wave(others[:, np.newaxis] * q[joints])
+            cos, sin = cos_sin(others[:, np.newaxis] * q[joints])
+            phi[rows] = sin if kind == 'sin' else cos
         elif kind == 'backlash' and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):
@@ -157,12 +157,14 @@ def basis(
 
 def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) with what effects add to them, by their phi (E, B)."""
-    values = dict(chain.effects)
-    q = q.copy() if names else q
-    for name, row in zip(names, phi, strict=True):
-        if values[name]:
-            q[chain.joint_names.index(name.partition('.')[0])] += values[name] * row
-    return q
+    known = dict(chain.effects)
+    values = [known[name] for name in names]
+    if not any(values):
+        return q
+    shares = np.zeros((len(q), len(names)))
+    for k, name in enumerate(names):
+        shares[chain.joint_names.index(Parameter(name).owner), k] = values[k]
+    return np.asarray(q + shares @ phi)
 
 
 @lru_cache(maxsize=256)
@@ -201,8 +203,13 @@ def _torques(
     turned[np.abs(turned) < ROUNDING * np.linalg.norm(down)] = 0.0  # of a vertical axis
     turned *= chain.walk.signs[..., np.newaxis]
     if ends is not None:
-        arms = places[ends.astype(int), 3] - points[joints]
-        return np.asarray(np.einsum('ecb,ecb->eb', arms, turned[joints]) / np.linalg.norm(down))
+        torques = np.empty((len(joints), q.shape[1]))
+        turned /= np.linalg.norm(down)
+        for i, axis in enumerate(turned):
+            here = np.flatnonzero(joints == i)
+            arms = places[ends[here].astype(int), 3] - points[i]
+            torques[here] = np.einsum('ecb,cb->eb', arms, axis)
+        return torques
     masses = np.array([joint.mass for joint in chain.joints])
     centres = np.einsum('ik,ikcb->icb', [(*joint.com, 1.0) for joint in chain.joints], places)
     carried = np.arange(len(masses)) >= joints[:, np.newaxis]  # (E, n)

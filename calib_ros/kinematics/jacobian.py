@@ -66,7 +66,8 @@ class ErrorModel:
         self.names = tuple(names)
         self._ends = (base, tool)
         turning = tuple(bool(turns) for turns in chain.walk.turning)
-        fitted = tuple(name for name, _ in chain.effects if name in self.names)
+        asked = set(self.names)
+        fitted = tuple(name for name, _ in chain.effects if name in asked)
         standard = chain.convention == 'standard'
         joints = tuple(zip(chain.joint_names, turning, strict=True))
         self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
@@ -106,8 +107,7 @@ class ErrorModel:
 
         """
         layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
-        own = {name: value for name, value in self.chain.effects if name not in layout.effects}
-        names = (*layout.effects, *(name for name, value in own.items() if value))
+        names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
         phi = effects.basis(self.chain, names, q, approach)
         frames, target = self._frames(effects.moved(self.chain, names, phi, q))
         flat = frames.reshape(4 * len(frames), 3, samples)
@@ -123,9 +123,11 @@ class ErrorModel:
             (turn if k < self.rotations else shift)[k] = 0.0
         if layout.effects:
             phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
-            shift[layout.driven] *= phi[:, np.newaxis]
-            turning = layout.driven < self.rotations
-            turn[layout.driven[turning]] *= phi[turning, np.newaxis]
+            turning, sliding = layout.driven
+            about, along = np.split(phi[:, np.newaxis], [turning.stop - turning.start])
+            shift[turning] *= about
+            turn[turning] *= about
+            shift[sliding] *= along
         if velocity is not None and layout.delay is not None:
             turn[layout.delay], shift[layout.delay] = _twist(walk, velocity, frames, target[3])
         return target[:3], target[3], shift, turn
@@ -178,8 +180,8 @@ class _Layout(NamedTuple):
     Of the rows of all frames, four each, `axes` and `points` are those that something turns
     about; `levers` (of these), `shifts` and `turns` the ones that each parameter takes, `still`
     those that move nothing. `behind` are the frames behind the constant part of each link, `bent`
-    where something goes along or about x there; `effects` stand among the parameters, with the
-    rows `driven` and the `joints` that they drive; `delay` is the row of a delay.
+    where something goes along or about x there; `effects` are the last rotations and the last of
+    all, rows `driven`, of the `joints` that they drive; `delay` is the row of a delay.
     """
 
     rotations: int
@@ -193,7 +195,7 @@ class _Layout(NamedTuple):
     behind: slice
     bent: bool
     effects: tuple[str, ...]
-    driven: NDArray[np.intp]
+    driven: tuple[slice, slice]
     joints: NDArray[np.intp]
     delay: int | None
 
@@ -237,12 +239,12 @@ def _layout(
     number = {joint: i for i, (joint, _) in enumerate(joints)}
     turning = [turns for _, turns in joints]
     lines = _lines(number, standard, frames, ends)
-    owners = [number[Parameter(name).owner] for name in fitted]
-    lines |= {name: (i, 2, turning[i]) for name, i in zip(fitted, owners, strict=True)}
+    own = {name: number[Parameter(name).owner] for name in fitted}
+    lines |= {name: (i, 2, turning[i]) for name, i in own.items()}
     for name in names:
         if name not in lines:
             raise UnknownNameError('parameter', name, lines)
-    ordered = sorted(names, key=lambda name: not lines[name][2])
+    ordered = sorted(names, key=lambda name: (not lines[name][2], name in own))
     row = {name: k for k, name in enumerate(ordered)}
     rotations = sum(lines[name][2] for name in names)
     taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
@@ -251,6 +253,8 @@ def _layout(
     away = [lines[name][0] not in (None, len(joints) + 2) for name in ordered[:rotations]]
     axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
     levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
+    driving = tuple(name for name in ordered if name in own)
+    about = sum(lines[name][2] for name in driving)
     return _Layout(
         rotations,
         _indices(row[name] for name in names),
@@ -262,9 +266,9 @@ def _layout(
         tuple(k for k, yes in enumerate(moved) if not yes),
         slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
         any(Parameter(name).kind in ('a', 'alpha') for name in names),
-        fitted,
-        _indices(row[name] for name in fitted),
-        _indices(owners),
+        driving,
+        (slice(rotations - about, rotations), slice(len(names) - len(own) + about, len(names))),
+        _indices(own[name] for name in driving),
         row.get(Parameter(ends[0], DELAY)),
     )
 
@@ -301,18 +305,18 @@ def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
 
     Notes
     -----
-    E = R_measured R^T is summed from its columns; its vector is log E = angle / sin(angle) *
-    1/2 sum_k r_k x m_k, which is as long as log(R^T R_measured).
+    E = R_measured R^T is summed from its columns; its vector is log E, as long as
+    log(R^T R_measured): angle / sin(angle) times half of what E differs from its transpose.
 
     """
-    sine_vector = 0.5 * se3.cross(model, measured).sum(axis=0)
-    cosine = 0.5 * (np.einsum('kib,kib->b', model, measured) - 1.0)
+    turn = np.einsum('kib,kjb->ijb', measured, model)
+    sine_vector = 0.5 * (turn[[2, 0, 1], [1, 2, 0]] - turn[[1, 2, 0], [2, 0, 1]])
+    cosine = 0.5 * (np.einsum('iib->b', turn) - 1.0)
     sine = np.sqrt(np.einsum('ib,ib->b', sine_vector, sine_vector))
     angle = np.arctan2(sine, cosine)
     least = np.maximum(sine, se3.ROUNDING)
     error: FloatArray = sine_vector * np.where(sine > se3.ROUNDING, angle / least, 1.0)
     half_turn = np.flatnonzero(cosine < -0.99)  # the sine loses the axis near 180 degrees
     if half_turn.size:
-        turned = np.einsum('kib,kjb->bij', measured[..., half_turn], model[..., half_turn])
-        error[:, half_turn] = se3.log_rotation(turned).T
+        error[:, half_turn] = se3.log_rotation(turn[..., half_turn].transpose(2, 0, 1)).T
     return error

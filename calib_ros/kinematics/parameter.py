@@ -9,6 +9,7 @@ all at once; what it says of itself is read from it here and nowhere else.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import lru_cache
 
 DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
 ANGLES = ('alpha', 'theta', 'beta')
@@ -74,7 +75,12 @@ class Parameter(str):
     @property
     def unit(self) -> str:
         """Return its unit; '1' for a pure number."""
-        return _UNITS.get(self.kind) or _UNITS.get(self.effect[0], 'rad')
+        return _unit(self)
+
+
+@lru_cache(maxsize=1024)
+def _unit(name: Parameter) -> str:
+    return _UNITS.get(name.kind) or _UNITS.get(name.effect[0], 'rad')
 
 
 def parameters_of(owner: str, kinds: Iterable[str] = FRAME_KINDS) -> tuple[Parameter, ...]:

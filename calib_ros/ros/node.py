@@ -54,11 +54,11 @@ from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import STANDARD, parse_sources
 
-TAKING_PERIOD = 0.1
-"""Time [s] between two times at which the messages that have come are taken, all at once: one at
-a time, each in a cold cache, they cost three times as much."""
 DIAGNOSTICS_PERIOD = 1.0
 """Time [s] between two reports on /diagnostics, as is usual there."""
+TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
+"""Time [s] between two times at which the messages that have come are taken, all at once: one at
+a time, each in a cold cache, they cost three times as much."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD
 """Time [s] for which the end waits for what was begun."""
 STATUS_LENGTH = 120
@@ -88,7 +88,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove
         )
-        self.session.socket_distance = given.socket_distance
         self.session.pictures.cameras = cameras_of(given.settings.sources)
         filer = Filer(given.history, given.serial, chain)
         self._filer, self._status_text = filer, ''

@@ -28,13 +28,13 @@ DENSE_NS = round(0.8e9 * STEP)
 WATCHED = 5 * WATCH_NS // DENSE_NS
 """Samples that it keeps at most, of several streams."""
 CLOCKS_MOVED = SMOOTHING
-"""Difference of two delays [s] from which a clock was moved: positions tell each to 0.03 s."""
+"""Difference of two delays [s] from which a clock was moved; speeds tell none finer."""
 LOOK_AGAIN_NS = 4 * ADVANCE_NS
 """Time between two looks for the delay."""
-EARLY = 0.03
-"""Time [s] by which measurements of a stop may be stamped too early: as near as positions tell a
-delay. Of what then shows the arm leaving, most is left out as spikes; the rest moves the mean by
-less than the noise of a measurement."""
+EARLY = CLOCKS_MOVED / 2.0**0.5
+"""Time [s] by which measurements of a stop may be stamped too early: as near as one
+delay is told. Of what then shows the arm leaving, most is left out as spikes; the rest moves the
+mean by less than the noise of a measurement."""
 
 
 class Watch:

@@ -29,7 +29,7 @@ from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.sampling.waiting import Waiting
 from calib_ros.settings import Settings
 
-REST_S = 0.1
+REST_S = 0.5 * Settings.shortest_stop
 """Time [s] during which joints must have stayed where they are to be standing."""
 ADVANCE_NS = round(5e9 * REST_S)
 """Time of the newest joint sample between two rounds of taking samples."""
@@ -308,7 +308,7 @@ class Collector:
         stops = plan.stops
         if stops:
             spans = [(plan.begins[k], plan.ends[k]) for k in stops]
-            where = self.track.where(np.sum(spans, axis=1) // 2)
+            where = self.track.at(np.sum(spans, axis=1) // 2, standing=True).joints
             known = self._known.meets(spans, where, 2.0 * settings.still)
             for k in itertools.compress(stops, known):
                 plan.why[k] = SAMPLED

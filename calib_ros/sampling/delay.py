@@ -15,31 +15,29 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.levels import TELLING
+from calib_ros.identification.levels import ALIKE, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
 from calib_ros.settings import Settings
 
-STEP = 5e-3
+SMOOTHING = 0.5 * Settings.max_gap
+"""Time over which speeds are taken [s]; short against a move, long against the noise."""
+STEP = SMOOTHING / 10.0
 """Time between two values of the speeds [s]."""
 MOST_DELAY = Settings.lateness
 """Largest delay that is looked for [s]: as late as measurements may come."""
-LEAST_MOTION = 3.0
-"""Time in motion that is needed [s]."""
+LEAST_MOTION = 3.0 * MOST_DELAY
+"""Time in motion that is needed [s]: so that most of it is compared at every delay."""
 ALIKE_ENOUGH = 0.8
 """Least correlation."""
 RISE = 0.02
 """Least rise of the correlation beyond a valley for another peak."""
-RIVAL = 3.0
-"""A rival explains the speeds unless it leaves so many times what the best delay leaves."""
 IN_MOTION = 0.1
 """Share of the 95th percentile of the speed beyond which the arm counts as moving."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
-SMOOTHING = 10.0 * STEP
-"""Time over which speeds are taken [s]; short against a move, long against the noise."""
 
 
 @dataclass(frozen=True)
@@ -111,11 +109,11 @@ def find_delay(
 
 
 def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
-    """Return where other peaks of the correlation are nearly as high as the best."""
+    """Return at which other peaks of the correlation as much of the speeds is left."""
     found = peaks(score, RISE)
     others = found[found != best]
-    left, least = (1.0 - np.maximum(score[k], 0.0) ** 2 for k in (others, best))
-    return np.asarray(others[left < RIVAL * least])
+    left, least = (np.sqrt(1.0 - np.maximum(score[k], 0.0) ** 2) for k in (others, best))
+    return np.asarray(others[left < ALIKE * least])
 
 
 def peaks(score: FloatArray, rise: float) -> NDArray[np.intp]:

@@ -9,17 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib_ros.identification.levels import NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import Estimate, barely_moved
 from calib_ros.sampling.slices import NO_ACCIDENT
-from calib_ros.settings import Settings
-
-SHARE = 0.2
-"""Least share of measurements without joint values of which it is told."""
-NOT_NOISE = 3.0
-"""RMS residual [what measurements scatter by] from which it is no noise, and more samples would
-average nothing: chance alone does not reach it with the fewest samples of which it is told."""
+from calib_ros.settings import EXCEPTION, Settings
 
 
 class Hint(NamedTuple):
@@ -40,7 +35,7 @@ def restless(needed: float, still: float) -> Hint:
 
 def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
     """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
-    if between < NO_ACCIDENT or between <= SHARE * measurements:
+    if between < NO_ACCIDENT or between <= EXCEPTION * measurements:
         return None
     rate = f'{2.0 / max_gap:g} Hz or more'
     return Hint(
@@ -103,7 +98,7 @@ def _forecast(estimate: Estimate, settings: Settings) -> str:
         return 'enough for the accuracy wanted'
     if estimate.excess is None:
         return 'too few to tell how many it takes'
-    if estimate.excess > NOT_NOISE:
+    if estimate.excess * NEARER > 1.0:  # not by chance, even with the fewest samples
         advice = 'is the target firm? More'
         if settings.model == 'geometric':
             advice = 'set model to auto, more'

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.values import LARGEST as LARGEST
-from calib_ros.values import QUATERNION_TOLERANCE, covariance_fault
+from calib_ros.values import LARGEST as LARGEST, QUATERNION_TOLERANCE, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'

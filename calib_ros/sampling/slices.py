@@ -11,13 +11,15 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
+from calib_ros.settings import Settings
 
 JOINTS, POSES = 'joints', 'measurements'
-NO_ACCIDENT = 20
-"""So many messages that differ from the others are no accident."""
-SILENCE = 5.0
+NO_ACCIDENT = round(1.0 / (1.0 - CONFIDENT))
+"""So many messages that differ from the others are no accident: one in so many may be."""
+SILENCE = 5.0 * Settings.lateness
 """A joint or topic that was heard before and is silent for so long [s] is told."""
 
 
@@ -61,19 +63,11 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """Messages in the order in which they came, in pieces by stream.
+    """Messages in the order in which they came, in pieces by stream, the first to come first.
 
-    Attributes
-    ----------
-    pieces : tuple of Piece
-        Who comes first is first; their places count from the first message of a batch.
-    begin : int
-        Place of the first message.
-    joints : (N,) bool
-        Which messages are joint states.
-    times : (N,) int
-        Stamps on the clock of the joints [ns].
-
+    Places count from the first message of a batch, `begin` is that of the first one here.
+    `joints` (N,) are the messages that are joint states, `times` (N,) all stamps on the clock of
+    the joints [ns].
     """
 
     pieces: tuple[Piece, ...]

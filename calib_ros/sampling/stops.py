@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.identification.levels import MOST_OUTLIERS
 from calib_ros.kinematics.se3 import FloatArray
 
 MOST_SPREAD = 2.0
@@ -24,27 +25,16 @@ NEAR = 2.0 * MOST_SPREAD
 """Distance [noise] to the later half within which a measurement is taken to have settled."""
 SPIKE = 3.0 * MOST_SPREAD
 """A single measurement further from the median [noise] is left out of the mean."""
-MOST_SPIKES = 0.3
-"""Share of spikes from which a stop may be at two places."""
 LEAST_COUNT = 4
 """With fewer measurements nothing can be said about their spread."""
 
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """The means of what was measured at S stops.
+    """The means of what was measured at S stops: `values` (S, 3) or (S, 1) [m].
 
-    Attributes
-    ----------
-    used : (N,) bool
-        Which measurements are in the mean of their stop.
-    rests : (S,) bool
-        False for a stop whose measurements spread more than their noise.
-    values : (S, 3) or (S, 1)
-        Positions or distances [m].
-    spreads : (S,)
-        RMS of one coordinate of a stop about its mean [m].
-
+    `used` (N,) are the measurements in them, `spreads` (S,) the RMS of one coordinate about them
+    [m]; at a stop that does not `rests` (S,) measurements spread more than their noise.
     """
 
     used: NDArray[np.bool_]
@@ -70,7 +60,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
         settled[: _settled(values[part], reach)] = False
         middle = np.median(values[part][settled], axis=0)
         spikes = _distance(values[part], middle) > SPIKE * reach
-        rests[k] = (spikes & settled).sum() <= MOST_SPIKES * settled.sum()
+        rests[k] = (spikes & settled).sum() <= MOST_OUTLIERS * settled.sum()  # else two places
         settled &= ~spikes
     means = mean_of_each(values, begins, used)
     squares = (values - np.repeat(means, ends - begins, axis=0)) ** 2

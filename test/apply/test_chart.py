@@ -37,7 +37,7 @@ def test_an_arm_that_gets_worse_is_found(growth, within):
     for seed in range(40):
         rms = np.sqrt(np.random.default_rng(seed).chisquare(60.0, 60) / 60.0)
         rms[30:] *= growth
-        found = drift(0.1 * rms, np.full(60, 60.0))
+        found = drift(0.1 * rms, np.full(60, 60.0), 100.0)
         assert found.alarms
         assert found.alarms[0] >= 30
         late.append(found.alarms[0] - 29)
@@ -47,5 +47,5 @@ def test_an_arm_that_gets_worse_is_found(growth, within):
 def test_what_are_no_errors_is_refused():
     for rms, freedom in (([0.1, -0.1], [3.0, 3.0]), ([0.1], [3.0, 3.0]), ([0.1], [0.0])):
         with pytest.raises(InputError, match='degrees of freedom of nights'):
-            drift(rms, freedom)
-    assert drift([], []).alarms == ()
+            drift(rms, freedom, 100.0)
+    assert drift([], [], 100.0).alarms == ()

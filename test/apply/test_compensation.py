@@ -16,8 +16,7 @@ from commanded import (
     pose_errors,
     regular,
 )
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.optimize import least_squares
 
 from calib_ros.apply.compensation import Compensator, compensate, in_words

@@ -14,11 +14,11 @@ from calib_ros.apply.design import (
     ASSUMED_TOOL,
     Candidates,
     Design,
+    _root_of_inverse as root_of_inverse,
     accuracy,
     information_of,
     predicted,
 )
-from calib_ros.apply.design import _root_of_inverse as root_of_inverse
 from calib_ros.errors import InputError
 from calib_ros.identification.identifiability import observability
 from calib_ros.identification.identification import Problem, identify

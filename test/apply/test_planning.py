@@ -6,8 +6,7 @@ from itertools import combinations, permutations
 import numpy as np
 import pytest
 from designs import POSTURE, SIGMAS, TOOL, arm, design_of, log_det, predicted_square, some
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from robots import DATA, needs_data
 from scipy.spatial.distance import pdist
 

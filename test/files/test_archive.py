@@ -189,3 +189,30 @@ def test_a_folder_in_which_nothing_can_be_written_is_refused(folder):
         open_archive(Path(folder))
     assert folder in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('how', ['deleted', 'folder deleted', 'replaced'])
+def test_a_journal_that_is_not_there_any_more_goes_on_in_another_file(tmp_path, how):
+    folder = tmp_path / 'data'
+    archive = open_archive(folder)
+    archive.add(sample(1))
+    archive.add(sample(2))
+    first = archive.journal
+    if how == 'folder deleted':
+        shutil.rmtree(folder)
+        folder.write_text('in the way')
+        archive.write()
+        assert 'in memory only' in archive.trouble
+        folder.unlink()
+    elif how == 'replaced':
+        (folder / 'edited').write_text('by an editor')
+        (folder / 'edited').replace(first)
+    else:
+        first.unlink()
+    archive.add(sample(3))
+    assert not archive.error
+    assert stamps(folder) == [1, 2, 3]
+    assert archive.begin_anew().exists()
+    archive.close()
+    if how == 'replaced':
+        assert first.read_text() == 'by an editor'

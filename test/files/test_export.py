@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.cli.main import main

@@ -100,7 +100,7 @@ BOARD = 'type: charuco\ncolumns: 5\nrows: 7\nsquare: 0.036\nmarker: 0.026\ndicti
     ('old', 'new', 'said'),
     [
         ('columns: 5', 'columns: 5.0', 'columns must be a whole number'),
-        ('columns: 5', 'columns: 1', 'columns of a board must be from 2 to 100, not 1'),
+        ('columns: 5', 'columns: 1', 'columns of a board must be from 2 to 1000, not 1'),
         ('marker: 0.026', 'marker: 0.036', 'needs 0 < marker < square'),
         ('rows: 7\n', '', 'key "rows" is missing'),
         ('charuco', 'chess', 'unknown type of board "chess"'),

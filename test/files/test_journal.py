@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
 from calib_ros.files.journal import Journal
@@ -169,6 +168,7 @@ def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
     written(path, [])
     header = path.read_bytes()
     path.write_bytes(header[:20])
+    assert read_journal(path, JOINTS) == ((), ())
     written(path, [plain(1)])
     assert path.read_bytes().startswith(header)
     assert_equal(read_journal(path, JOINTS)[0], [plain(1)])

@@ -11,8 +11,7 @@ from types import SimpleNamespace
 
 import lz4.frame
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from calib_ros.files.mcap import CHANNEL, CHUNK, LARGEST_CHUNK, MESSAGE, logged, records
 

@@ -29,7 +29,9 @@ def standing(serial, errors=None, changes=(), errors_mm=(0.1, 0.1, 0.1), **more)
     robot = Robot(serial, load_chain('ur10e'), (Measured('*'),), tolerance=0.11)
     watched = Watched(tuple(nights), changes)
     verified = tuple(replace(row, rms_mm=rms) for row, rms in zip(rows, errors_mm, strict=True))
-    return Standing(robot, rows[-1], watched, errors or {}, verified, drift(errors_mm, [30.0] * 3))
+    return Standing(
+        robot, rows[-1], watched, errors or {}, verified, drift(errors_mm, [30.0] * 3, 100.0)
+    )
 
 
 def test_states_from_the_worst_to_the_best():

@@ -39,7 +39,7 @@ def keys(history):
 def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
     history, out = History(tmp_path / 'history'), tmp_path / 'report'
     said = []
-    first = run(plant, history, cluster, out, lambda words, share: said.append(share))
+    first = run(plant, history, cluster, out, said.append)
     assert (first.filed, first.errors, said[-1]) == (4, {}, 1.0)
     rows = history.rows('A')
     assert [row.time for row in rows] == [plants.when(0), plants.when(1)]
@@ -86,13 +86,13 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     found = run(plant, history, cluster)
     assert found.filed == 1
     assert row.name in found.errors['A']['']
-    first, second = standings(plant, history, found)
+    first, second = standings(plant, history, found, 100.0)
     assert (first.robot.serial, first.state, first.last) == ('A', 'unreadable', None)
     assert (second.robot.serial, second.state) == ('B', 'fine')
     for number, rms in enumerate((0.1, 0.1, 0.5)):
         errors = {'rms_mm': rms, 'rms_freedom': 30.0}
         history.file(Row('B', 'verify', plants.when(number), 'JUDGED', str(number), 's', **errors))
-    worst = standings(plant, history, found)[0]
+    worst = standings(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
 

@@ -44,7 +44,7 @@ def nights(first, rng, count, bump=(99, ''), scatter=1.0):
 @pytest.mark.parametrize('name', BUMPS)
 def test_a_bump_is_found_within_two_nights_and_its_joint_named(first, rng, name):
     for number in (4, 9):
-        (change,) = watch(list(nights(first, rng, 12, (number, name)))).changes
+        (change,) = watch(list(nights(first, rng, 12, (number, name))), 100.0).changes
         assert change.joint == name.partition('.')[0]
         best = change.reasons[0]
         assert best.names == (name,)
@@ -57,7 +57,7 @@ def test_a_bump_is_found_within_two_nights_and_its_joint_named(first, rng, name)
 def test_an_unchanged_arm_raises_no_alarm(first, rng):
     """1,000 nights at one false alarm in 100 years; 365 at ten a year, chance alone."""
     for scatter in (1.0, 2.0):
-        found = watch(list(nights(first, rng, 500, scatter=scatter)))
+        found = watch(list(nights(first, rng, 500, scatter=scatter)), 100.0)
         assert found.changes == ()
         assert len(found.nights) == 500
     assert 2 <= len(watch(list(nights(first, rng, 365)), years=0.1).changes) <= 20
@@ -67,7 +67,7 @@ def test_a_drift_that_no_night_shows_is_found(first, rng):
     rows = list(nights(first, rng, 60))
     which = np.array(first.names) == 'wrist_1_joint.d'
     rows = [replace(row, offsets=row.offsets + 2e-6 * k * which) for k, row in enumerate(rows)]
-    changes = watch(rows).changes
+    changes = watch(rows, 100.0).changes
     assert changes
     for change in changes:
         assert 'wrist_1_joint' in {reason.owner for reason in change.reasons}
@@ -77,12 +77,12 @@ def test_several_changes_and_those_before_a_date(first, rng):
     rows = list(nights(first, rng, 20, (5, BUMPS[0])))
     again = np.array(first.names) == BUMPS[1]
     rows = [replace(r, offsets=r.offsets + 1e-4 * again * (k >= 12)) for k, r in enumerate(rows)]
-    changes = watch(rows).changes
+    changes = watch(rows, 100.0).changes
     assert [change.joint for change in changes] == ['elbow_joint', 'wrist_1_joint']
-    assert [c.joint for c in watch([r for r in rows if r.time >= changes[0].time]).changes] == [
-        'wrist_1_joint'
-    ]
-    assert watch([r for r in rows if r.time >= changes[1].time]).changes == ()
+    assert [
+        c.joint for c in watch([r for r in rows if r.time >= changes[0].time], 100.0).changes
+    ] == ['wrist_1_joint']
+    assert watch([r for r in rows if r.time >= changes[1].time], 100.0).changes == ()
 
 
 def test_what_cannot_be_compared_is_left_out(first, rng):
@@ -95,7 +95,7 @@ def test_what_cannot_be_compared_is_left_out(first, rng):
         covariance=rows[2].covariance[np.ix_(few, few)],
     )
     rows[3] = replace(rows[3], verdict='refused', offsets=rows[3].offsets + 1.0)
-    found = watch(rows)
+    found = watch(rows, 100.0)
     assert [night.row for night in found.nights] == [rows[k] for k in (0, 1, 4, 5)]
     assert found.changes == ()
-    assert watch(()).nights == watch(rows[:1]).changes == ()
+    assert watch((), 100.0).nights == watch(rows[:1], 100.0).changes == ()

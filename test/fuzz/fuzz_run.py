@@ -98,8 +98,7 @@ def by_atheris(name, seconds, seed):
 def by_hypothesis(name, seconds, seed):
     import fuzz_targets
     from fuzz_variants import variants
-    from hypothesis import HealthCheck, Phase, given, settings
-    from hypothesis import seed as seeded
+    from hypothesis import HealthCheck, Phase, given, seed as seeded, settings
 
     until, runs = time.monotonic() + seconds, 0
 

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fits import UR10E, fitted, measured_arm, worst_prediction
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError

@@ -9,8 +9,7 @@ from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification import samples as samples_module
-from calib_ros.identification import shared_errors
+from calib_ros.identification import samples as samples_module, shared_errors
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System
 from calib_ros.report.words import as_document, neighbours_in_words

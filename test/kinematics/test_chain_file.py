@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3

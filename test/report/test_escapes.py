@@ -9,8 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from measured import measured
 
 from calib_ros.escapes import from_cell, in_markdown, one_line, to_cell

@@ -12,8 +12,7 @@ from rclpy.node import Node
 from ros_cell import LATCHED, Cell, true_arm
 from urdfs import UR10E, by_kinpy
 
-from calib_ros.apply.simulation import Cell as SimulatedCell
-from calib_ros.apply.simulation import faulty
+from calib_ros.apply.simulation import Cell as SimulatedCell, faulty
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame

@@ -6,8 +6,7 @@ import re
 
 import pytest
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from launching import ROOT, parameters_of
 from ros_cell import Cell
 

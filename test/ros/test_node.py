@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import (
-    PointStamped,
-    PoseWithCovarianceStamped,
-    TransformStamped,
-)
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import ReliabilityPolicy
 from ros_cell import (
@@ -32,8 +28,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Float64MultiArray, String
 
-from calib_ros.apply.simulation import Cell as SimulatedCell
-from calib_ros.apply.simulation import faulty, measure, random_frame
+from calib_ros.apply.simulation import Cell as SimulatedCell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag

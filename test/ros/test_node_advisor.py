@@ -8,14 +8,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
-from ros_cell import (
-    STOPS,
-    Cell,
-    joint_messages,
-    pose_messages,
-    topics,
-    values_of,
-)
+from ros_cell import STOPS, Cell, joint_messages, pose_messages, topics, values_of
 from sensor_msgs.msg import JointState, PointCloud2, Range
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 

@@ -8,13 +8,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from ros_cell import (
-    STOPS,
-    Cell,
-    pose_messages,
-    topics,
-    values_of,
-)
+from ros_cell import STOPS, Cell, pose_messages, topics, values_of
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 

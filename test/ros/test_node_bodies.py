@@ -11,7 +11,6 @@ import pytest
 if 'CI' not in os.environ:
     pytest.importorskip('mocap4r2_msgs.msg', reason='make test builds it')
 
-from diagnostic_msgs.msg import DiagnosticArray
 from mocap4r2_msgs.msg import Marker, RigidBodies, RigidBody
 from ros_cell import Cell, direct, joint_messages, pose_messages
 
@@ -42,19 +41,6 @@ def test_a_body_is_measured_as_a_pose_would_be(tmp_path, recording):
                 getattr(live.problem().observations, name),
                 getattr(expected.problem().observations, name),
             )
-
-
-def test_the_diagnostics_tell_which_bodies_are_there(tmp_path, recording):
-    source = SOURCE.replace('child=4', 'child=5')
-    with Cell(chain='ur10e', sources=[source], data_dir=str(tmp_path)) as cell:
-        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
-        publisher = cell.publisher(RigidBodies, '/rigid_bodies')
-        for message in bodies(recording)[:5]:
-            publisher.publish(message)
-        cell.spin_until(lambda: any('nothing links' in m.status[0].message for m in heard))
-        words = heard[-1].status[0].message
-        assert 'nothing links frame "5" to "tracker" on /rigid_bodies' in words
-        assert 'tracker to 4 at ' in words
 
 
 def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):

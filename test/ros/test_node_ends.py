@@ -10,16 +10,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from ros_cell import (
-    START,
-    STOPS,
-    Cell,
-    Child,
-    direct,
-    part,
-    topics,
-    values_of,
-)
+from ros_cell import START, STOPS, Cell, Child, direct, part, topics, values_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 

@@ -25,8 +25,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from calib_ros.files.archive import Archive
-from calib_ros.ros import inputs as inputs_module
-from calib_ros.ros import node as node_module
+from calib_ros.ros import inputs as inputs_module, node as node_module
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.outputs import Keeper

@@ -14,8 +14,14 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from calib_ros.apply.simulation import Camera, before_camera, drive, faulty, photograph
-from calib_ros.apply.simulation import Cell as SimulatedCell
+from calib_ros.apply.simulation import (
+    Camera,
+    Cell as SimulatedCell,
+    before_camera,
+    drive,
+    faulty,
+    photograph,
+)
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
 from calib_ros.files.cameras import cameras_of, lens_in

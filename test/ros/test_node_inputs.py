@@ -10,13 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_cell import (
-    Cell,
-    Child,
-    joint_messages,
-    topics,
-    values_of,
-)
+from ros_cell import Cell, Child, joint_messages, topics, values_of
 from sensor_msgs.msg import JointState
 
 from calib_ros.errors import ConfigError

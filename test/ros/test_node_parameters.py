@@ -11,11 +11,7 @@ import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
-from ros_cell import (
-    Cell,
-    Child,
-    topics,
-)
+from ros_cell import Cell, Child, topics
 
 from calib_ros.errors import CalibrationError
 from calib_ros.kinematics.chain_file import load_chain

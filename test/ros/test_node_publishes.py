@@ -6,17 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import (
-    PoseStamped,
-)
-from ros_cell import (
-    STOPS,
-    Cell,
-    joint_messages,
-    pose_messages,
-    topics,
-    values_of,
-)
+from geometry_msgs.msg import PoseStamped
+from ros_cell import STOPS, Cell, joint_messages, pose_messages, topics, values_of
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 

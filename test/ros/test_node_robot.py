@@ -73,15 +73,6 @@ def test_the_robot_describes_itself_and_gets_a_corrected_description(tmp_path):
         np.testing.assert_allclose(corrected.forward(q), arm.forward(q), rtol=0, atol=1e-9)
 
 
-def test_a_table_is_exported_without_a_urdf(tmp_path):
-    with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
-        cell.play(topics(shift(true_arm())))
-        assert cell.call('identify').success
-        assert cell.call('export').success
-        (folder,) = [path for path in tmp_path.iterdir() if path.is_dir()]
-        assert {path.name for path in folder.iterdir()} == TABLES
-
-
 def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
     monkeypatch.setattr(parameters_module, 'DESCRIPTION_WAIT', 0.2)
     with Cell() as cell:

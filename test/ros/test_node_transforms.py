@@ -15,15 +15,7 @@ if 'CI' not in os.environ:
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rclpy.serialization import serialize_message
-from ros_cell import (
-    LATCHED,
-    Cell,
-    assert_same,
-    direct,
-    header,
-    joint_messages,
-    stamp_ns,
-)
+from ros_cell import LATCHED, Cell, assert_same, direct, header, joint_messages, stamp_ns
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from tf2_msgs.msg import TFMessage

@@ -3,8 +3,7 @@
 """Every measurement that came is in a sample, waits, or is counted with a cause: none is lost."""
 
 import numpy as np
-from hypothesis import Phase, given, settings
-from hypothesis import strategies as st
+from hypothesis import Phase, given, settings, strategies as st
 from streams import (
     MS,
     POSE,

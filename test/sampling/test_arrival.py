@@ -17,8 +17,7 @@ from arriving import (
     tour,
     toured,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from streams import START, stamps, stops, sweep
 
 from calib_ros.sampling.slices import NO_ACCIDENT

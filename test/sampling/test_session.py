@@ -6,16 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sessions import TRUE, UR5E, drive, samples, session, tracker
-from streams import (
-    POSE,
-    RANGE,
-    TRACKER,
-    TRANSFORM,
-    distance,
-    pose,
-    take,
-    transform,
-)
+from streams import POSE, RANGE, TRACKER, TRANSFORM, distance, pose, take, transform
 
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError

@@ -6,11 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sessions import SIGMAS, UR5E, drive, samples, session, tracker
-from streams import (
-    joint_state,
-    of_joints,
-    take,
-)
+from streams import joint_state, of_joints, take
 
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings

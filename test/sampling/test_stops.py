@@ -2,8 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from calib_ros.sampling.stops import LEAST_COUNT, MOST_SPREAD, averages
 
@@ -82,7 +81,7 @@ def test_two_places_are_never_averaged(rng, at):
     values = noisy(rng, 60)
     values[at:] += [2e-3, 0.0, 0.0]
     found = average(values)
-    assert (found is None) == (40 <= at <= 45)
+    assert (found is None) == (41 <= at <= 45)
     if found is not None:
         used = found[0]
         assert not used[:at].any() or not used[at:].any()

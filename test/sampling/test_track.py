@@ -4,8 +4,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from tracked import BOTH, MAX_GAP, MS, add, at, fill, filled, track
 
 from calib_ros.sampling.interpolation import MOVED
