@@ -186,12 +186,8 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
 def _add_compare(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to compare')
     for name, text in (('first', 'the earlier one'), ('second', 'the later one')):
-        group.add_argument(
-            name,
-            type=Path,
-            metavar=name.upper(),
-            help=f'{text}: calibration.yaml, or the folder of identify --out',
-        )
+        text += ': calibration.yaml, or the folder of identify --out'
+        group.add_argument(name, type=Path, metavar=name.upper(), help=text)
     group.add_argument('--json', action='store_true', help='print the difference as JSON')
 
 
@@ -373,7 +369,7 @@ COMMANDS = {
         'workspace._run',
         (
             'workspace result/ --chain ur10e --out map/',
-            'workspace result/ --chain ur10e --task task.csv --out map/ --aim max',
+            'workspace result/ --chain ur10e --task task.csv --out map/ --aim worst',
         ),
     ),
     'bag2csv': Command(

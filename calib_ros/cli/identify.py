@@ -55,8 +55,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         problem, measured = found.loaded.problem, options.csv or options.detections
         sets, measured = (*problem.sets, *problem.judging), measured or options.measured
         about = given.filing_of(options, problem.chain, sets, measured, options.largest_loss)
-        history.file(row_of(found.result, about, found.warnings))
-    for warning in (*found.warnings, *words.remarks(found.result)):
+        history.file(row_of(found.result, about, found.loaded.warnings))
+    for warning in (*found.loaded.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))

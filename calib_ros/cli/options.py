@@ -224,7 +224,7 @@ def add_previous(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('an earlier calibration (docs/history.md)')
     add = group.add_argument
     text = 'bring this one up to date by a few poses, and say what has changed since'
-    add('--previous', metavar='CALIBRATION', help=text)
+    add('--previous', type=Path, metavar='CALIBRATION', help=text)
     text = 'by which lengths wander in a year; angles by twice as many mrad'
     add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
     add_moved(group)

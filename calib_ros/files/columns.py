@@ -165,9 +165,18 @@ class MadeColumns(Columns):
         return ['' if value != value else repr(value) for value in self.values[name].tolist()]
 
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
-        if set(names) & set(self.words):
-            return None
-        return np.column_stack([self.values[name] for name in names])
+        found = np.zeros((len(self.lines), len(names)))
+        for k, name in enumerate(names):
+            words = self.words.get(name)
+            try:
+                found[:, k] = (
+                    self.values[name] if words is None else [float(w or 'nan') for w in words]
+                )
+            except ValueError:
+                return None
+            if not (np.isfinite(found[:, k]) | self.blank(name)).all():
+                return None
+        return found
 
 
 def numbered(texts: Sequence[str]) -> Codes:

@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from calib_ros.identification.levels import TELLING
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, cos_sin
 
 STILL = 1e-3
 """Joint values [rad or m] that differ by less are one configuration."""
@@ -54,7 +54,7 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
         return np.zeros(0, dtype=np.intp)
     number = stops(joints)
     standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
-    place = np.concatenate([np.cos(standing), np.sin(standing)], axis=1)  # which knows no turns
+    place = np.concatenate(cos_sin(standing), axis=1)  # which knows no turns
     close, label = _pairs(place, SCATTER), np.arange(len(standing))
     # what stands still is nearer than visits may scatter
     near = close[_still(standing[close[:, 0]] - standing[close[:, 1]])]

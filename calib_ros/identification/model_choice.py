@@ -14,12 +14,11 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
@@ -34,6 +33,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.progress import Told, nobody, share_of
 
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
@@ -41,27 +41,24 @@ COMPARED = 3000
 """Samples by which effects are compared; of more, every so many are taken."""
 
 
-def _unheard(stage: str) -> None:
-    """Tell nobody which stage begins."""
-
-
-def identify_model(
-    problem: Problem, model: str, progress: Callable[[str], None] = _unheard
-) -> Identification:
+def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:
     """Identify with the errors that `model` names; `auto` chooses by cross-validation.
 
     A choice that cannot be fitted, or is refused where the geometric result is not, leaves that
-    one, with the verdicts and a remark. `progress` is called with each stage that begins; what it
-    raises ends the work.
+    one, with the verdicts and a remark. What `progress` raises ends the work.
     """
     progress(f'model {"geometric" if model == "auto" else model}')
-    result = identify(problem)
     if model != 'auto':
-        return result
-    chosen, verdicts = _chosen(problem, result, progress)
+        return identify(problem, progress=progress)
+    poses, columns = sum(map(len, problem.sets)), 2 * len(HARMONICS) * len(problem.chain.joints)
+    fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
+    first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
+    result = identify(problem, progress=share_of(progress, 0.0, first))
+    chosen, verdicts = _chosen(problem, result, share_of(progress, first, second))
     if chosen:
         progress(f'model with {len(chosen)} effects')
-        richer = identify(replace(problem, effects=chosen), result)
+        rest = share_of(progress, second, 1.0)
+        richer = identify(replace(problem, effects=chosen), result, rest)
         reasons: tuple[str, ...] = ()
         if not richer.converged:
             reasons = ('its fit has not converged',)
@@ -76,7 +73,7 @@ def identify_model(
 
 
 def _chosen(
-    problem: Problem, geometric: Identification, progress: Callable[[str], None]
+    problem: Problem, geometric: Identification, progress: Told
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     """Return the effects that pay for themselves, and the verdicts on all that were tried."""
     progress('effects')
@@ -153,10 +150,8 @@ class _Linear:
         self._ends = np.cumsum([each[-1].size for each in rows])
         owner = owners(rows)
         self._folds = [dealing[owner] for dealing in dealings]
-        self._products = [
-            np.array([_square(self._columns[:, folds == k].T) for k in range(problem.folds)])
-            for folds in self._folds
-        ]
+        self._inside = np.array([d == k for d in self._folds for k in range(problem.folds)])
+        self._products = np.array([_square(self._columns[:, part].T) for part in self._inside])
         self._pairs = [
             effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
@@ -207,9 +202,7 @@ class _Linear:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return Verdict(what, found[0], found[1], bool(pays))
 
-    def strongest_harmonic(
-        self, chosen: Sequence[str], progress: Callable[[str], None]
-    ) -> list[Parameter] | None:
+    def strongest_harmonic(self, chosen: Sequence[str], progress: Told) -> list[Parameter] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
         None where the strongest one of residuals moved in time often explains as much.
@@ -226,7 +219,7 @@ class _Linear:
         self,
         chosen: Sequence[str],
         groups: Sequence[Sequence[str]],
-        progress: Callable[[str], None] = _unheard,
+        progress: Told = nobody,
     ) -> FloatArray:
         """Return the shares (G, S) of the moved residuals that groups of effects explain.
 
@@ -251,13 +244,12 @@ class _Linear:
             [[numbers[name] for name in group] for group in groups],
         )
 
-    def _lots(
-        self, lots: Sequence[Sequence[str]], progress: Callable[[str], None]
-    ) -> Iterator[list[FloatArray]]:
+    def _lots(self, lots: Sequence[Sequence[str]], progress: Told) -> Iterator[list[FloatArray]]:
         """Yield the weighted columns (P, c, N) of each set, lot by lot."""
         for number, names in enumerate(lots):
             if number:
                 progress(f'harmonics of {Parameter(names[0]).owner}')
+                progress(number / len(lots))
             yield [each[:-1] for each in self._rows(names)]
 
     def _of(self, names: Sequence[str]) -> list[int]:
@@ -267,28 +259,19 @@ class _Linear:
             added = stacked(self._rows(missing)).T[:-1]
             self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
             self._columns = np.concatenate([self._columns, added])
-            self._products = [
-                self._wider(parts, folds, added)
-                for parts, folds in zip(self._products, self._folds, strict=True)
-            ]
+            size, count = len(self._columns), len(added)
+            masked = (self._inside[:, np.newaxis] * added).reshape(-1, added.shape[1])
+            new = (masked @ self._columns.T).reshape(-1, count, size)
+            known, self._products = self._products, np.zeros((len(new), size, size))
+            self._products[:, :-count, :-count] = known
+            self._products[:, :, -count:] = np.swapaxes(new, 1, 2)
+            self._products[:, -count:] = new
         return [self._number[name] for name in names]
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
         """Return weighted Jacobian and residual (P + 1, c, N) of each set."""
         chain = self._chain.with_effects([name for name in names if name not in self._names])
         return self._system.rows_of(chain, names)
-
-    def _wider(self, parts: FloatArray, folds: NDArray[np.intp], added: FloatArray) -> FloatArray:
-        """Return the products (F, C, C) by fold, those of the last columns (K, R) added."""
-        inside = np.arange(self._problem.folds)[:, np.newaxis, np.newaxis] == folds
-        size, count = len(self._columns), len(added)
-        masked = (inside * added).reshape(-1, added.shape[1])
-        new = np.swapaxes((masked @ self._columns.T).reshape(-1, count, size), 1, 2)
-        found = np.zeros((len(new), size, size))
-        found[:, :-count, :-count] = parts
-        found[:, :, -count:] = new
-        found[:, -count:] = np.swapaxes(new, 1, 2)
-        return found
 
     def _left_out(self, chosen: Sequence[str], dealing: int) -> FloatArray:
         """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
@@ -298,7 +281,8 @@ class _Linear:
             return self._errors[key]
         extra = np.column_stack(self._extra(chosen))
         ends = [*which, self._number['']]
-        parts = self._products[dealing][:, ends][:, :, ends]
+        folds = self._problem.folds
+        parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
         rest = parts.sum(axis=0) + _square(extra)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))  # a fold may hold all of it
         weights = np.zeros((len(parts), len(self._columns)))
@@ -307,8 +291,8 @@ class _Linear:
             scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
             factor = linalg.cho_factor(scaled)
             weights[fold, which] = scale * linalg.cho_solve(factor, scale * left[:, -1])
-        folds = self._folds[dealing][np.newaxis]
-        predicted = np.take_along_axis(weights @ self._columns, folds, axis=0)[0]
+        here = self._folds[dealing][np.newaxis]
+        predicted = np.take_along_axis(weights @ self._columns, here, axis=0)[0]
         pieces = np.split(self._residual - predicted, self._ends[:-1])
         sets = self._system.sets
         errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]

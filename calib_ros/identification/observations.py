@@ -184,9 +184,8 @@ class Observations(Shown):
             few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
             vars(chosen)[name] = few
         if 'configurations' in vars(self):  # takes longer to find than all the rest
-            _, vars(chosen)['configurations'] = np.unique(
-                self.configurations[mask], return_inverse=True
-            )
+            numbers = self.configurations[mask]
+            vars(chosen)['configurations'] = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
         return chosen
 
     def spread(self, most: int = SOME_POSES) -> Observations:

@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import CERTAIN, TELLING
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -312,7 +312,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
                 rows[:, : added.shape[1]] = added / np.sqrt(count)
             parts[part].append(rows)
         q = few.observations.joints[begins]
-        turned = [np.cos(q[:, circular]), np.sin(q[:, circular]), q[:, ~circular]]
+        turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
         places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
         times.append(numbers[begins] + ELSEWHERE * number)
         counts.append(count)

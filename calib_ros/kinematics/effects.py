@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cross
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cos_sin, cross
 
 if TYPE_CHECKING:
     from calib_ros.kinematics.chain import Chain
@@ -146,8 +146,8 @@ def basis(
         elif kind == 'coupling':
             phi[rows] = q[others.astype(int)]
         elif kind in WAVES:
-            wave = np.sin if kind == 'sin' else np.cos
-            phi[rows] = wave(others[:, np.newaxis] * q[joints])
+            cos, sin = cos_sin(others[:, np.newaxis] * q[joints])
+            phi[rows] = sin if kind == 'sin' else cos
         elif kind == 'backlash' and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):

@@ -81,6 +81,14 @@ def turned(x: float, y: float, z: float) -> FloatArray:
     )
 
 
+def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the cosines and sines of angles [rad], from the tangents of half of them."""
+    tangent = np.tan(0.5 * angles)
+    square = tangent * tangent
+    scale = 1.0 / (1.0 + square)
+    return (1.0 - square) * scale, (tangent + tangent) * scale
+
+
 def log_rotation(rotation: FloatArray) -> FloatArray:
     """Turn (..., 3, 3) rotation matrices into (..., 3) rotation vectors [rad]."""
     if not rotation.size:

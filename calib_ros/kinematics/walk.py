@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, cos_sin
 
 BLOCK = 1024
 """Samples that one operation runs over: their arrays stay in the caches (benchmarks/peers.py)."""
@@ -97,7 +97,7 @@ class Walk:
         """
         values = self.signs * q
         angles = self._theta + (values if self._all_turning else values * self._turns)
-        cos, sin = np.cos(angles), np.sin(angles)
+        cos, sin = cos_sin(angles)
         here, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
         here[:] = base[:3].T[..., np.newaxis]
         if self.standard:

@@ -165,7 +165,7 @@ FAULTS = [
       ('0.5,-0.5,0.5,', ',,,1', '0.5,,0.5,0.5')),
     *((each, r'cell\.csv has no') for each in
       ('', '\n', 'q1,q2,x,y,z\n', 'q1,q2,x,y,z\n\n\n')),
-    (b'\xff\xfe\x00\x80', r'cannot read .*cell\.csv'),
+    (b'\xff\xfe\x00\x80', r'cell\.csv is no text in UTF-8'),
     *((f'{FLAG}{each}\n', f"line 2: eye_in_hand must be 0 or 1, not '{each}'") for each in
       ('yes', 'True', '2')),
     (SESSIONS, r'cell\.csv holds several sessions, .*A, B'),
