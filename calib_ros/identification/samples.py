@@ -101,11 +101,15 @@ class Samples:
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         nothing = np.zeros((0, 0, 0))
         joints, velocity = self.moving(chain)
+        out = None
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
+            if start + BLOCK > self.count:
+                out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
-            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving)
+            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving, out)
+            out = shift, turn
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
