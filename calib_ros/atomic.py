@@ -27,32 +27,40 @@ def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> 
 
     One that is there already is refused unless `overwrite` is True.
     """
-    partial = path.with_name(f'.{path.name}.{secrets.token_hex(8)}.partial')
-    data = content.encode() if isinstance(content, str) else content
-    if path.exists() and not overwrite:
-        raise _exists(path)
+    write_together({path: content}, overwrite=overwrite)
+
+
+def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = False) -> None:
+    """Write files that belong together as `write_file` does, none before all are on the disk."""
+    name = f'{secrets.token_hex(8)}.partial'
+    partials = {path: path.with_name(f'.{path.name}.{name}') for path in contents}
+    for path in contents:
+        if path.exists() and not overwrite:
+            raise _exists(path)
     try:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-        with os.fdopen(os.open(partial, flags, 0o666), 'wb') as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        if overwrite:
-            partial.replace(path)
-        else:
-            _rename_new(partial, path)
+        for path, content in contents.items():
+            data = content.encode() if isinstance(content, str) else content
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+            with os.fdopen(os.open(partials[path], flags, 0o666), 'wb') as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+        for path, partial in partials.items():
+            if overwrite:
+                partial.replace(path)
+            else:
+                _rename_new(partial, path)
     except OSError as err:
-        err.filename = err.filename or str(path)
-        raise
+        raise OSError(err.errno, err.strerror, str(path)) from err
     finally:
-        partial.unlink(missing_ok=True)
+        for partial in partials.values():
+            partial.unlink(missing_ok=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
     """Write new files by name into a folder, which is made if there is none."""
     folder.mkdir(exist_ok=True)
-    for name, content in contents.items():
-        write_file(folder / name, content)
+    write_together({folder / name: content for name, content in contents.items()})
 
 
 @contextmanager
@@ -75,19 +83,30 @@ def whole_folder(
         _clean_up(place, new, old)
         _check_place(path, place, own, overwrite)
         try:
-            yield new
-            _sync(new)
-            if place.exists():
-                _carry_over(place, new, own or ())
-                place.rename(old)
-            new.rename(place)
-            _sync(place.parent, deep=False)
+            with _named(new, path):
+                yield new
+                _sync(new)
+                if place.exists():
+                    _carry_over(place, new, own or ())
+                    place.rename(old)
+                new.rename(place)
+                _sync(place.parent, deep=False)
         finally:
             _clean_up(place, new, old)
     finally:
         with suppress(OSError):  # it holds what could neither be put back nor removed
             work.rmdir()
         os.close(claim)
+
+
+@contextmanager
+def _named(new: Path, path: Path) -> Iterator[None]:
+    """Let errors of the system name the folder that was asked for, not the one to work in."""
+    try:
+        yield
+    except OSError as err:
+        name = str(err.filename or path).replace(str(new), str(path))
+        raise OSError(err.errno, err.strerror or str(err), name) from err
 
 
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:

@@ -28,8 +28,8 @@ def shortened(text: str, longest: int = LONGEST) -> str:
 _ADVICE = {
     errno.ENOSPC: 'the disk is full: make room, or write to another place',
     errno.EDQUOT: 'your share of the disk is full: make room, or write to another place',
-    errno.EROFS: 'it cannot be written to: choose another place',
-    errno.EACCES: 'you may not do that there: choose another place, or ask its owner',
+    errno.EROFS: 'this disk is read-only: choose another place',
+    errno.EACCES: 'permission denied: choose another place, or ask its owner',
     errno.EFBIG: 'the file would be too large for this disk: write to another place',
     errno.EMFILE: 'too many files are open: close programs, or raise the limit (ulimit -n)',
 }
@@ -79,6 +79,7 @@ class TooFewObservationsError(InputError):
         )
 
 
-def advice_on(err: OSError) -> str:
-    """Return in words what to do about an error of the system; empty where nobody can tell."""
-    return _ADVICE.get(err.errno or 0, '')
+def trouble(err: OSError) -> str:
+    """Return in words which file the system refused, why, and what to do where that is known."""
+    why = _ADVICE.get(err.errno or 0) or err.strerror or str(err)
+    return f'{err.filename}: {why}' if err.filename else why

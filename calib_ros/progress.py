@@ -1,15 +1,28 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a long piece of work is: told by stages, and ended between two of them."""
+"""How far a long piece of work is: told by stages and shares, and ended between two of them."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TypeAlias
 
 from calib_ros.errors import CalibrationError
+
+Told: TypeAlias = Callable[[str | float], None]
+"""Called with each stage that begins, in words, and with the share of all that is done."""
+
+
+def nobody(at: str | float) -> None:
+    """Tell nobody."""
+
+
+def share_of(told: Told, begin: float, end: float) -> Told:
+    """Return what tells of a part of the work, from one share of all of it to another."""
+    return lambda at: told(at if isinstance(at, str) else begin + at * (end - begin))
 
 
 class CancelledError(CalibrationError):
@@ -17,35 +30,50 @@ class CancelledError(CalibrationError):
 
 
 class Progress:
-    """What a piece of work on another thread is at; called with each stage that begins.
-
-    `what` says in a word what the work does.
-    """
+    """What a piece of work on another thread is at: a `Told`; `what` says what the work does."""
 
     def __init__(self, what: str) -> None:
         self._what = what
         self._lock = threading.Lock()
-        self._stage = ''
-        self._began: float | None = None
         self._cancelled = False
+        self._began: float | None = None
+        self._stage, self._ends = '', 0.0
+        self.share = 0.0
 
-    def __call__(self, stage: str) -> None:
-        """Note which stage begins."""
+    def __call__(self, at: str | float) -> None:
+        """Note the stage that begins, or the share that is done, which never falls."""
         with self._lock:
             self._refuse_cancelled()
-            self._stage = stage
+            if isinstance(at, str):
+                self._stage = at
+            elif self._began is not None and self.share < at:
+                now, self.share = time.monotonic(), min(at, 1.0)
+                self._ends = now + (now - self._began) * (1.0 / self.share - 1.0)
 
     def __str__(self) -> str:
         """Return in words what is done, and for how long; empty while nothing is."""
-        with self._lock:
-            if self._began is None:
-                return ''
-            return f'{self._what} for {time.monotonic() - self._began:.0f} s ({self._stage})'
+        return '' if self._began is None else f'{self.words}, {self.times}'
+
+    @property
+    def words(self) -> str:
+        """Return what the work is, and its stage."""
+        return f'{self._what} ({self._stage})' if self._stage else self._what
+
+    @property
+    def times(self) -> str:
+        """Return the time spent, and how much is left if that is told."""
+        now = time.monotonic()
+        words = f'{now - (self._began or now):.0f} s'
+        if 0 < (percent := round(100.0 * self.share)) < 100:
+            words += f', {percent} %'
+            words += f', {self._ends - now:.0f} s left' if self._ends > now + 0.5 else ''
+        return words
 
     def begin(self) -> None:
         """Note that the work is about to run."""
         with self._lock:
-            self._stage, self._began, self._cancelled = 'start', time.monotonic(), False
+            self._stage, self.share, self._cancelled = '', 0.0, False
+            self._began = time.monotonic()
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -65,8 +93,8 @@ class Progress:
             if self._began is None:
                 return False, f'nothing to cancel: not {self._what}'
             self._cancelled = True
-            return True, f'{self._what} ends after this stage ({self._stage})'
+            return True, f'{self.words} ends after this stage'
 
     def _refuse_cancelled(self) -> None:
         if self._cancelled:
-            raise CancelledError(f'cancelled after the stage "{self._stage}"')
+            raise CancelledError(f'cancelled: {self.words}')

@@ -90,6 +90,7 @@ class Settings:
     sigma_pixel: float = _setting(
         0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
     )
+    socket_distance: float = _setting(0.05, 'between the two sockets of a location [m]', 1e-6)
     max_gap: float = _setting(
         0.1, 'longest time between the two joint states that bracket a measurement [s]', 0.0
     )

@@ -56,7 +56,7 @@ def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: st
         with path.open('rb') as file:
             data = file.read(largest + 1)
     except OSError as err:
-        raise error(f'cannot read {what}{path}: {err}') from err
+        raise error(f'cannot read {what}{path}: {err.strerror or err}') from err
     if len(data) > largest:
         raise error(f'{what}{path} is larger than {largest // 10**6} MB: is it the right file?')
     return data
@@ -67,7 +67,7 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
     try:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as err:
-        raise error(f'cannot read {where}: {err}') from err
+        raise error(f'{where} is no text in UTF-8: is it the right file?') from err
 
 
 def csv_lines(text: str, where: str) -> io.StringIO:
@@ -103,7 +103,8 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     except CalibrationError:
         raise
     except Exception as err:  # explicit tags fail in many ways
-        raise error(f'{where} is not valid YAML: {" ".join(str(err).split())}') from err
+        words = ' '.join(str(err).split()).replace(' in "<unicode string>"', '')
+        raise error(f'{where} is not valid YAML: {words}') from err
     if len(documents) > 1:
         raise error(f'{where} must hold one YAML document, not {len(documents)}')
     return documents[0] if documents else None

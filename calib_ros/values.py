@@ -65,19 +65,6 @@ def parse_numbers(
     return np.array([parse_number(item, where, error) for item in value])
 
 
-def cell_number(text: str, where: str, largest: float = LARGEST) -> float:
-    """Return the number in a cell of a table."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(f'{where} must be a number, not {text!r}')
-    if abs(number) > largest:
-        raise InputError(f'{where} must be at most {largest:g}, not {number:g}')
-    return number
-
-
 def cell_integer(text: str, where: str) -> int:
     """Return the integer in a cell of a table; it has 64 bits at most."""
     number = int(text) if re.fullmatch(r'-?[0-9]{1,19}', text) else 2**63

@@ -95,8 +95,11 @@ def text_message(text='hello'):
     return TYPES['std_msgs/msg/String'](text)
 
 
-def record(path, events, storage='mcap', silent=()):
-    """Write (topic, message) in the order given; `silent` topics (topic, type) get none."""
+def record(path, events, storage='mcap', silent=(), behind=b''):
+    """Write (topic, message) in the order given; `silent` topics (topic, type) get none.
+
+    Some bytes may stand behind each message.
+    """
     with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         connections = {
             topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
@@ -106,7 +109,7 @@ def record(path, events, storage='mcap', silent=()):
         }
         for k, (topic, message) in enumerate(events):
             data = TYPESTORE.serialize_cdr(message, message.__msgtype__)
-            writer.write(connections[topic], k + 1, data)
+            writer.write(connections[topic], k + 1, bytes(data) + behind)
     return path
 
 

@@ -19,19 +19,9 @@ from calib_ros.kinematics.se3 import FloatArray
 class Visibility:
     """Where the measuring device sees the target.
 
-    Parameters
-    ----------
-    box : (2, 3), optional
-        Lower and upper corner [m] of the measurable region.
-    tracker : (3,), optional
-        Where the device stands [m].
-    axis : (3,)
-        Direction in the target's frame that must point to the device.
-    cone : float
-        Largest angle [rad] between that axis and the direction to the device.
-    world : bool
-        Whether box and tracker are given in the world; else they are in the arm's base frame.
-
+    `box` (2, 3) [m] has the corners of the measurable region, `tracker` (3,) [m] is where the
+    device stands, both in the `world` or else in the arm's base frame. The `axis` in the target's
+    frame points to the device within a `cone` [rad].
     """
 
     box: FloatArray | None = None

@@ -33,20 +33,10 @@ SLOPES = (0.5, 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What a chart of one robot shows.
+    """What a chart of one robot shows: nights of `alarms`, and the night `since` which, for each.
 
-    Attributes
-    ----------
-    scores : (N,)
-        How large each night's error is against those before, as a normal variable; NaN in the
-        first night and in the first after an alarm.
-    sums : (N, 2)
-        Of both charts, as shares of their heights: beyond 1 is an alarm.
-    alarms : tuple of int
-        Nights in which it is too large.
-    since : tuple of int
-        The night from which on it has been, for each alarm.
-
+    `scores` (N,) are errors against those before as normal variables, NaN in the first night and
+    in the first after an alarm; `sums` (N, 2) shares of the heights of both charts.
     """
 
     scores: FloatArray

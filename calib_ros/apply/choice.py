@@ -28,6 +28,7 @@ from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import CRITERIA, Criterion
 
 Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
@@ -41,6 +42,7 @@ def choose(
     criterion: Criterion = 'd',
     task: FloatArray | None = None,
     apart: float = STILL,
+    told: Told = nobody,
 ) -> NDArray[np.intp]:
     """Choose poses to measure among candidates (N, n) [rad or m].
 
@@ -54,10 +56,13 @@ def choose(
     score = _score(space, criterion, task)
     first = score if criterion == 'task' else _by_determinant
     pick = _Pick(space, apart)
+    told(f'{count} poses')
     for _ in range(count):
         pick.add(pick.best(first))
+    rounds = 1
     while pick.exchange(score):
-        pass
+        rounds += 1
+        told(f'{count} poses, exchange {rounds}')
     again = _Pick(space, apart)
     for _ in range(count):
         again.add(again.best(first, pick.chosen))

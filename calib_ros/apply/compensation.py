@@ -16,7 +16,7 @@ What cannot be corrected within the limits given is refused, sample by sample, w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -27,6 +27,7 @@ from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.following import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
@@ -127,12 +128,12 @@ def compensate(
     compensator: Compensator,
     joints: FloatArray,
     approach: FloatArray | None = None,
-    heard: Callable[[float], None] | None = None,
+    told: Told = nobody,
 ) -> Compensation:
     """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
 
     `approach` (N, n) holds the signs of the velocities before, for backlash;
-    `heard` is called with the share that is done.
+    `told` is called with the share that is done.
 
     Raises
     ------
@@ -150,7 +151,7 @@ def compensate(
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
-    solution = follower.solve(command, approach, heard=heard)
+    solution = follower.solve(command, approach, told=told)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))

@@ -22,8 +22,12 @@ from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import AIMS, Aim, Model
 from calib_ros.shown import Shown
+
+STEPS = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
+"""To the neighbours on a grid."""
 
 
 def task_of(poses: FloatArray) -> FloatArray:
@@ -35,21 +39,12 @@ def task_of(poses: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placements(Shown):
-    """Where a task's frame may be placed, and the error expected there.
+    """Where a task's frame may be placed, and the `errors` (M,) [m] expected there.
 
-    Attributes
-    ----------
-    positions : (M, 3)
-        Of the task's frame [m] in the arm's base frame.
-    turns : (M,)
-        Turn [rad] of the task's frame about the vertical axis of the base.
-    errors : (M,)
-        Expected error [m]; NaN where the arm does not reach all poses of the task.
-    joints : (M, K, n)
-        Joint values [rad or m] of the task's poses, where it is reached.
-    best, centre : int
-        The placement of least error, and the one nearest to the centre of all that are reached.
-
+    `positions` (M, 3) [m] are in the arm's base frame, `turns` (M,) [rad] about its vertical axis;
+    `joints` (M, K, n) [rad or m] are those of the task's poses. Errors are NaN where not all poses
+    are reached. `best` is the placement of least error, `centre` the one nearest to the centre of
+    all that are reached.
     """
 
     positions: FloatArray
@@ -71,6 +66,7 @@ def place(
     refinements: int = 4,
     starts: int = 6,
     drawn: int = 20_000,
+    told: Told = nobody,
 ) -> Placements:
     """Find the placement of a task with the least expected error, mean or worst of its poses.
 
@@ -80,12 +76,12 @@ def place(
     about the vertical, and is halved so many times about the best placement. The first pose is
     solved from so many `starts` out of random joint values `drawn`.
     """
-    search = _Search(arm, task, aim, model, starts, drawn)
+    search = _Search(arm, task, aim, model, starts, drawn, told)
     corners = search.within(region)
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
     angles = 2.0 * np.pi * np.arange(turns) / turns
     grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
-    errors, joints = search.errors(grid)
+    errors, joints = search.errors(grid, refinements * len(STEPS))
     reached = ~np.isnan(errors)
     if not reached.any():
         raise InputError(
@@ -95,10 +91,10 @@ def place(
     away = np.linalg.norm(grid[:, :3] - grid[reached, :3].mean(axis=0), axis=1)
     centre = int(np.where(reached, away, np.inf).argmin())
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
-    for _ in range(refinements):
+    for left in reversed(range(refinements)):
         step /= 2.0
         near = _around(grid[np.nanargmin(errors)], step, corners)
-        more = search.errors(near)
+        more = search.errors(near, left * len(STEPS))
         both = zip((grid, errors, joints), (near, *more), strict=True)
         grid, errors, joints = map(np.concatenate, both)
     return Placements(grid[:, :3], grid[:, 3], errors, joints, int(np.nanargmin(errors)), centre)
@@ -106,8 +102,7 @@ def place(
 
 def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:
     """Return the placements (26, 4) a step (3,) away from the best (4,), within corners (2, 3)."""
-    steps = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
-    places = np.clip(best[:3] + step * steps, corners[0], corners[1])
+    places = np.clip(best[:3] + step * STEPS, corners[0], corners[1])
     return np.column_stack([places, np.full(len(places), best[3])])
 
 
@@ -122,11 +117,12 @@ class _Search:
         model: Model,
         starts: int,
         drawn: int,
+        told: Told,
     ) -> None:
         if aim not in AIMS:
             raise UnknownNameError('aim', aim, AIMS)
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
-        self._starts = starts
+        self._starts, self._told, self._solved = starts, told, 0
         self._chain = arm.commanded_by(model)
         self._base = self._chain.frame('base').matrix
         self._known = self._chain.random_joints(drawn, np.random.default_rng(0))
@@ -145,12 +141,15 @@ class _Search:
             )
         return region
 
-    def errors(self, placements: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n)."""
+    def errors(self, placements: FloatArray, later: int) -> tuple[FloatArray, FloatArray]:
+        """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n).
+
+        So many placements are tried `later`.
+        """
         turns = placements[:, 3:] * [0.0, 0.0, 1.0]
         frames = se3.transform(se3.exp_rotation(turns), placements[:, :3])
         poses = frames[:, np.newaxis] @ self._task
-        joints, reached = self._follow(poses)
+        joints, reached = self._follow(poses, later)
         errors = np.full((len(placements), self._starts), np.nan)
         expected = self._arm.expected(joints[reached].reshape(-1, joints.shape[-1]), self._model)
         expected = expected.reshape(-1, len(self._task))
@@ -159,7 +158,7 @@ class _Search:
         index = np.arange(len(placements))
         return errors[index, best], joints[index, best]
 
-    def _follow(self, poses: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def _follow(self, poses: FloatArray, later: int) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return joint values (M, S, K, n) for poses (M, K, 4, 4), and which reach them."""
         count, length = poses.shape[:2]
         _, nearest = self._tree.query(_features(poses[:, 0]), self._starts)
@@ -173,6 +172,9 @@ class _Search:
             joints[placement, branch, k] = found.joints
             start[reached] = found.joints
             reached[placement, branch] = found.converged
+            self._solved += len(wanted)
+            left = np.count_nonzero(reached) * (length - k - 1) + later * self._starts * length
+            self._told(self._solved / max(self._solved + left, 1))
         return joints, reached
 
 

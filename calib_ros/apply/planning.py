@@ -16,24 +16,17 @@ from calib_ros.apply.design import Design, accuracy, predicted
 from calib_ros.errors import InputError
 from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import Criterion
 from calib_ros.shown import Shown, as_frame
 
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """The next pose to measure, and what it brings.
+    """The next pose to measure, joint values (n,) [rad or m], and what it brings.
 
-    Attributes
-    ----------
-    joints : (n,)
-        Joint values [rad or m].
-    now, then : float
-        Predicted RMS position error [m] at the task poses, without and with it; infinite while
-        parameters are not determined.
-    enough : bool
-        Whether the wanted error is reached already.
-
+    `now` and `then` are the RMS position errors [m] predicted at the task poses without and with
+    it, infinite while parameters are not determined; `enough` tells that it is as small as wanted.
     """
 
     joints: FloatArray
@@ -108,13 +101,14 @@ def plan(
     apart: float = STILL,
     velocities: FloatArray | None = None,
     draws: int = 25,
+    told: Told = nobody,
 ) -> Plan:
     """Plan a number of measurements, and compare them with so many random draws.
 
     `choose` and `visit_order` say what the other arguments mean.
     """
     excited = design.determined_by(candidates)
-    chosen = choose(excited, candidates, count, criterion, task, apart)
+    chosen = choose(excited, candidates, count, criterion, task, apart, told)
     joints = candidates[chosen]
     speeds = np.ones(joints.shape[1]) if velocities is None else velocities
     visit = visit_order(joints, speeds)
@@ -144,6 +138,7 @@ def poses_needed(
     wanted: float,
     criterion: Criterion = 'd',
     apart: float = STILL,
+    told: Told = nobody,
 ) -> int:
     """Return how many poses bring the RMS position error at task poses (T, n) to `wanted` [m]."""
     excited = design.determined_by(candidates)
@@ -156,14 +151,14 @@ def poses_needed(
     count = len(excited.names)  # poses determine several parameters each
     while True:
         count = min(count, len(candidates))
-        chosen = choose(excited, candidates, count, criterion, task, apart)
+        chosen = choose(excited, candidates, count, criterion, task, apart, told)
         reached = np.flatnonzero(accuracy(excited, candidates[chosen], task) <= wanted)
         if reached.size:
             break
         count *= 2
     count = int(reached[0]) + 1
     while count > 1:  # the first of many are not quite the best of few
-        fewer = choose(excited, candidates, count - 1, criterion, task, apart)
+        fewer = choose(excited, candidates, count - 1, criterion, task, apart, told)
         if accuracy(excited, candidates[fewer], task)[-1] > wanted:
             break
         count -= 1
@@ -194,5 +189,5 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
             'further and in more combinations, or fix these parameters. The figures leave out '
             'what these bring, and hold only where the joints move as in the candidates'
         )
-    lines.append('from the noise of the measurement alone; what the model lacks comes on top')
+    lines.append('from measurement noise alone; errors of the model come on top')
     return '\n'.join(lines)

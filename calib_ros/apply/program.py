@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,7 @@ from calib_ros.apply.compensation import (
 )
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown
 
 NUDGE = HALF_THE_DIGITS**0.25
@@ -53,12 +54,12 @@ class Program(Shown):
 
 
 def compensate_program(
-    compensator: Compensator, program: Program, heard: Callable[[float], None] | None = None
+    compensator: Compensator, program: Program, told: Told = nobody
 ) -> tuple[Program, Compensation]:
     """Return a program with corrected joint values, and what became of each point.
 
     Velocities and accelerations follow the corrected path; times stay. Joints that are not of the
-    arm stay as they are. Refused points are NaN; `heard` is called with the share that is done.
+    arm stay as they are. Refused points are NaN; `told` is called with the share that is done.
 
     Raises
     ------
@@ -69,7 +70,7 @@ def compensate_program(
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]
     approach = approaches(positions) if program.approach is None else program.approach
-    result = compensate(compensator, positions, approach, heard)
+    result = compensate(compensator, positions, approach, told)
     if program.velocities is None:
         return replace(program, positions=_put(program.positions, columns, result.joints)), result
     given = program.accelerations

@@ -47,6 +47,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
@@ -156,6 +157,7 @@ def verify(
     new_base: bool = False,
     commanded: FloatArray | None = None,
     new_tool: bool = False,
+    told: Told = nobody,
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
@@ -172,6 +174,8 @@ def verify(
     new_base, new_tool : bool
         The measuring device stands elsewhere than for the calibration; another target is on the
         flange, or the same was mounted anew. Their frames are fitted, which costs freedom (LOST).
+    told : Told
+        Of the share that is done.
     commanded : (M, n), optional
         Joint values [rad or m] of the program before its correction: the nominal arm means there
         what is wanted. The nearest belongs to a measurement.
@@ -186,6 +190,7 @@ def verify(
     _check(arm.chain, sets, tolerance, confidence)
     fitted = ('base',) * new_base + ('tool',) * new_tool
     comparison, left = _compared(arm, sets, commanded, fitted)
+    told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
     lost = sum(LOST[frame] for frame in fitted)
@@ -361,8 +366,8 @@ def remarks(found: Verification) -> list[str]:
         lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
     if not found.by_program:
         lines.append(
-            'this is about the calibration: whether its correction arrives at the arm shows only '
-            'with the program as it was before (--commanded)'
+            'this judges the calibration: give the program before its correction (--commanded) '
+            'to see whether the correction reaches the arm'
         )
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'

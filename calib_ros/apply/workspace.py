@@ -17,22 +17,12 @@ from calib_ros.shown import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey(Shown):
-    """Errors at configurations all over the workspace.
+    """Errors at `joints` (N, n) [rad or m] all over the workspace.
 
-    Attributes
-    ----------
-    joints : (N, n)
-        Joint values [rad or m].
-    positions : (N, 3)
-        Of the target [m] in the arm's base frame.
-    removed, turned : (N,)
-        What the calibration removes: distance [m] and angle [rad].
-    sigma : (N,)
-        Standard deviation [m] of the position by the uncertainty of the parameters; NaN if not
-        known.
-    remaining : (N,)
-        Error [m] that is expected to remain: sigma and the residual RMS; NaN if not known.
-
+    `positions` (N, 3) [m] are those of the target in the arm's base frame. The calibration removes
+    `removed` (N,) [m] and `turned` (N,) [rad]; `sigma` (N,) [m] is the standard deviation of the
+    position by the uncertainty of the parameters, and `remaining` (N,) [m] what is expected to
+    remain by it and the residuals, both NaN if not known.
     """
 
     joints: FloatArray

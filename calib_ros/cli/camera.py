@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib_ros.atomic import write_file
+from calib_ros.atomic import write_file, write_together
 from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
@@ -43,9 +43,9 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     words = f'{board.type} {board.columns} x {board.rows}, {board.dictionary}; must measure '
     words += f'{width:.2f} x {height:.2f} mm: print in true size (100 %)'
     described = options.out.with_suffix('.yaml')
-    common.refuse_existing(options, described)
-    write_file(options.out, board_pdf(np.array(rows), board.size, words), overwrite=options.force)
-    write_file(described, dump_yaml(content), overwrite=options.force)
+    common.refuse_existing(options, options.out, described)
+    drawn = {options.out: board_pdf(np.array(rows), board.size, words)}
+    write_together({**drawn, described: dump_yaml(content)}, overwrite=options.force)
     printed = f'{width:.2f} x {height:.2f} mm'
     screen.say(f'wrote {options.out} and {described}: {printed}; measure the print')
     return 0
@@ -74,9 +74,11 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
     if folder and not paths and not (options.images / 'metadata.yaml').exists():
         raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
     for k, path in enumerate(paths):
-        work(path.name, k / len(paths))
+        work(path.name)
+        work(k / len(paths))
         yield path.name, read_image(path)
     if paths:
         return
-    for stamp, message in pictures(options.images, options.topic):
+    for k, (stamp, message) in enumerate(pictures(options.images, options.topic), 1):
+        work(f'image {k}')
         yield str(stamp), image_of(message)

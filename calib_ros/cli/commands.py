@@ -141,7 +141,6 @@ def _add_identify(parser: argparse.ArgumentParser) -> None:
         group,
         float,
         ('--largest-loss', 'SHARE', EXCEPTION, loss),
-        ('--socket-distance', 'M', None, 'between two sockets of a place, 0.05 if not given'),
         ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
     )
     group = parser.add_argument_group('what to write')
@@ -187,12 +186,8 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
 def _add_compare(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('what to compare')
     for name, text in (('first', 'the earlier one'), ('second', 'the later one')):
-        group.add_argument(
-            name,
-            type=Path,
-            metavar=name.upper(),
-            help=f'{text}: calibration.yaml, or the folder of identify --out',
-        )
+        text += ': calibration.yaml, or the folder of identify --out'
+        group.add_argument(name, type=Path, metavar=name.upper(), help=text)
     group.add_argument('--json', action='store_true', help='print the difference as JSON')
 
 
@@ -374,7 +369,7 @@ COMMANDS = {
         'workspace._run',
         (
             'workspace result/ --chain ur10e --out map/',
-            'workspace result/ --chain ur10e --task task.csv --out map/ --aim max',
+            'workspace result/ --chain ur10e --task task.csv --out map/ --aim worst',
         ),
     ),
     'bag2csv': Command(

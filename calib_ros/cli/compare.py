@@ -7,14 +7,14 @@ from __future__ import annotations
 import argparse
 import json
 
+from calib_ros.cli.given import calibration_of
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.cli.screen import Screen
-from calib_ros.identification.calibration import load_calibration
 from calib_ros.identification.difference import difference
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    pair = [load_calibration(path) for path in (options.first, options.second)]
+    pair = [calibration_of(path, 'compare') for path in (options.first, options.second)]
     with screen.work('comparing'):
         found = difference(*pair)
     if options.json:

@@ -11,11 +11,11 @@ from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.program import compensate_program
 from calib_ros.atomic import write_file
 from calib_ros.cli import options as common
+from calib_ros.cli.given import calibration_of
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.trajectories import read_program
-from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import Limits
 from calib_ros.shown import NAMED
@@ -29,14 +29,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             '--out is the program itself: keep it, a program compensated twice is wrong'
         )
     nominal = load_chain(options.chain)
-    arm = load_calibration(options.calibration, nominal)
+    arm = calibration_of(options.calibration, 'compensate', nominal)
     limits = {item.name: getattr(options, item.name) for item in fields(Limits)}
     compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
     with screen.work(f'correcting {options.program.name}') as work:
         source = read_program(options.program, nominal.joint_names)
-        corrected, result = compensate_program(
-            compensator, source.program, lambda share: work(share=share)
-        )
+        corrected, result = compensate_program(compensator, source.program, work)
     if result.refusals:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
         for refusal in result.refusals[:NAMED]:

@@ -8,18 +8,18 @@ import argparse
 from pathlib import Path
 
 from calib_ros.cli import options as common
+from calib_ros.cli.given import calibration_of
 from calib_ros.cli.screen import Screen
 from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
 from calib_ros.files.vendors import VENDOR_FILES, vendor_files
 from calib_ros.files.waypoints import read_joints
-from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.kinematics.urdf import corrected_urdf
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     nominal = load_chain(options.chain)
-    calibration = load_calibration(options.calibration, nominal)
+    calibration = calibration_of(options.calibration, 'export', nominal)
     chain, origin = calibration.chain, calibration.record
     measured = None
     if options.measured is not None:

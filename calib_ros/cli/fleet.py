@@ -5,7 +5,10 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from calib_ros.atomic import write_file
 from calib_ros.cli import options as common
@@ -27,7 +30,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)
-    with screen.work(f'{len(robots)} robots') as work:
+    with screen.work(f'{len(robots)} robots') as work, _tidied_up(screen):
         done = run(robots, history, cluster, options.out, work)
         work('comparing nights')
         found = standings(robots, history, done, options.years)
@@ -55,6 +58,24 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     if number['fine'] + number['unreadable'] < len(found):
         return common.NOT_ACCEPTED
     return common.INCOMPLETE if number['unreadable'] else 0
+
+
+@contextmanager
+def _tidied_up(screen: Screen) -> Iterator[None]:
+    """Let the first Ctrl-C end the work, and no second one what ends the workers then."""
+
+    def end(*_: object) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    except KeyboardInterrupt:
+        screen.warn('results so far are filed: the next run does the rest', 'note')
+        raise
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _run_history(options: argparse.Namespace, screen: Screen) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import LAYOUT, Contents, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -16,6 +17,7 @@ from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
+from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report.page import (
@@ -28,6 +30,8 @@ from calib_ros.report.page import (
     on_paper,
     render,
 )
+
+WRITTEN = 'give the folder that identify --out wrote'
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
@@ -51,6 +55,18 @@ def history_of(options: argparse.Namespace) -> History | None:
     if not options.serial:
         raise InputError('--history files by serial number: give --serial as well')
     return History(options.history)
+
+
+def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Calibration:
+    """Return the calibration in a file, or in the folder of an identification."""
+    refuse_others(path, command, 'chain', 'result')
+    if path.is_dir() and not calibration_file(path).exists():
+        if (path / 'result.json').exists():
+            raise InputError(f'the result in {path} was not accepted: there is no calibration')
+        raise InputError(f'{path} holds no calibration.yaml: {WRITTEN}')
+    if not path.exists():
+        raise InputError(f'there is no calibration at {path}: {WRITTEN}')
+    return load_calibration(path, nominal)
 
 
 def filing_of(

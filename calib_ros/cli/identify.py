@@ -33,7 +33,7 @@ from calib_ros.settings import Settings
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
 OF_TABLES = (
-    *('session', 'eye_in_hand', 'socket_distance', 'sigma_touch', 'preset', 'columns', 'joints'),
+    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints'),
     *(*common.LAYOUT, *DETECTIONS),
 )
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
@@ -55,8 +55,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         problem, measured = found.loaded.problem, options.csv or options.detections
         sets, measured = (*problem.sets, *problem.judging), measured or options.measured
         about = given.filing_of(options, problem.chain, sets, measured, options.largest_loss)
-        history.file(row_of(found.result, about, found.warnings))
-    for warning in (*found.warnings, *words.remarks(found.result)):
+        history.file(row_of(found.result, about, found.loaded.warnings))
+    for warning in (*found.loaded.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))
@@ -88,8 +88,8 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     if options.detections is not None:
         loaded = detected(options, chain, settings, screen)
     elif source == 'table':
-        given = {'sockets': options.socket_distance, 'sigma_touch': options.sigma_touch}
-        given = {name: value for name, value in given.items() if value is not None}
+        touch = options.sigma_touch
+        given = {} if touch is None else {'sigma_touch': touch}
         found = table(options, options.csv, chain, settings, screen, options.eye_in_hand)
         loaded = of_table(found, chain, settings, **given)
     else:

@@ -22,7 +22,7 @@ def replayed(
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has taken a bag."""
     with screen.work(f'reading {path.name}') as work:
-        return loading.replayed(path, chain, settings, lambda share: work(share=share))
+        return loading.replayed(path, chain, settings, work)
 
 
 def table(
@@ -35,7 +35,6 @@ def table(
 ) -> Table:
     """Return a table of measurements, laid out as the options say."""
     foreign = given.foreign_of(options, chain)
-    with screen.work(f'reading {path.name}'):
-        return loading.table(
-            path, chain, settings, common.sessions_of(options), eye_in_hand, foreign
-        )
+    sessions = common.sessions_of(options)
+    with screen.work(f'reading {path.name}') as work:
+        return loading.table(path, chain, settings, sessions, eye_in_hand, foreign, work)

@@ -23,7 +23,7 @@ SUFFIXES = {
     **dict.fromkeys(('.urdf', '.xacro', '.xml'), 'urdf'),
     **dict.fromkeys(('.yaml', '.yml'), 'chain'),
     **dict.fromkeys(('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp'), 'image'),
-    **dict.fromkeys(('.html', '.pdf', '.md'), 'report'),
+    **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
     **dict.fromkeys(('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat'), 'table'),
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
@@ -31,10 +31,11 @@ WORDS = {
     'bag': ('a bag', 'identify and verify take it, bag2csv makes a table of it'),
     'table': ('a table', 'identify and verify take it, csv2bag makes a bag of it'),
     'program': ('a program', 'compensate takes it'),
-    'chain': ('a YAML file', 'chain prints one of an arm, which commands take as --chain'),
+    'chain': ('a YAML file', 'an arm, for --chain, or a calibration, for --calibration'),
     'urdf': ('a URDF', 'commands take it as --chain'),
     'result': ('the result of identify', 'workspace takes it, others as --calibration'),
-    'image': ('an image', 'images takes the folder of it'),
+    'image': ('an image', 'images takes its folder'),
+    'images': ('a folder of images', 'images takes it'),
     'report': ('a report', 'open it in a browser or a reader'),
 }
 
@@ -44,7 +45,8 @@ def kind_of(path: Path) -> str:
     if path.is_dir():
         names = [each.name for each in path.iterdir()]
         found = [kind for name, kind in IN_FOLDERS if name in names]
-        found += [kind for kind in map(_by_suffix, names) if kind in ('bag', 'image')]
+        inside = {'bag': 'bag', 'image': 'images'}
+        found += [inside[kind] for kind in map(_by_suffix, names) if kind in inside]
         return found[0] if found else ''
     if path.is_file():
         with path.open('rb') as file:

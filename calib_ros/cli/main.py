@@ -23,7 +23,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 from calib_ros import __version__
 from calib_ros.cli.command import GROUPS, TEXTS
 from calib_ros.cli.screen import Screen, help_width
-from calib_ros.errors import CalibrationError, UnknownNameError, advice_on, shortened
+from calib_ros.errors import CalibrationError, UnknownNameError, shortened, trouble
 
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
@@ -38,20 +38,19 @@ WAY = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    options = _options(given)
     try:
+        options = _options(given)
         status: int = options.run(options, Screen(options.quiet))
         sys.stdout.flush()
     except BrokenPipeError:  # whoever read it has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13
     except KeyboardInterrupt:
-        return _failed('interrupted: nothing was written', 130)
+        return _failed('interrupted: no file is left half written', 130)
     except MemoryError:
         return _failed('there is not enough memory: give less data, or close other programs')
     except OSError as err:
-        advice = advice_on(err)
-        return _failed(f'{err}; {advice}' if advice else str(err))
+        return _failed(trouble(err))
     except CalibrationError as err:
         return _failed(str(err))
     return status

@@ -23,7 +23,7 @@ Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
 Contents: TypeAlias = dict[str, str | bytes]
 """Of files by name."""
 SETTINGS = {
-    'the fit': ('model', 'fixed', 'priors', 'loss', 'folds'),
+    'the fit': ('model', 'fixed', 'priors', 'loss', 'folds', 'socket_distance'),
     'how the device measures': ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'frame_id'),
     'what is not accepted': ('largest_length', 'largest_angle', 'largest_error'),
     'bags: what is read': ('joint_topics', 'sources', 'joint_names', 'delay'),
@@ -224,7 +224,7 @@ def add_previous(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group('an earlier calibration (docs/history.md)')
     add = group.add_argument
     text = 'bring this one up to date by a few poses, and say what has changed since'
-    add('--previous', metavar='CALIBRATION', help=text)
+    add('--previous', type=Path, metavar='CALIBRATION', help=text)
     text = 'by which lengths wander in a year; angles by twice as many mrad'
     add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
     add_moved(group)

@@ -15,7 +15,7 @@ from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
-from calib_ros.atomic import write_file
+from calib_ros.atomic import write_together
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -23,6 +23,7 @@ from calib_ros.files.waypoints import joints_csv, read_joints
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told
 from calib_ros.report.maps import plan_report
 
 
@@ -41,14 +42,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         options.world,
     )
     planned = _tests if options.iso9283 else _measurement
-    with screen.work('choosing poses'):
-        joints, words, plan = planned(options, design, visibility, rng)
+    with screen.work('choosing poses') as work:
+        joints, words, plan = planned(options, design, visibility, rng, work)
     screen.say(words)
     if chain.tool is None:
         x, y, z = ASSUMED_TOOL
-        screen.say(
-            f'the tool is unknown: its target is taken to be at {x} {y} {z} m from the flange'
-        )
+        screen.say(f'the tool is unknown: the target is assumed at {x} {y} {z} m from the flange')
     if options.out is not None:
         page = _page_beside(options.out)
         report = plan_report(
@@ -60,15 +59,18 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             options.accuracy,
         )
         pages = given.page_of(report, screen, page.name)
-        write_file(options.out, joints_csv(joints), overwrite=options.force)
-        for text in pages.values():
-            write_file(page, text, overwrite=options.force)
+        beside = {options.out.with_name(name): text for name, text in pages.items()}
+        write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
         screen.say(f'wrote {options.out}' + (f' and {page}' if pages else ''))
     return 0
 
 
 def _measurement(
-    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+    options: argparse.Namespace,
+    design: Design,
+    visibility: Visibility,
+    rng: np.random.Generator,
+    told: Told,
 ) -> tuple[FloatArray, str, Plan | None]:
     """Return the poses to measure in the order of visit, what they promise, and the plan."""
     size = len(design.chain.joints)
@@ -87,7 +89,7 @@ def _measurement(
         candidates = candidates[visibility.sees(design, candidates)]
         if not len(candidates):
             raise InputError(f'the target can be measured at no pose of {options.candidates}')
-    choice = {'criterion': options.criterion, 'apart': options.apart}
+    choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
     needed = None
     if options.accuracy is not None:
         wanted = 1e-3 * options.accuracy
@@ -100,7 +102,11 @@ def _measurement(
 
 
 def _tests(
-    options: argparse.Namespace, design: Design, visibility: Visibility, rng: np.random.Generator
+    options: argparse.Namespace,
+    design: Design,
+    visibility: Visibility,
+    rng: np.random.Generator,
+    told: Told,
 ) -> tuple[FloatArray, str, Plan | None]:
     """Return the test poses of ISO 9283, and what to do with them; there is no plan."""
     found = iso_9283_poses(design, rng, visibility)

@@ -9,9 +9,9 @@ import json
 from collections.abc import Callable
 
 from calib_ros.cli import options as common
+from calib_ros.cli.given import calibration_of
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
-from calib_ros.identification.calibration import load_calibration
 from calib_ros.identification.recalibration import Recalibration, recalibrate, years_since
 
 FILES = ('calibration.yaml', 'result.json')
@@ -33,7 +33,7 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
 
 def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recalibration:
     common.at_least(options, growth=0)
-    previous = load_calibration(options.previous, loaded.problem.chain)
+    previous = calibration_of(options.previous, 'identify --previous', loaded.problem.chain)
     for warning in loaded.warnings:
         screen.warn(warning)
     new = ('base',) * options.new_base + ('tool',) * options.new_tool

@@ -14,6 +14,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
+from calib_ros.progress import share_of
 from calib_ros.report import words
 from calib_ros.report.advice import advice
 from calib_ros.report.markdown import markdown
@@ -40,11 +41,6 @@ class Identified:
     loaded: Loaded
     result: Identification
     origin: Origin
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Return what was strange in the input."""
-        return self.loaded.warnings
 
 
 def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origin) -> Identified:
@@ -73,7 +69,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     for line in words.cameras_in_words(result):
         screen.bullet(line)
     if out is None:
-        screen.bullet('nothing is kept: --out FOLDER writes the calibration and its report')
+        screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
     else:
         screen.say(f'wrote {out}: open {out / "report.html"}')
 
@@ -109,7 +105,7 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
 def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
     """Return the content of result.json; `tolerance` is the wanted error [mm]."""
     content = words.as_document(found.result, found.loaded.samples)
-    content |= {'warnings': list(found.warnings), 'tolerance_mm': tolerance}
+    content |= {'warnings': list(found.loaded.warnings), 'tolerance_mm': tolerance}
     return content | {'origin': found.origin.document()}
 
 
@@ -128,17 +124,21 @@ def result_files(
     from calib_ros.report.plots import before_after_png
 
     loaded, result = found.loaded, found.result
-    with screen.work('writing the report'):
+    with screen.work('writing the report') as work:
+        work('residuals.csv, 1 of 3')
         poses = poses_of(loaded.problem, result, loaded.lines)
         contents: dict[str, str | bytes] = {
             'result.json': json.dumps(document(found, tolerance), indent=2) + '\n',
-            'residuals.csv': poses.table(),
-            'before_after.png': before_after_png(result),
+            'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),
             'settings.yaml': found.origin.settings,
         }
+        work('before_after.png, 2 of 3')
+        contents['before_after.png'] = before_after_png(result)
+        work('report.html, 3 of 3')
+        work(2 / 3)
         wanted = None if tolerance is None else 1e-3 * tolerance
         report = identification_report(
-            loaded.problem, result, poses, found.origin, found.warnings, wanted
+            loaded.problem, result, poses, found.origin, found.loaded.warnings, wanted
         )
         contents['report.md'] = markdown(report, loaded.samples)
         contents |= page_of(report, screen, pdf=pdf)

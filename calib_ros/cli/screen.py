@@ -13,10 +13,11 @@ import shutil
 import sys
 import textwrap
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
+
+from calib_ros.progress import Progress
 
 WIDTH = 80
 EVERY_S = 2.0
@@ -105,31 +106,13 @@ class Screen:
             watch.join()
 
 
-class Work:
-    """A piece of work; called with the stage that begins, or the share that is done, or both."""
+class Work(Progress):
+    """A piece of work that begins now, to be watched by another thread until it is done."""
 
     def __init__(self, what: str) -> None:
-        self.what, self.stage, self.share = what, '', 0.0
+        super().__init__(what)
         self.done = threading.Event()
-        self._began = time.monotonic()
-
-    def __call__(self, stage: str = '', share: float | None = None) -> None:
-        """Note what the work is at."""
-        self.stage = stage or self.stage
-        self.share = self.share if share is None else min(max(share, 0.0), 1.0)
-
-    def __str__(self) -> str:
-        """Return in words what is done."""
-        spent = time.monotonic() - self._began
-        words = f'{self.words()}, {spent:.0f} s'
-        if self.share > 0.0:
-            left = spent * (1.0 / self.share - 1.0)
-            words += f', {100.0 * self.share:.0f} %, {left:.0f} s left'
-        return words
-
-    def words(self) -> str:
-        """Return what the work is, and its stage."""
-        return _printable(f'{self.what} ({self.stage})' if self.stage else self.what)
+        self.begin()
 
     def watch(self) -> None:
         """Show that the work goes on until it is done."""
@@ -137,7 +120,7 @@ class Work:
         if console is None:
             pause = EVERY_S
             while not self.done.wait(pause):
-                print(f'calib_ros: {self}', file=sys.stderr, flush=True)
+                print(f'calib_ros: {_printable(str(self))}', file=sys.stderr, flush=True)
                 pause = min(2.0 * pause, 16.0 * EVERY_S)
         elif not self.done.wait(FIRST_S):
             self._as_bar(console)
@@ -154,10 +137,12 @@ class Work:
         with progress.Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task('', total=None, told='')
             while True:
-                told = str(self)[len(self.words()) + 2 :]
-                total = 1.0 if self.share else None
                 bar.update(
-                    task, description=self.words(), total=total, completed=self.share, told=told
+                    task,
+                    description=_printable(self.words),
+                    total=1.0 if 0.0 < self.share < 1.0 else None,
+                    completed=self.share,
+                    told=self.times,
                 )
                 if self.done.wait(FIRST_S / 5):
                     break

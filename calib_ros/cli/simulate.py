@@ -24,8 +24,7 @@ from calib_ros.settings import Settings
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    with screen.work('simulating'):
-        truth = _write_simulation(load_chain(options.chain), options, options.bag)
+    truth = _write_simulation(load_chain(options.chain), options, options.bag, screen)
     screen.say(f'wrote {options.bag} and the true chain {truth}')
     return 0
 
@@ -37,8 +36,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         folder.mkdir()
         bag = folder / 'bag'
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
-        with screen.work('simulating'):
-            truth = _write_simulation(chain, options, bag)
+        truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading that recording as one of a real cell')
         loaded = of_bag(*replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors from it')
@@ -54,7 +52,9 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
     return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 
-def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> Path:
+def _write_simulation(
+    chain: Chain, options: argparse.Namespace, bag: Path, screen: Screen
+) -> Path:
     """Write the bag of a simulated cell, and the true chain beside it; return the latter."""
     common.at_least(options, poses=1, seed=0)
     rng, cell = np.random.default_rng(options.seed), Cell()
@@ -67,5 +67,7 @@ def _write_simulation(chain: Chain, options: argparse.Namespace, bag: Path) -> P
         chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
     )
     truth = bag.with_name(f'{bag.name}_truth.yaml')
-    write_bag(bag, recording, options.storage, {truth: dump_chain(true, {'source': 'simulation'})})
+    beside = {truth: dump_chain(true, {'source': 'simulation'})}
+    with screen.work('simulating') as work:
+        write_bag(bag, recording, options.storage, beside, work)
     return truth

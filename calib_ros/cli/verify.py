@@ -15,10 +15,11 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.rows import verified
 from calib_ros.files.waypoints import read_joints
-from calib_ros.identification.calibration import calibration_file, load_calibration
+from calib_ros.identification.calibration import calibration_file
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
+from calib_ros.progress import share_of
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verified import STATES, verification_report
 from calib_ros.sampling.sample import collect
@@ -38,12 +39,12 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
     history = given.history_of(options)
     nominal = load_chain(options.chain)
-    arm = load_calibration(options.calibration, nominal)
+    arm = given.calibration_of(options.calibration, 'verify', nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
     commanded = None
     if options.commanded is not None:
         commanded = read_joints(options.commanded, nominal)
-    with screen.work('judging'):
+    with screen.work('judging') as work:
         found = verify(
             arm,
             sets,
@@ -52,6 +53,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
             options.new_base,
             commanded,
             options.new_tool,
+            work,
         )
     if history is not None:
         judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
@@ -65,12 +67,12 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     if options.out is None:
         return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))
-    with screen.work('writing the report'):
+    with screen.work('writing the report') as work:
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
         report = verification_report(
             arm.chain, found, poses, given.origin_of(options, read), warnings
         )
-        contents['residuals.csv'] = poses.table()
+        contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['verification.txt'] = f'{in_words(found)}\n'
         contents |= given.page_of(report, screen, pdf=options.pdf)
     return status

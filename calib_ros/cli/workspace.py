@@ -18,7 +18,6 @@ from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import (
     Calibration,
     calibration_file,
-    load_calibration,
 )
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -41,7 +40,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
     """Map, place, print what comes out, and return the files of it."""
     from calib_ros.report import plots
 
-    arm = load_calibration(options.result, load_chain(options.chain))
+    arm = given.calibration_of(options.result, 'workspace', load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
     with screen.work('mapping errors over the workspace'):
@@ -56,10 +55,9 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
     found = None
     if task is not None:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
-        with screen.work('placing the task'):
-            found = placement.place(
-                arm, task, options.aim, options.model, region, options.cells, options.turns
-            )
+        with screen.work('placing the task') as work:
+            where = (region, options.cells, options.turns)
+            found = placement.place(arm, task, options.aim, options.model, *where, told=work)
         screen.say(placement.in_words(found, options.aim, options.model))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from calib_ros.files.salvage import (
 )
 from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.progress import Told, nobody
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.intake import BATCH, Deserialise, Stream, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
@@ -91,9 +92,7 @@ def _share(expected: int | None, found: int) -> float:
     return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
-def replay(
-    path: Path, session: CalibrationSession, told: Callable[[float], None] = lambda share: None
-) -> Replayed:
+def replay(path: Path, session: CalibrationSession, told: Told = nobody) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
     Parameters
@@ -102,8 +101,8 @@ def replay(
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
         Takes the messages; its settings name topics where the types leave a choice.
-    told : callable, optional
-        Called with the share of the messages that are read.
+    told : Told
+        Of the share of the messages that are read.
 
     """
     if not (path.is_dir() or path.is_file()):
@@ -113,9 +112,7 @@ def replay(
         return _replay(path, folder, session, told)
 
 
-def _replay(
-    path: Path, folder: Path, session: CalibrationSession, told: Callable[[float], None]
-) -> Replayed:
+def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -> Replayed:
     """Feed the files in a folder, which are those of a bag or were unpacked from it."""
     rosbag2()  # damaged or not, nothing is read without
     try:
@@ -272,7 +269,7 @@ def typestore() -> Any:
 def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     """Return what makes messages of bytes, also of types that a bag itself defines."""
     if not defined:
-        return lambda data, kind: typestore().deserialize_cdr(data, kind)
+        return lambda data, kind: _decoded(typestore(), data, kind)
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
@@ -286,7 +283,21 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
             store.register({k: each for k, each in found.items() if k not in store.fielddefs})
         except Exception as err:  # a damaged definition fails in many ways
             raise InputError(f'the bag defines {kind} by what cannot be read: {err}') from err
-    return store.deserialize_cdr
+    return partial(_decoded, store)
+
+
+def _decoded(store: Any, data: bytes, kind: str) -> Any:
+    """Return a message; up to 12 bytes may stand behind it, of which the library takes 3.
+
+    rclpy leaves as many behind lists that are empty where it serialises for a writer of bags.
+    """
+    try:
+        return store.deserialize_cdr(data, kind)
+    except Exception:  # damaged bytes fail in many ways
+        for behind in (4, 8, 12):
+            with suppress(Exception):
+                return store.deserialize_cdr(data[:-behind], kind)
+        raise
 
 
 def _is_message(stream: Stream, data: object) -> bool:

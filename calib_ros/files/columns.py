@@ -15,7 +15,7 @@ from calib_ros.errors import InputError
 from calib_ros.escapes import from_cell
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
-from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, cell_number
+from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, parse_number
 
 Lines = NDArray[np.intp]
 Codes = tuple[NDArray[np.intp], list[str]]
@@ -56,7 +56,7 @@ class Columns:
                     break
         if first is not None:
             row, k, text = first
-            cell_number(text, self.where(row, (called or names)[k]))
+            parse_number(text, self.where(row, (called or names)[k]), InputError)
         return parsed
 
     def block(
@@ -76,11 +76,12 @@ class Columns:
             nothing = np.isnan(found)
             lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
-                cell_number('', self.where(row, names[int(nothing[row].argmax())]))
+                where = self.where(row, names[int(nothing[row].argmax())])
+                parse_number('', where, InputError)
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
-            cell_number(repr(found[row, k]), self.where(row, names[k]), largest)
+            parse_number(float(found[row, k]), self.where(row, names[k]), InputError, largest)
         return found
 
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
@@ -164,9 +165,18 @@ class MadeColumns(Columns):
         return ['' if value != value else repr(value) for value in self.values[name].tolist()]
 
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
-        if set(names) & set(self.words):
-            return None
-        return np.column_stack([self.values[name] for name in names])
+        found = np.zeros((len(self.lines), len(names)))
+        for k, name in enumerate(names):
+            words = self.words.get(name)
+            try:
+                found[:, k] = (
+                    self.values[name] if words is None else [float(w or 'nan') for w in words]
+                )
+            except ValueError:
+                return None
+            if not (np.isfinite(found[:, k]) | self.blank(name)).all():
+                return None
+        return found
 
 
 def numbered(texts: Sequence[str]) -> Codes:

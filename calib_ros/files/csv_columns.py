@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
 
 IRREGULAR = (b'"', b'\r', b'\0')
@@ -140,11 +141,11 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
     return found
 
 
-def columns_of(path: Path, data: bytes) -> Columns:
+def columns_of(path: Path, data: bytes, told: Told = nobody) -> Columns:
     """Return the columns of the content of a CSV; refuse what is no table, or is too large."""
     if not data.isascii():
         data = decoded(data, str(path), InputError).encode()
-    return regular(path, data) or _irregular(path, data.decode())
+    return regular(path, data) or _irregular(path, data.decode(), told)
 
 
 def regular(
@@ -195,14 +196,16 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
     return ends
 
 
-def _irregular(path: Path, text: str) -> MadeColumns:
+def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
     """Return the columns of a text with quotes, or with rows that end early."""
     reader = csv.reader(csv_lines(text, str(path)), strict=True)
     header: list[str] = []
     rows: list[list[str]] = []
     lines: list[int] = []
+    most = text.count('\n') + 1
     try:
         for row in reader:
+            told(min(reader.line_num / most, 1.0))
             if not (row and header):
                 header = header or row
                 if len(header) > MOST_ENTRIES:

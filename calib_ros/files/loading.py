@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
+from calib_ros.progress import Told, nobody
 from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -42,9 +43,7 @@ class Loaded:
     instead: bool = False
     owners: Mapping[str, Owner] = field(default_factory=dict)
 
-    def identified(
-        self, model: str, told: Callable[[str], None] = lambda stage: None
-    ) -> Identification:
+    def identified(self, model: str, told: Told = nobody) -> Identification:
         """Identify, and refuse the result where too much of the input is lost."""
         try:
             result = identify_model(self.problem, model, told)
@@ -60,7 +59,7 @@ def replayed(
     path: Path,
     chain: Chain,
     settings: Settings,
-    told: Callable[[float], None] = lambda share: None,
+    told: Told = nobody,
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has taken a bag."""
     session = CalibrationSession(chain, settings)
@@ -83,15 +82,16 @@ def table(
     sessions: Sequence[str] = (),
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
+    told: Told = nobody,
 ) -> Table:
     """Return a table of measurements of a chain."""
     sigmas = (settings.sigma_position, settings.sigma_orientation)
-    return read_table(path, len(chain.joints), sessions, sigmas, eye_in_hand, foreign)
+    return read_table(path, len(chain.joints), sessions, sigmas, eye_in_hand, foreign, told)
 
 
 def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return what is to be fitted of a table; what is `given` goes to the problem."""
-    problem = found.problem(chain, **given, **settings.for_problem())
+    problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
     samples = {
         'samples': sum(map(len, found.fitted)),
         'held_out': sum(map(len, found.held_out)),

@@ -38,29 +38,11 @@ POSE, DISTANCE, SOCKET, PLANE = range(4)
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """N rows with what was measured, NaN where nothing was.
+    """N rows with what was measured, NaN where nothing was; columns are those of a `Sample`.
 
-    Attributes
-    ----------
-    path, lines : Path, (N,)
-        The file, and the line of each row.
-    stamps_ns : (N,)
-    joints, approach, velocity, acceleration : (N, n)
-        Joint values [rad or m], signs of their last moves, rates; the latter optional.
-    kind : (N,)
-        POSE, DISTANCE, SOCKET or PLANE.
-    position, rotation : (N, 3), (N, 3, 3)
-        Of poses [m]; no turn where none was measured, which `oriented` (N,) tells.
-    distance : (N,)
-        In metres; 0 of touched planes.
-    covariance : (N, 6, 6), optional
-        Of poses [m, rad].
-    session, device, target, frame_id, view : Codes
-    eye_in_hand, test, removed : (N,)
-        Flags.
-    delay, count, spread : (N,)
-        As a `Sample` has them.
-
+    `lines` (N,) are those of the file at `path`. `kind` (N,) is POSE, DISTANCE, SOCKET or PLANE,
+    which has the distance 0. Poses whose rotation was not measured, by `oriented` (N,), have no
+    turn. What no row has may be None.
     """
 
     path: Path

@@ -18,6 +18,7 @@ from calib_ros.atomic import whole_folder, write_file
 from calib_ros.files.bags import rosbag2, typestore
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray, to_quat
+from calib_ros.progress import Told, nobody
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import VALIDATION
 
@@ -56,6 +57,7 @@ def write_bag(
     recording: Recording,
     storage: str = 'mcap',
     beside: Mapping[Path, str] | None = None,
+    told: Told = nobody,
 ) -> None:
     """Write a recording as a rosbag2 folder, in the order of the stamps, as a whole or not at all.
 
@@ -64,17 +66,15 @@ def write_bag(
     """
     with whole_folder(path) as folder:
         try:
-            _write_bag(folder, recording, storage)
+            _write_bag(folder, recording, storage, told)
         except (OSError, sqlite3.Error) as err:
-            failed = OSError(f'cannot write {path}: {err}')
             full = errno.ENOSPC if 'full' in str(err) else None
-            failed.errno = getattr(err, 'errno', None) or full
-            raise failed from err
+            raise OSError(getattr(err, 'errno', None) or full, str(err), str(path)) from err
         for file, text in (beside or {}).items():
             write_file(file, text, overwrite=True)
 
 
-def _write_bag(path: Path, recording: Recording, storage: str) -> None:
+def _write_bag(path: Path, recording: Recording, storage: str, told: Told) -> None:
     library = rosbag2()
     store = typestore()
     types = store.types
@@ -107,7 +107,8 @@ def _write_bag(path: Path, recording: Recording, storage: str) -> None:
             writer.add_connection(f'/{prefix}{noun}', kind, typestore=store)
             for prefix in ('measured_', VALIDATION)[: 1 + int(recording.held_out.any())]
         ]
-        for k in np.argsort(stamps, kind='stable').tolist():
+        for done, k in enumerate(np.argsort(stamps, kind='stable').tolist()):
+            told(done / len(stamps))
             stamp_ns = int(stamps[k])
             if k < len(recording.joints):
                 values = np.ascontiguousarray(recording.joints[k])

@@ -42,8 +42,10 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.sampling.problems import with_lenses
-from calib_ros.sampling.sample import SOCKETS, Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, csv_text, read_bytes
 
@@ -67,7 +69,9 @@ class Table(Shown):
     by_line: bool = False
     lenses: Mapping[str, Lens] = field(default_factory=dict)
 
-    def problem(self, chain: Chain, sockets: float = SOCKETS, **more: Any) -> Problem:
+    def problem(
+        self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any
+    ) -> Problem:
         """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
         return Problem(
             with_lenses(chain, self.lenses),
@@ -87,6 +91,7 @@ def read_table(
     sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
+    told: Told = nobody,
 ) -> Table:
     """Read a CSV, or a table in any other layout.
 
@@ -104,6 +109,8 @@ def read_table(
         All poses are those of a fixed target in a camera on the flange.
     foreign : Foreign, optional
         How to read a table that others have written.
+    told : Told
+        Of the share that is read.
 
     Raises
     ------
@@ -116,7 +123,7 @@ def read_table(
         made, warnings = foreign.convert(path)
         return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
     data, warnings = _read(path, columns(joints))
-    return table_of(columns_of(path, data), joints, sessions, sigmas, eye_in_hand, warnings)
+    return table_of(columns_of(path, data, told), joints, sessions, sigmas, eye_in_hand, warnings)
 
 
 def table_of(

@@ -14,7 +14,7 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.sampling.sample import View
-from calib_ros.values import cell_number
+from calib_ros.values import parse_number
 
 
 def view_cell(view: View) -> str:
@@ -27,7 +27,8 @@ def view_cell(view: View) -> str:
 def view_of(text: str, where: str) -> View:
     """Return the view in a cell; `where` names it in an error."""
     first, *rows = [
-        [cell_number(cell, where) for cell in part.split(' ')] for part in text.split(';')
+        [parse_number(cell, where, InputError) for cell in part.split(' ')]
+        for part in text.split(';')
     ]
     if len(first) != len(LENS_KINDS) + 1 or not rows or any(len(row) != 5 for row in rows):
         raise InputError(f'{where} must be a lens of 10 numbers, then x y z u v of each corner')

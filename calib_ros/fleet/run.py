@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 from urllib.parse import quote
 
 import calib_ros
@@ -26,6 +26,7 @@ from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
+from calib_ros.progress import Told, nobody
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
 SPAN = 2.0
@@ -43,7 +44,6 @@ DASK = {
 """Settings of dask: it watches itself less, which takes more than its work, and workers keep what
 memory [bytes] they need again: to get it anew costs a third of a large task's time."""
 NEVER = datetime.fromtimestamp(0, timezone.utc)
-Told: TypeAlias = Callable[[str, float], None]
 
 
 class LostError(CalibrationError):
@@ -80,13 +80,13 @@ def run(
     history: History,
     cluster: Cluster,
     out: Path | None = None,
-    told: Told = lambda words, share: None,
+    told: Told = nobody,
 ) -> Run:
     """Identify all that is new, file it, and write the page of each robot's newest result.
 
     The cluster is not asked for where nothing is to be done. `out` is the folder of the report;
-    without it there are no pages. `told` is called with words, and the share that is done. When
-    the cluster cannot be reached any more a LostError is raised.
+    without it there are no pages. When the cluster cannot be reached any more a LostError is
+    raised.
     """
     found = Run()
     with ExitStack() as stack:
@@ -97,10 +97,11 @@ def run(
                 continue
             if client is None:
                 client = stack.enter_context(_client(cluster))
-                told(f'dashboard: {client.dashboard_link}', 0.0)
+                told(f'dashboard: {client.dashboard_link}')
             for number, (task, outcome) in enumerate(_done(client, tasks), 1):
                 _keep(task, outcome, history, out, found)
-                told(f'{number} of {len(tasks)}: {task.robot.serial}', number / len(tasks))
+                told(f'{number} of {len(tasks)}: {task.robot.serial}')
+                told(number / len(tasks))
     return found
 
 

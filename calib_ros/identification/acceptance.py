@@ -32,6 +32,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
 from calib_ros.identification.validation import COUNTS, Comparison, ParameterRow, log_gain
+from calib_ros.shown import some
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +82,21 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
     not_excited = [p.name for p in found.parameters if p.status == 'not excited']
     if not_excited:
+        frames = dict.fromkeys(n.owner for n in not_excited if problem.model.owns_frame(n))
+        known = f' ({", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
         yield Reason(
             Rule.EXCITATION,
             f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            'in more combinations, or fix these parameters',
+            f'in more combinations, or fix these parameters{known}',
         )
-    for p in found.parameters:
-        if p.beyond(problem.largest_length, problem.largest_angle):
-            yield Reason(
-                Rule.COMMON_SENSE,
-                f'{p.name} is off by {1e3 * p.offset:.0f} m{p.name.unit}, '
-                'more than a faulty robot of this kind can be: is it the right chain file?',
-            )
+    limits = (problem.largest_length, problem.largest_angle)
+    if beyond := [p for p in found.parameters if p.beyond(*limits)]:
+        far = [f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond]
+        yield Reason(
+            Rule.COMMON_SENSE,
+            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be: is it the '
+            'right chain file?',
+        )
 
 
 def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> Iterator[Reason]:

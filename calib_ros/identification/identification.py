@@ -50,6 +50,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown, as_frame, as_html
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
@@ -232,7 +233,9 @@ class Identification(Shown):
         return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
 
-def identify(problem: Problem, simpler: Identification | None = None) -> Identification:
+def identify(
+    problem: Problem, simpler: Identification | None = None, progress: Told = nobody
+) -> Identification:
     """Identify the parameters of a chain from matched pairs.
 
     With the result of a `simpler` model, without effects, no sample that it explains is taken for
@@ -250,11 +253,13 @@ def identify(problem: Problem, simpler: Identification | None = None) -> Identif
     structural, start, fitted = fit(problem, known)
     names = fitted.names
     problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
+    progress(1 / 2)  # of many poses (benchmarks/end_to_end.py)
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > 4 * SOME:
         start = minimise(start, frames, robust.system.spread(SOME)).chain
     before = minimise(start, frames, robust.system, tolerance=1e-5)
     explained = simpler.validation.judged if simpler and simpler.validation else None
+    progress(2 / 3)
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)

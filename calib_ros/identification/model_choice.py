@@ -14,7 +14,7 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
@@ -33,6 +33,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.progress import Told, nobody, share_of
 
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
@@ -40,27 +41,24 @@ COMPARED = 3000
 """Samples by which effects are compared; of more, every so many are taken."""
 
 
-def _unheard(stage: str) -> None:
-    """Tell nobody which stage begins."""
-
-
-def identify_model(
-    problem: Problem, model: str, progress: Callable[[str], None] = _unheard
-) -> Identification:
+def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:
     """Identify with the errors that `model` names; `auto` chooses by cross-validation.
 
     A choice that cannot be fitted, or is refused where the geometric result is not, leaves that
-    one, with the verdicts and a remark. `progress` is called with each stage that begins; what it
-    raises ends the work.
+    one, with the verdicts and a remark. What `progress` raises ends the work.
     """
     progress(f'model {"geometric" if model == "auto" else model}')
-    result = identify(problem)
     if model != 'auto':
-        return result
-    chosen, verdicts = _chosen(problem, result, progress)
+        return identify(problem, progress=progress)
+    poses, columns = sum(map(len, problem.sets)), 2 * len(HARMONICS) * len(problem.chain.joints)
+    fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
+    first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
+    result = identify(problem, progress=share_of(progress, 0.0, first))
+    chosen, verdicts = _chosen(problem, result, share_of(progress, first, second))
     if chosen:
         progress(f'model with {len(chosen)} effects')
-        richer = identify(replace(problem, effects=chosen), result)
+        rest = share_of(progress, second, 1.0)
+        richer = identify(replace(problem, effects=chosen), result, rest)
         reasons: tuple[str, ...] = ()
         if not richer.converged:
             reasons = ('its fit has not converged',)
@@ -75,7 +73,7 @@ def identify_model(
 
 
 def _chosen(
-    problem: Problem, geometric: Identification, progress: Callable[[str], None]
+    problem: Problem, geometric: Identification, progress: Told
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     """Return the effects that pay for themselves, and the verdicts on all that were tried."""
     progress('effects')
@@ -204,9 +202,7 @@ class _Linear:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return Verdict(what, found[0], found[1], bool(pays))
 
-    def strongest_harmonic(
-        self, chosen: Sequence[str], progress: Callable[[str], None]
-    ) -> list[Parameter] | None:
+    def strongest_harmonic(self, chosen: Sequence[str], progress: Told) -> list[Parameter] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
         None where the strongest one of residuals moved in time often explains as much.
@@ -223,7 +219,7 @@ class _Linear:
         self,
         chosen: Sequence[str],
         groups: Sequence[Sequence[str]],
-        progress: Callable[[str], None] = _unheard,
+        progress: Told = nobody,
     ) -> FloatArray:
         """Return the shares (G, S) of the moved residuals that groups of effects explain.
 
@@ -248,13 +244,12 @@ class _Linear:
             [[numbers[name] for name in group] for group in groups],
         )
 
-    def _lots(
-        self, lots: Sequence[Sequence[str]], progress: Callable[[str], None]
-    ) -> Iterator[list[FloatArray]]:
+    def _lots(self, lots: Sequence[Sequence[str]], progress: Told) -> Iterator[list[FloatArray]]:
         """Yield the weighted columns (P, c, N) of each set, lot by lot."""
         for number, names in enumerate(lots):
             if number:
                 progress(f'harmonics of {Parameter(names[0]).owner}')
+                progress(number / len(lots))
             yield [each[:-1] for each in self._rows(names)]
 
     def _of(self, names: Sequence[str]) -> list[int]:

@@ -19,7 +19,7 @@ Arrays inside are laid out (component, sample), as in `jacobian.py`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -31,6 +31,7 @@ from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, transform
 from calib_ros.kinematics.walk import BLOCK
+from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown
 
 Flags = NDArray[np.bool_]
@@ -127,19 +128,18 @@ class Follower:
         joints: FloatArray,
         approach: FloatArray | None = None,
         bounded: bool = True,
-        heard: Callable[[float], None] | None = None,
+        told: Told = nobody,
     ) -> Solution:
         """Return the changes for commands (N, n), within the limits of the joints if bounded.
 
-        `heard` is called with the share that is done.
+        `told` is called with the share that is done.
         """
         parts = []
         for start in range(0, len(joints), BLOCK):
             rows = slice(start, start + BLOCK)
             came = None if approach is None else np.ascontiguousarray(approach[rows].T)
             parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
-            if heard is not None:
-                heard(min(1.0, rows.stop / len(joints)))
+            told(min(1.0, rows.stop / len(joints)))
         names = [each.name for each in fields(Solution)]
         found = {name: [getattr(part, name) for part in parts] for name in names}
         iterations = max(found.pop('iterations'))

@@ -29,7 +29,7 @@ class Advice:
 
 
 RIGHT_CHAIN = (
-    'Check that --chain names the arm that was measured: type, size and generation.',
+    'Check that --chain names the arm measured: type, size and generation.',
     'Check the units of the table: joint values in radians, positions in metres.',
     'Check that the columns q1, q2, ... are in the order of the arm, from its foot to its tool.',
 )
@@ -38,11 +38,11 @@ SPREAD = 'spread over the whole workspace, with every joint moved through most o
 RULES: dict[Rule, Advice] = {
     Rule.ENCODER: Advice(
         'A joint lost its zero while you measured',
-        'From one pose on, one joint reads differently than before. Measurements from before '
-        'describe an arm that no longer exists.',
+        'From one pose on, one joint reads differently than before. Earlier measurements no '
+        'longer describe the arm.',
         (
-            'Check the mastering (zero position) of the joint that is named.',
-            'Keep only what was measured after the slip, or measure again.',
+            'Check the mastering (zero position) of the joint named.',
+            'Keep only the measurements after the slip, or measure again.',
         ),
     ),
     Rule.MOVED: Advice(
@@ -55,24 +55,24 @@ RULES: dict[Rule, Advice] = {
         ),
     ),
     Rule.OWN_BEHAVIOUR: Advice(
-        'The poses that were left out are the arm itself',
-        'Some poses did not fit and were set aside as faulty measurements. But they all go '
-        'with one joint, so it is the arm that behaves like this, not the device.',
+        'The poses set aside show the arm itself',
+        'Some poses did not fit and were set aside as faulty measurements. But they all depend '
+        'on one joint: the cause is the arm, not the device.',
         (
-            'Run again with --model auto: it looks for such behaviour of the arm.',
-            'Or run with --loss none, which sets no pose aside.',
+            'Run again with --model auto: it looks for such effects.',
+            'Or run with --loss none to set no pose aside.',
         ),
     ),
     Rule.CONVERGENCE: Advice(
         'The computation found no stable answer',
-        'The measurements contradict each other or the description of the arm so much that '
-        'no set of corrections fits.',
+        'The measurements contradict each other, or the description of the arm, too much: no '
+        'set of corrections fits.',
         (*RIGHT_CHAIN, f'Measure more poses, {SPREAD}.'),
     ),
     Rule.EXCITATION: Advice(
         'Some joints hardly moved',
-        'An error of a joint shows only when that joint moves. The poses say nothing about '
-        'the parameters that are named.',
+        'A joint shows its errors only when it moves. These poses say nothing about the '
+        'parameters named.',
         (
             f'Add poses {SPREAD}. `calib_ros plan` chooses them.',
             'If a joint cannot move, hold its parameters with --fixed.',
@@ -81,21 +81,21 @@ RULES: dict[Rule, Advice] = {
     Rule.COMMON_SENSE: Advice(
         'This does not look like the right arm',
         'A correction as large as this cannot come from manufacturing or wear. Most often '
-        'the description is that of another arm, or units or columns are mixed up. Little error '
-        'after it proves nothing: so large a correction makes one arm of another.',
+        'the description is that of another arm, or units or columns are mixed up. A small error '
+        'afterwards proves nothing: so large a correction turns one arm into another.',
         RIGHT_CHAIN,
     ),
     Rule.LARGEST_ERROR: Advice(
         'The arm does not behave like its description',
-        'Even after the correction a large error is left. Most often the description is '
+        'A large error remains even after the correction. Most often the description is '
         'that of another arm, or units or columns are mixed up.',
         RIGHT_CHAIN,
     ),
     Rule.CONFIGURATIONS: Advice(
         'Too few poses were measured',
-        'A correction must be tested on poses that it was not computed from. There are not '
-        'enough poses for both.',
-        (f'Measure at least 30 different poses in all, {SPREAD}. Those that you have count.',),
+        'A correction must be tested on poses not used to compute it. There are not enough '
+        'poses for both.',
+        (f'Measure at least 30 different poses in all, {SPREAD}. Those you have count.',),
     ),
     Rule.OUTLIERS: Advice(
         'Too many measurements do not fit',
@@ -110,9 +110,9 @@ RULES: dict[Rule, Advice] = {
     ),
     Rule.GAIN: Advice(
         'The correction does not make the arm better',
-        'On poses that were not used to compute it, the corrected arm is no closer to the '
-        'measurements than the uncorrected one, or not by more than chance explains. The '
-        'arm may be as good as it gets, or the device too coarse to show more.',
+        'On poses not used to compute it, the corrected arm is no closer to the measurements '
+        'than the uncorrected one, or only by as much as chance explains. The arm may be as '
+        'good as it gets, or the device too coarse to show more.',
         (
             'Compare the error before with the accuracy of the measuring device. If they '
             'are similar, stop: this device cannot measure any improvement.',
@@ -141,7 +141,7 @@ RULES: dict[Rule, Advice] = {
         (
             f'Measure more poses, {SPREAD}. `calib_ros plan --chain ROBOT --accuracy MM` says how '
             'many.',
-            'Or measure with a more accurate device; orientation too, if it was position only.',
+            'Or use a more accurate device, and measure orientation too if it was position only.',
         ),
     ),
     Rule.GAIN_WITH_OUTLIERS: Advice(
@@ -149,14 +149,14 @@ RULES: dict[Rule, Advice] = {
         'Some poses were set aside as faulty measurements. Counting them, the corrected arm '
         'is worse than before. Perhaps they were right.',
         (
-            'Look at the poses marked as outliers below, and measure these again.',
+            'Look at the poses marked as outliers, and measure them again.',
             'Run with --model auto or --loss none.',
         ),
     ),
     Rule.ROUNDING: Advice(
         'The joint values are too coarse',
-        'The recording rounds the joint values. The improvement found is no larger than '
-        'what this rounding alone could cause.',
+        'The recording rounds the joint values. This rounding alone could cause the whole '
+        'improvement.',
         (
             'Record the joint values with all their digits, as the controller knows them.',
             'Measure different poses rather than the same ones many times.',
@@ -164,8 +164,8 @@ RULES: dict[Rule, Advice] = {
     ),
     Rule.ORIENTATION: Advice(
         'The position gets better, the orientation worse',
-        'On poses that were not used to compute it, the corrected arm points less precisely '
-        'than before. Often the stated accuracy of the device is wrong.',
+        'On poses not used to compute it, the corrected arm points less precisely than before. '
+        'Often the stated accuracy of the device is wrong.',
         (
             'Check --sigma-position and --sigma-orientation against the data sheet of the device.',
             'Check that the target sits rigidly on the flange.',
@@ -174,37 +174,37 @@ RULES: dict[Rule, Advice] = {
     Rule.SCALE: Advice(
         'The measuring device is out of scale',
         'All lengths of the arm came out too long or too short by the same factor. No arm '
-        'is built like that; a measuring device with a wrong scale shows just this.',
+        'is built like that; a measuring device with a wrong scale looks just like it.',
         (
-            'Check the scale of the device with a length that you know, such as a scale bar.',
-            'Check the temperature and pressure that are set in the device.',
+            'Check the scale of the device with a known length, such as a scale bar.',
+            'Check the temperature and pressure set in the device.',
         ),
     ),
     Rule.UNKNOWN_LOSS: Advice(
         'Nobody can tell how much of the recording is missing',
-        'The recording does not say how many messages it should hold. What is missing could '
-        'be just the poses that matter.',
+        'The recording does not say how many messages it should hold. Those missing could be '
+        'just the poses that matter.',
         (
             'Repair the recording: `ros2 bag reindex`.',
-            'If you know that it is complete, run with --largest-loss 1.',
+            'If you know it is complete, run with --largest-loss 1.',
         ),
     ),
     Rule.UNREADABLE: Advice(
         'A part of the recording cannot be read',
-        'The recording is damaged. What is missing could be just the poses that matter.',
+        'The recording is damaged. The missing part could be just the poses that matter.',
         (
             'Copy the recording again from the computer that made it.',
-            'If what is left is enough, run with the --largest-loss that is named.',
+            'If the rest is enough, run with the --largest-loss named.',
         ),
     ),
     Rule.DROPPED: Advice(
-        'Much of what was recorded could not be used',
-        'Joint values and measurements are matched by their time stamps. Too many had stamps '
-        'that match nothing.',
+        'Much of the recording could not be used',
+        'Joint values and measurements are matched by their time stamps. Too many stamps match '
+        'nothing.',
         (
             'Make the clocks of robot and measuring device agree (NTP or PTP).',
             'Record both from the same computer.',
-            'If what is left is enough, run with the --largest-loss that is named.',
+            'If the rest is enough, run with the --largest-loss named.',
         ),
     ),
     Rule.MISTAKE: Advice(

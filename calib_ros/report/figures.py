@@ -51,14 +51,8 @@ def _margin(left: int, top: int, bottom: int) -> dict[str, int]:
 
 
 def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> Figure:
-    return {
-        'type': 'scatter',
-        'mode': mode,
-        'name': name,
-        'x': numbers(x),
-        'y': numbers(y),
-        **more,
-    }
+    points = {'x': numbers(x), 'y': numbers(y)}
+    return {'type': 'scatter', 'mode': mode, 'name': name, **points, **more}
 
 
 def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:

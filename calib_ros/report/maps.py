@@ -132,7 +132,7 @@ def plan_report(
     )
     if found is not None:
         curve = figures.predictions(found.accuracy, found.at_random, wanted_mm)
-        about = 'From the noise of the measurement alone; what the model lacks comes on top.'
+        about = 'From measurement noise alone; errors of the model come on top.'
         sections.insert(0, Section('promise', 'What the poses promise', (about,), curve))
         known = bool(np.isfinite(found.accuracy[-1]))
         if known:

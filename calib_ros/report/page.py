@@ -73,15 +73,9 @@ class Input:
 
 @dataclass(frozen=True)
 class Origin:
-    """Whence a result comes: what only the one who started it knows.
+    """Whence a result comes: what only the one who started it knows; empty where not told.
 
-    Attributes
-    ----------
-    inputs : tuple of Input
-    operator, serial, device : str
-        Who measured, which robot, and with which device; empty where not told.
-    settings : str
-        The configuration, with which the same is done again.
+    With the configuration in `settings` the same is done again.
     """
 
     inputs: tuple[Input, ...] = ()

@@ -20,10 +20,10 @@ from calib_ros.apply.workspace import Survey, rms_map
 from calib_ros.escapes import one_line
 from calib_ros.identification.identification import Identification
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.report.figures import AFTER, BEFORE
 
 INCH, MARGIN = 0.0254, 0.01
 """In metres: an inch, and what is left free around a board."""
-BEFORE_COLOUR, AFTER_COLOUR = '#d95f02', '#1b9e77'
 
 
 def before_after_png(result: Identification) -> bytes:
@@ -36,8 +36,8 @@ def before_after_png(result: Identification) -> bytes:
     figure = _figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     for name, errors, colour in (
-        ('before', before, BEFORE_COLOUR),
-        ('after', after, AFTER_COLOUR),
+        ('before', before, BEFORE),
+        ('after', after, AFTER),
     ):
         rms = np.sqrt(np.mean(errors**2))
         left.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
@@ -57,7 +57,7 @@ def before_after_png(result: Identification) -> bytes:
 
 def draw_histogram(axes: Axes, errors_mm: FloatArray, label: str) -> None:
     """Draw how often an error comes, with its 50th and 95th percentile."""
-    axes.hist(errors_mm, bins=60, color=AFTER_COLOUR, alpha=0.7)
+    axes.hist(errors_mm, bins=60, color=AFTER, alpha=0.7)
     for share, style in ((0.5, '-'), (0.95, '--')):
         value = float(np.quantile(errors_mm, share))
         axes.axvline(value, color='black', linestyle=style, label=f'{share:.0%}: {value:.3f} mm')

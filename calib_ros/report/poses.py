@@ -22,6 +22,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK
+from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
@@ -31,46 +32,25 @@ WHEN = ('before', 'after')
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """N poses in the order of their stamps.
+    """N poses in the order of their stamps, which are the `lines` of a table, in seconds, or not.
 
-    Attributes
-    ----------
-    joints : (N, n)
-        Joint values [rad or m].
-    stamps_ns : (N,)
-    position : (N, 3)
-        Of the target [m] in the arm's base, by the corrected arm.
-    before, after : (N, 3)
-        Error of position [m] in the arm's base; for distances (error, 0, 0).
-    turned_before, turned_after : (N, 3)
-        Error of orientation [rad] in the arm's base; NaN where none was measured.
-    sigma : (N, 2)
-        Stated standard deviation of position [m] and orientation [rad], of one coordinate.
-    role : (N,) str
-        FITTED, JUDGED or REPEATED.
-    outlier : (N,) bool
-    size : (N,)
-        Of the residual in usual errors; NaN where the pose was not fitted.
-    set : (N,)
-        Number of the set of observations, whose tools (S, 4, 4) are `tools`.
-    lines : bool
-        Stamps are the lines of a table, in seconds.
-
+    Errors of position [m] and orientation [rad] are in the arm's base: (error, 0, 0) of a
+    distance, NaN where no orientation was measured.
     """
 
-    joints: FloatArray
+    joints: FloatArray  # (N, n) [rad or m]
     stamps_ns: NDArray[np.int64]
-    position: FloatArray
-    before: FloatArray
+    position: FloatArray  # (N, 3) of the target [m] in the arm's base, by the corrected arm
+    before: FloatArray  # (N, 3)
     after: FloatArray
     turned_before: FloatArray
     turned_after: FloatArray
-    sigma: FloatArray
-    role: NDArray[np.str_]
+    sigma: FloatArray  # (N, 2) stated for one coordinate [m, rad]
+    role: NDArray[np.str_]  # FITTED, JUDGED or REPEATED
     outlier: NDArray[np.bool_]
-    size: FloatArray
-    set: NDArray[np.intp]
-    tools: FloatArray
+    size: FloatArray  # of the residual in usual errors; NaN where the pose was not fitted
+    set: NDArray[np.intp]  # of observations, by its number
+    tools: FloatArray  # (S, 4, 4) of the sets
     lines: bool = False
 
     def __len__(self) -> int:
@@ -103,7 +83,7 @@ class Poses:
         }
         return Poses(**arrays, tools=self.tools, lines=self.lines)
 
-    def table(self) -> str:
+    def table(self, told: Told = nobody) -> str:
         """Return a CSV: a row for each pose, in metres and radians."""
         names = ['line' if self.lines else 'stamp_ns', 'set', 'role', 'outlier', 'size']
         names += [f'q{k + 1}' for k in range(self.joints.shape[1])]
@@ -122,6 +102,7 @@ class Poses:
             columns += np.column_stack([block[rows] for block in blocks]).T.tolist()
             text = '\n'.join(form % row for row in zip(*columns, strict=True))
             parts.append(text.replace('nan', ''))
+            told(min(1.0, rows.stop / len(self)))
         return '\n'.join(parts) + '\n'
 
 

@@ -87,19 +87,8 @@ def _verdict(
 ) -> Verdict:
     both = gain(result.validation or result.fitted)
     if not result.accepted:
-        return Verdict(
-            'bad',
-            'Not accepted: the robot stays as it was',
-            (
-                f'Why: {". ".join(each.heading for each in reasons if each.steps)}.',
-                'No correction was saved or sent to the robot. The figures show what was tried.',
-                *_left(result),
-            ),
-        )
-    how = (
-        'Before and after, on poses that were not used to compute the correction; in brackets '
-        'the 95 % interval.'
-    )
+        return _refused(result, reasons)
+    how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(each for each in (how, where) if each)
     if tolerance is None:
@@ -113,6 +102,25 @@ def _verdict(
     return Verdict(
         'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text, both
     )
+
+
+def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
+    """Return why nothing is corrected: an arm with no error that the device sees is no bad one."""
+    tried = 'No correction was saved or sent to the robot. The figures show what was tried.'
+    noise = result.noise
+    if {each.rule for each in result.refusals} == {Rule.GAIN} and (
+        noise.consistent or noise.position < 1.0
+    ):
+        why = (
+            'Not accepted, because the error is within the stated noise of the measuring device: '
+            'the arm is as good as this device can see.'
+        )
+        heading = 'Nothing to correct: the robot stays as it was'
+        return Verdict('info', heading, (why, tried, *_left(result)))
+    whys = '. '.join(each.heading for each in reasons if each.steps)
+    found = [f'What was found: {x}.' for x in result.refusals if x.rule is Rule.MISTAKE]
+    heading = 'Not accepted: the robot stays as it was'
+    return Verdict('bad', heading, (f'Why: {whys}.', *found, tried, *_left(result)))
 
 
 def _left(result: Identification) -> Iterator[str]:

@@ -27,7 +27,7 @@ STATES: dict[str, Verdict] = {
     'PASS': Verdict('good', 'PASS: the arm is within the tolerance'),
     'FAIL': Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
     'UNDECIDED': Verdict('open', 'UNDECIDED: too few measurements to tell'),
-    'JUDGED': Verdict('info', 'judged: without --tolerance there is no verdict'),
+    'JUDGED': Verdict('info', 'no verdict: --tolerance MM gives PASS or FAIL'),
 }
 NEXT: dict[str, tuple[str, ...]] = {
     'PASS': ('Keep this page with the calibration. Verify again after a collision or repair.',),

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.qos import qos_profile_services_default
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
@@ -52,8 +53,8 @@ MOST_POINTS = Settings.pose_buffer
 """Points of a trajectory; a longer one is refused."""
 MOST_SIZE = 400 * MOST_POINTS
 """Bytes of a serialised trajectory: ten joints with all rates take 352 a point."""
-MOST_QUEUED = 10
-"""Trajectories that may wait; those that come on top are refused."""
+MOST_QUEUED = qos_profile_services_default.depth
+"""Trajectories that may wait, as many as calls of a service; those on top are refused."""
 
 
 class Guide:

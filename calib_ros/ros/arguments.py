@@ -76,7 +76,6 @@ BESIDE_SETTINGS = (
         'called; default: none, a measurement is taken',
         False,
     ),
-    Parameter('socket_distance', 0.05, 'of the two sockets of a location [m]'),
     Parameter('marker_scale', 200.0, 'residual vectors are drawn so many times as long', False),
     Parameter(
         'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'

@@ -10,7 +10,7 @@ from typing import Any
 
 from rclpy.exceptions import InvalidHandle
 
-from calib_ros.errors import CalibrationError, advice_on
+from calib_ros.errors import CalibrationError, trouble
 
 Answer = tuple[bool, str]
 
@@ -55,7 +55,7 @@ class Boundary:
         except CalibrationError as err:
             success, text = False, str(err)
         except OSError as err:
-            success, text = False, '; '.join(filter(None, (str(err), advice_on(err))))
+            success, text = False, trouble(err)
         except Exception as err:
             self._log()
             success, text = False, f'internal error, see the log: {err!r}'

@@ -88,7 +88,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove
         )
-        self.session.socket_distance = given.socket_distance
         self.session.pictures.cameras = cameras_of(given.settings.sources)
         filer = Filer(given.history, given.serial, chain)
         self._filer, self._status_text = filer, ''

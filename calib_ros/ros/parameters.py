@@ -63,7 +63,6 @@ class Given:
     autoload: bool
     candidates: Path | None
     frames: FrameNames
-    socket_distance: float
     settings: Settings
 
 
@@ -93,7 +92,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    plain = ('chain', 'serial', 'history', 'resume', 'autoload', 'socket_distance')
+    plain = ('chain', 'serial', 'history', 'resume', 'autoload')
     given = Given(
         links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
         data_dir=_path(own['data_dir']),

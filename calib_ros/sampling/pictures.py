@@ -110,19 +110,17 @@ class Pictures:
         found: list[Sample] = []
         while self._queue:
             sample, looked = self._queue[0]
+            result: Sample | Refusal = sample
             if looked is not None:
                 if not (wait or looked.done()):
                     break
-                result = looked.result()
-                self.refused = ''
-                if isinstance(result, Refusal):
-                    self.refused = result.reason
-                    self.dropped[f'measurements: image {result.cause}'] += sample.count
-                else:
-                    found.append(result)
-            else:
-                found.append(sample)
+                result, self.refused = looked.result(), ''
             self._queue.popleft()
+            if isinstance(result, Refusal):
+                self.refused = result.reason
+                self.dropped[f'measurements: image {result.cause}'] += sample.count
+            else:
+                found.append(result)
         return found
 
     def _begin(self, sample: Sample) -> Future[Sample | Refusal] | None:

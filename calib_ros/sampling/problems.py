@@ -53,13 +53,11 @@ def problem_of(
     chain: Chain,
     samples: Sequence[Sample],
     settings: Settings,
-    socket_distance: float,
     posed: bool = False,
 ) -> Problem | None:
     """Return samples as a problem; None when there is none to fit.
 
-    Two sockets of a location are `socket_distance` [m] apart. With `posed` the poses of boards are
-    taken instead of their corners.
+    With `posed` the poses of boards are taken instead of their corners.
     """
     frames = Frames()
     sigmas = settings.sigma_position, settings.sigma_orientation
@@ -72,7 +70,7 @@ def problem_of(
         fitted[0],
         held_out,
         more=fitted[1:],
-        separations=tuple((*pair, socket_distance) for pair in pairs),
+        separations=tuple((*pair, settings.socket_distance) for pair in pairs),
         world_frame=samples[0].frame_id,  # it is the frame of `base`
         **settings.for_problem(),
     )

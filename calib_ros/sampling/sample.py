@@ -20,9 +20,6 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
-SOCKETS = 0.05
-"""Distance [m] of the two sockets of a location unless it is given: that of MUKCa's plates."""
-
 
 @dataclass(frozen=True, eq=False)
 class View:

@@ -36,7 +36,7 @@ from calib_ros.sampling.problems import (
     refuse_other_joints,
 )
 from calib_ros.sampling.road import Road
-from calib_ros.sampling.sample import SOCKETS, Sample, named, socket_place
+from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import POSES, SILENCE
 from calib_ros.sampling.strays import STRAY
 from calib_ros.settings import Settings
@@ -73,8 +73,6 @@ class CalibrationSession:
         check_joint_names(chain, self.joint_names)
         check_settings(chain, self.settings)
         self.recording = True
-        self.socket_distance = SOCKETS
-        """Distance of the two sockets of a location [m]."""
         self.calibration: Calibration | None = None
         """The last one that was accepted or loaded."""
         self._known: frozenset[Sample] = frozenset()  # that were there by then
@@ -275,7 +273,7 @@ class CalibrationSession:
 
     def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
         """Return samples as a problem; with `posed` boards by their poses, not their corners."""
-        found = problem_of(self.chain, samples, self.settings, self.socket_distance, posed)
+        found = problem_of(self.chain, samples, self.settings, posed)
         if found is None:
             raise InputError(f'no poses to fit: {self._came}')
         return found

@@ -63,19 +63,11 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """Messages in the order in which they came, in pieces by stream.
+    """Messages in the order in which they came, in pieces by stream, the first to come first.
 
-    Attributes
-    ----------
-    pieces : tuple of Piece
-        Who comes first is first; their places count from the first message of a batch.
-    begin : int
-        Place of the first message.
-    joints : (N,) bool
-        Which messages are joint states.
-    times : (N,) int
-        Stamps on the clock of the joints [ns].
-
+    Places count from the first message of a batch, `begin` is that of the first one here.
+    `joints` (N,) are the messages that are joint states, `times` (N,) all stamps on the clock of
+    the joints [ns].
     """
 
     pieces: tuple[Piece, ...]

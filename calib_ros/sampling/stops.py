@@ -31,19 +31,10 @@ LEAST_COUNT = 4
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """The means of what was measured at S stops.
+    """The means of what was measured at S stops: `values` (S, 3) or (S, 1) [m].
 
-    Attributes
-    ----------
-    used : (N,) bool
-        Which measurements are in the mean of their stop.
-    rests : (S,) bool
-        False for a stop whose measurements spread more than their noise.
-    values : (S, 3) or (S, 1)
-        Positions or distances [m].
-    spreads : (S,)
-        RMS of one coordinate of a stop about its mean [m].
-
+    `used` (N,) are the measurements in them, `spreads` (S,) the RMS of one coordinate about them
+    [m]; at a stop that does not `rests` (S,) measurements spread more than their noise.
     """
 
     used: NDArray[np.bool_]

@@ -167,7 +167,7 @@ def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
             'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
             'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',
         ),
-        ('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,x\n', "line 2: q6 must be a number, not 'x'"),
+        ('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,x\n', "line 2: q6 must be a finite number, not 'x'"),
     ],
 )
 def test_files_of_poses_that_cannot_be_read(run, tmp_path, content, text):

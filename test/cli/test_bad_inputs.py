@@ -19,7 +19,7 @@ def bad_inputs():
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
-    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a number'
+    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'
     yield 'too few rows', (*csv_of, 'few.csv'), '3 measured poses are too few'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
     yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
@@ -55,6 +55,25 @@ def bad_inputs():
     yield 'simulate, into a file', ('simulate', 'empty/b', '--chain', 'ur5e'), 'empty'
     yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
     yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
+    yield (
+        'no calibration',
+        ('compare', 'none', 'none'),
+        'no calibration at none: give the folder that ide',
+    )
+    yield 'not accepted', ('compare', 'refused', 'none'), 'refused was not accepted'
+    yield 'a folder as calibration', ('compare', 'folder', 'none'), 'folder holds no calibration.y'
+    yield (
+        'a table as calibration',
+        ('compare', 'good.csv', 'none'),
+        'is a table, but compare takes',
+    )
+    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no text in UTF-8: is it the'
+    yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
+    yield (
+        'a result as a table',
+        (*bag_of, 'refused/result.json'),
+        'is a report, but identify takes',
+    )
     yield 'demo, into a file', ('demo', '--out', 'empty', '--poses', '5'), 'empty'
     yield 'demo, too few', ('demo', '--poses', '2'), '2 measured poses are too few'
 
@@ -73,7 +92,10 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'empty.mcap').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
-    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
+    for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.jpg')):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / (file or 'notes')).write_text('{}')
     status, _, err = run(*arguments)
     assert status == 1
     assert err.startswith('calib_ros: ')

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import json
+import signal
 
 import pandas
 import plants
@@ -45,6 +46,28 @@ def test_identify_and_verify_are_filed(folder, capsys):
     assert main(['history', 'history', '--robot', '42']) == 1
     assert 'did you mean "0042"' in capsys.readouterr().err
     assert main(['history', 'nothing']) == 1
+
+
+def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, capsys):
+    plants.write_plant(folder, ['A'], 1)
+    ended = []
+
+    def interrupted(*_):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        finally:
+            signal.raise_signal(signal.SIGINT)  # the second one ends nothing
+            ended.append('workers')
+
+    monkeypatch.setattr(running, 'run', interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(['fleet', 'plant.yaml', '--history', 'history']) == 130
+    assert ended == ['workers']
+    assert signal.getsignal(signal.SIGINT) is before
+    assert capsys.readouterr().err.splitlines() == [
+        'note: results so far are filed: the next run does the rest',
+        'calib_ros: interrupted: no file is left half written',
+    ]
 
 
 def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):

@@ -11,6 +11,7 @@ import errno
 import io
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,15 +19,19 @@ import time
 from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
+import plants
 import pytest
-from measured import TEST, UR, measured, rows_of, write_csv
+from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.cli import screen
 from calib_ros.cli.command import TEXTS
-from calib_ros.cli.main import main
+from calib_ros.cli.commands import COMMANDS
+from calib_ros.cli.main import _parser, main
 from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
 from calib_ros.files import bags
+from calib_ros.files.boards import read_board
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -57,7 +62,7 @@ def without_digits(text):
 
 @pytest.fixture(scope='module')
 def cell(tmp_path_factory):
-    """A folder with a table, a bag, results that are accepted and not, a task, a program."""
+    """A folder with tables, a bag, results, a history, a plant, a task, a program, images."""
     folder = tmp_path_factory.mktemp('cell')
     back = os.getcwd()
     os.chdir(folder)
@@ -65,8 +70,15 @@ def cell(tmp_path_factory):
         write_csv(folder / 'measured.csv', rows_of(measured()))
         write_csv(folder / 'good_arm.csv', rows_of(measured(UR, seed=5)))
         write_csv(folder / 'new.csv', rows_of(measured(seed=11))[:TEST])
+        bumped = TRUE.with_offsets(BUMP)
+        write_csv(folder / 'bumped.csv', rows_of(measured(bumped, seed=7)))
+        plants.write_plant(folder, ['0042', '0043'], 3, bumps={'0043': (2, BUMP)})
         table = ['measured.csv', '--chain', 'ur5e']
-        assert main(['identify', *table, '--out', 'result', '--quiet']) == 0
+        filed = ['--history', 'history', '--serial', '0042']
+        assert main(['identify', *table, *filed, '--out', 'result', '--quiet']) == 0
+        table[0] = 'bumped.csv'
+        assert main(['identify', *table, '--out', 'bumped', '--quiet']) == 0
+        assert main(['board', 'charuco', *BOARD, '--out', 'board.pdf', '--quiet']) == 0
         assert main(['simulate', 'bag', '--chain', 'ur5e', '--poses', '8', '--quiet']) == 0
         assert main(['plan', *table[1:], '--iso9283', '--out', 'tests.csv', '--quiet']) == 0
     finally:
@@ -107,17 +119,30 @@ def test_the_help_of_a_command(shown, name):
     assert 'default: None' not in text
 
 
+@pytest.mark.parametrize('name', TEXTS)
+def test_the_examples_of_a_help_are_right(name):
+    for example in COMMANDS[name].examples:
+        given = shlex.split(example)
+        assert given[0] == name
+        assert _parser(given).parse_args(given)
+
+
 UR5E = ('--chain', 'ur5e')
 BOARD = ['--columns', '5', '--rows', '4', '--square', '0.03', '--marker', '0.02']
+BUMP = {'elbow_joint.theta': 2e-3}
 RESULTS = {
     'bag2csv': (0, 'bag', 'NEW/table.csv', *UR5E),
     'board': (0, 'charuco', *BOARD, '--out', 'NEW/board.pdf'),
     'chain': (0, 'ur5e', '--out', 'NEW/ur5e.yaml'),
+    'compare': (3, 'result', 'bumped'),
     'compensate': (0, 'tests.csv', *UR5E, '--calibration', 'result', '--out', 'NEW/p.csv'),
     'csv2bag': (0, 'measured.csv', 'NEW/bag', *UR5E),
     'demo': (0, '--poses', '20', '--out', 'NEW/demo'),
     'export': (0, 'result/calibration.yaml', *UR5E, '--out', 'NEW/export'),
+    'fleet': (3, 'plant.yaml', '--history', 'NEW/history', '--out', 'NEW/report'),
+    'history': (0, 'history'),
     'identify': (0, 'measured.csv', *UR5E, '--out', 'NEW/result'),
+    'images': (0, 'images', '--board', 'board.yaml', '--out', 'NEW/corners.csv'),
     'import': (0, 'measured.csv', *UR5E, '--out', 'NEW/table.csv'),
     'plan': (0, *UR5E, '--poses', '20', '--draw', '200', '--out', 'NEW/plan.csv'),
     'robots': (0,),
@@ -135,6 +160,29 @@ MORE = {
 }
 
 
+@pytest.fixture
+def served(cell, monkeypatch, request):
+    """Where the commands run, with the images or the cluster that the command named needs."""
+    monkeypatch.chdir(cell)
+    if request.param == 'images':
+        cv2 = pytest.importorskip('cv2')
+        from photographs import drawn
+
+        (cell / 'images').mkdir()
+        page = drawn(read_board(cell / 'board.yaml'))
+        for image, shown in (
+            ('board.png', np.pad(page, 200, constant_values=255)),
+            ('wall.png', 0 * page),
+        ):
+            cv2.imwrite(str(cell / 'images' / image), shown)
+    if request.param != 'fleet':
+        yield request.param, ()
+        return
+    distributed = pytest.importorskip('distributed')
+    with distributed.LocalCluster(1, processes=False, dashboard_address=None) as local:
+        yield request.param, ('--scheduler', local.scheduler_address)
+
+
 def test_a_wrong_command_proposes_the_right_one(shown):
     status, text = shown('identfy')
     assert status == 2
@@ -142,17 +190,16 @@ def test_a_wrong_command_proposes_the_right_one(shown):
 
 
 def test_every_command_has_a_screen():
-    apart = {'images', 'compare', 'fleet', 'history'}  # in tests of their own, with more data
-    assert {*RESULTS, *apart} >= {*TEXTS}
+    assert {*RESULTS} == {*TEXTS}
 
 
-@pytest.mark.parametrize('name', [*RESULTS, *MORE])
-def test_the_result_of_a_command(cell, monkeypatch, name):
+@pytest.mark.parametrize('served', [*RESULTS, *MORE], indirect=True)
+def test_the_result_of_a_command(cell, monkeypatch, served):
     """In 80 columns; what may take over 2 s works where a sign of life is shown."""
-    expected, *arguments = MORE.get(name) or (RESULTS[name][0], name, *RESULTS[name][1:])
+    name, more = served
+    expected, *arguments = MORE.get(name) or (RESULTS[name][0], name, *RESULTS[name][1:], *more)
     monkeypatch.setenv('TERM', 'dumb')
     monkeypatch.setattr(screen, 'FIRST_S', 1e6)
-    monkeypatch.chdir(cell)
     begun = []
     monkeypatch.setattr(screen, 'Work', lambda what: begun.append(what) or Work(what))
     (cell / 'NEW').mkdir()
@@ -167,7 +214,7 @@ def test_the_result_of_a_command(cell, monkeypatch, name):
         shutil.rmtree(cell / 'NEW')
     assert status == expected
     assert ESCAPE not in terminal.getvalue()
-    assert begun or name not in {*RESULTS} - {'board', 'chain', 'export', 'robots'}
+    assert begun or name not in {*RESULTS} - {'board', 'chain', 'export', 'history', 'robots'}
     assert_shown(name, without_digits(terminal.getvalue()))
 
 
@@ -225,8 +272,14 @@ def test_work_tells_the_time_left(monkeypatch):
     work = screen.Work('reading bag')
     monkeypatch.setattr(time, 'monotonic', lambda: 16.0)
     assert str(work) == 'reading bag, 6 s'
-    work('third file', 0.75)
+    work('third file')
+    work(0.75)
     assert str(work) == 'reading bag (third file), 6 s, 75 %, 2 s left'
+    work(0.5)  # never backwards
+    monkeypatch.setattr(time, 'monotonic', lambda: 17.0)
+    assert str(work) == 'reading bag (third file), 7 s, 75 %, 1 s left'
+    work(1.0)  # all that is measured is done: no bar at its end
+    assert str(work) == 'reading bag (third file), 7 s'
 
 
 def test_a_bag_tells_how_much_of_it_is_read(cell, monkeypatch):
@@ -239,12 +292,51 @@ def test_a_bag_tells_how_much_of_it_is_read(cell, monkeypatch):
 
 
 @pytest.mark.parametrize(
+    ('command', 'least'),
+    [
+        (('identify', 'measured.csv', '--model', 'auto'), 7),
+        (('csv2bag', 'quoted.csv', 'NEW/bag'), 100),
+        (('identify', 'quoted.csv'), 40),
+    ],
+)
+def test_a_command_tells_how_much_is_left(cell, shown, monkeypatch, command, least):
+    text = (cell / 'measured.csv').read_text().replace('train', '"train"')
+    (cell / 'quoted.csv').write_text(text)
+    shares = []
+
+    class Heard(Work):
+        def __call__(self, at):
+            super().__call__(at)
+            shares.extend([] if isinstance(at, str) else [(id(self), at)])
+
+    monkeypatch.setattr(screen, 'Work', Heard)
+    (cell / 'NEW').mkdir()
+    status, text = shown(*command, *UR5E)
+    shutil.rmtree(cell / 'NEW')
+    assert status == 0, text
+    assert len(shares) >= least
+    last = {}
+    for work, share in shares:
+        assert last.get(work, 0.0) <= share <= 1.0
+        last[work] = share
+    assert max(last.values()) > 0.6
+
+
+def test_a_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, shown):
+    told = []
+    monkeypatch.setattr(Work, '__call__', lambda self, at: told.append(at))
+    assert shown('plan', *UR5E, '--accuracy', '0.1', '--draw', '100')[0] == 0
+    assert re.fullmatch(r'\d+ poses', told[0])
+    assert re.fullmatch(r'\d+ poses, exchange 2', told[1])
+
+
+@pytest.mark.parametrize(
     ('error', 'status', 'words'),
     [
         (OSError(errno.ENOSPC, 'No space left on device', 'x'), 1, 'make room'),
         (PermissionError(errno.EACCES, 'Permission denied', 'x'), 1, 'choose another place'),
         (MemoryError(), 1, 'not enough memory'),
-        (KeyboardInterrupt(), 130, 'nothing was written'),
+        (KeyboardInterrupt(), 130, 'no file is left half written'),
     ],
 )
 def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error, status, words):
@@ -256,6 +348,29 @@ def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error
     assert found == status
     assert words in text
     assert text.count('\n') == 1
+
+
+@pytest.mark.parametrize('name', ['board', 'chain', 'csv2bag', 'export', 'plan'])
+def test_a_full_disk_leaves_nothing_behind(cell, shown, monkeypatch, name):
+    """It is told in one line that names what was asked for; what was there before stays."""
+    sync, calls = os.fsync, []
+
+    def full(handle):
+        calls.append(handle)
+        if len(calls) > 1 or name == 'chain':
+            raise OSError(errno.ENOSPC, 'No space left on device')
+        sync(handle)
+
+    monkeypatch.setattr(os, 'fsync', full)
+    (cell / 'NEW').mkdir()
+    (cell / 'NEW/notes').write_text('mine')
+    status, text = shown(name, *RESULTS[name][1:])
+    there = [path.name for path in (cell / 'NEW').iterdir()]
+    shutil.rmtree(cell / 'NEW')
+    assert (status, there) == (1, ['notes'])
+    line = text.splitlines()[-1]
+    assert re.match(r'calib_ros: \S*NEW/[^.]\S*: the disk is full: make room', line)
+    assert 'partial' not in text
 
 
 def test_who_reads_no_further_is_no_error():

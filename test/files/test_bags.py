@@ -123,15 +123,16 @@ def test_a_covariance_of_the_message_is_kept(tmp_path):
     np.testing.assert_array_equal(observations.covariance, [covariance])
 
 
-def test_joints_are_taken_by_name(tmp_path):
+@pytest.mark.parametrize('behind', [0, 8])  # what rclpy leaves behind empty lists
+def test_joints_are_taken_by_name(tmp_path, behind):
     events = [
         ('/joint_states', joint_state(10 * MS, (3.0, 9.0, 1.0, 2.0), ('c', 'gripper', 'a', 'b'))),
         ('/joint_states', joint_state(20 * MS, (1.0, 2.0, 3.0), ('a', 'b', 'c'))),
         ('/joint_states', joint_state(30 * MS, (2.0, 1.0, 3.0), ('b', 'a', 'c'))),
         *(('/pose', pose_stamped(ms * MS)) for ms in (10, 15, 20, 25, 30)),
     ]
-    observations = observations_of(record(tmp_path / 'bag', events))
-    np.testing.assert_array_equal(observations.joints, [[1.0, 2.0, 3.0]] * 5)
+    path = record(tmp_path / 'bag', events, behind=behind * b'x')
+    np.testing.assert_array_equal(observations_of(path).joints, [[1.0, 2.0, 3.0]] * 5)
 
 
 def test_joints_by_other_names(tmp_path):
@@ -298,11 +299,12 @@ BAD_JOINTS = [
 ]
 
 
-@pytest.mark.parametrize('first', [True, False])
-def test_bad_joint_states_are_dropped_and_counted_by_cause(tmp_path, first):
+@pytest.mark.parametrize(('first', 'behind'), [(True, 0), (False, 12)])
+def test_bad_joint_states_are_dropped_and_counted_by_cause(tmp_path, first, behind):
     events = standing([pose_stamped(55 * MS)])
     bad = [('/joint_states', message) for message, _ in BAD_JOINTS]
-    account = account_of(record(tmp_path / 'bag', [*bad, *events] if first else [*events, *bad]))
+    events = [*bad, *events] if first else [*events, *bad]
+    account = account_of(record(tmp_path / 'bag', events, behind=behind * b'x'))
     assert (account.joint_states, account.samples) == (100 + len(bad), 1)
     assert account.dropped == Counter(cause for _, cause in BAD_JOINTS)
 

@@ -302,7 +302,7 @@ def test_joint_values_that_stand_a_row_below(read):
 @pytest.mark.parametrize(
     ('text', 'layout', 'said'),
     [
-        ('q1;q2;x;y;z\n1;2;3;4;five\n', {}, 'line 2: .* must be a number, not .five'),
+        ('q1;q2;x;y;z\n1;2;3;4;five\n', {}, 'line 2: .* must be a finite number, not .five'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
         (

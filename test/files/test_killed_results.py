@@ -83,7 +83,7 @@ def test_a_bag_whose_writing_is_killed_is_absent(tmp_path, monkeypatch, storage)
 def test_a_bag_on_a_full_disk_is_absent(tmp_path, storage, limit):
     def child():
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-        with pytest.raises(OSError, match=r'cannot write .*bag: '):
+        with pytest.raises(OSError, match=r'/bag'):
             write_bag(tmp_path / 'bag', dwells(40), storage, {tmp_path / 'truth': 'true'})
 
     assert status_of(forked(child)) == 0
@@ -101,7 +101,7 @@ def test_a_command_that_writes_a_bag_says_so_when_the_disk_is_full(tmp_path, mon
         sys.stderr.flush()
 
     assert status_of(forked(child)) == 0
-    assert 'calib_ros: cannot write bag: [Errno 27] File too large' in capfd.readouterr().err
+    assert 'calib_ros: bag: the file would be too large' in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ['cell.csv']
 
 

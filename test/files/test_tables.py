@@ -101,7 +101,9 @@ def test_a_bad_row_of_another_session_does_not_matter(read):
 
 @pytest.mark.parametrize('bad', ['nan', 'inf', '-inf', '', ' ', 'twelve', '1;2', '0,5'])
 def test_what_is_no_number_is_named_with_its_line(read, bad):
-    with pytest.raises(InputError, match=r'cell\.csv, line 3: y must be a number') as caught:
+    with pytest.raises(
+        InputError, match=r'cell\.csv, line 3: y must be a finite number'
+    ) as caught:
         read(POINTS.replace('5.5', f'"{bad}"'))
     assert repr(bad) in str(caught.value)
 
@@ -151,19 +153,19 @@ FAULTS = [
     (POSES.replace('qw', 'w'), 'no column qw;'),
     (
         POINTS.replace('\n-0.3', '\n\n\n\n-0.3').replace('4.5', 'bad'),
-        'line 6: x must be a number',
+        'line 6: x must be a finite number',
     ),
-    (f'{POINTS}0.1,0.2,1,2\n', 'line 4: z must be a number'),
-    (f'{POINTS}0.1,0.2,1,2,\n', 'line 4: z must be a number'),
-    (f'{POINTS}0.1\n', 'line 4: q2 must be a number'),
+    (f'{POINTS}0.1,0.2,1,2\n', 'line 4: z must be a finite number'),
+    (f'{POINTS}0.1,0.2,1,2,\n', 'line 4: z must be a finite number'),
+    (f'{POINTS}0.1\n', 'line 4: q2 must be a finite number'),
     ('q1,q2,x,y,z,session\n1,0,1,0,0,A\n2,0,2,0,0\n', r'cell\.csv'),
     *((POSES.replace(TURN, each), r'cell\.csv, line 3: quaternion .* expected 1') for each in
       ('0,0,0,2', '0,0,0,0', '0.6,0,0,0.9', '0,0,0,1.01')),
-    *((POSES.replace(TURN, each), r'line 3: q[xyzw] must be a number') for each in
+    *((POSES.replace(TURN, each), r'line 3: q[xyzw] must be a finite number') for each in
       ('0.5,-0.5,0.5,', ',,,1', '0.5,,0.5,0.5')),
     *((each, r'cell\.csv has no') for each in
       ('', '\n', 'q1,q2,x,y,z\n', 'q1,q2,x,y,z\n\n\n')),
-    (b'\xff\xfe\x00\x80', r'cannot read .*cell\.csv'),
+    (b'\xff\xfe\x00\x80', r'cell\.csv is no text in UTF-8'),
     *((f'{FLAG}{each}\n', f"line 2: eye_in_hand must be 0 or 1, not '{each}'") for each in
       ('yes', 'True', '2')),
     (SESSIONS, r'cell\.csv holds several sessions, .*A, B'),

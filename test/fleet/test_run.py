@@ -39,7 +39,7 @@ def keys(history):
 def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
     history, out = History(tmp_path / 'history'), tmp_path / 'report'
     said = []
-    first = run(plant, history, cluster, out, lambda words, share: said.append(share))
+    first = run(plant, history, cluster, out, said.append)
     assert (first.filed, first.errors, said[-1]) == (4, {}, 1.0)
     rows = history.rows('A')
     assert [row.time for row in rows] == [plants.when(0), plants.when(1)]

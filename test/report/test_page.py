@@ -22,7 +22,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.kinematics.chain_file import table_hash
+from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report import advice, explorer
 from calib_ros.report.maps import workspace_report
 from calib_ros.report.page import Input, Origin, Report, Verdict, render
@@ -196,6 +196,24 @@ def test_a_refused_page_says_why_and_what_to_do():
         assert each.refusal in page.text
     assert 'none: not accepted' in page.text
     assert 'map' not in figures_of(page)
+
+
+@pytest.mark.parametrize('sigma', [1e-4, 1e-5])
+def test_an_arm_as_good_as_the_device_can_see_is_no_bad_one(sigma):
+    """It is not accepted all the same; where the device should have seen more, it is refused."""
+    rows = measured(chain=UR, count=40)
+    problem = Problem(UR, rows, sigma_position=sigma, sigma_orientation=4 * sigma)
+    result = identify(problem)
+    assert {each.rule for each in result.refusals} == {Rule.GAIN}
+    verdict = report_of(problem, result).verdict
+    assert verdict.state == ('info' if sigma == 1e-4 else 'bad')
+    assert 'Not accepted' in ' '.join((verdict.heading, *verdict.text))
+
+
+def test_a_mistake_is_named_in_the_verdict():
+    problem = Problem(load_chain('ur10'), measured(chain=UR, count=40))
+    verdict = report_of(problem, identify(problem)).verdict
+    assert '--chain ur5e' in verdict.text[1]
 
 
 def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):

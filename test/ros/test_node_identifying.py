@@ -67,8 +67,9 @@ def stages(monkeypatch):
     def slow(problem, model, progress):
         def at(stage):
             progress(stage)
-            reached.append(stage)
-            release.get(timeout=20.0)
+            if isinstance(stage, str):  # no share of the work
+                reached.append(stage)
+                release.get(timeout=20.0)
 
         return identify_model(problem, model, at)
 
@@ -83,8 +84,9 @@ def test_the_status_names_the_stage_of_an_identification(tmp_path, recording, st
         cell.play(topics(recording))
         running = cell.start_call('identify')
         for stage in STAGES[:2]:
-            cell.spin_until(lambda now=stage: words and f's ({now}); ' in words[-1].data)
-            assert '; identifying for ' in words[-1].data
+            cell.spin_until(
+                lambda now=stage: words and f'; identifying ({now}), ' in words[-1].data
+            )
             release.put(None)
         for _ in range(100):
             release.put(None)
@@ -121,7 +123,7 @@ def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stag
             release.put(None)
             cell.spin_until(running.done)
             assert not running.result().success
-            assert f'cancelled after the stage "{reached[-1]}"' in running.result().message
+            assert f'cancelled: identifying ({reached[-1]})' in running.result().message
             assert len(reached) == stage + 1
         assert cell.node.session.calibration is good
         assert len(texts) == 1
