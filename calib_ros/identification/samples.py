@@ -116,16 +116,13 @@ class Samples:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
             if self.oriented:
                 turn[-1] = orientation_error(self.rotations[:, :, part], axes)
-            if self.weights is not None:
-                shift *= self.weights[part]
-                if self.oriented:
-                    turn *= self.weights[part]
-            if self.whitening is not None:
-                yield part, self._whitened(shift, turn, part), nothing, model
-                continue
-            shift /= self.sigmas[0]
+            weights = 1.0 if self.weights is None else self.weights[part]
+            sigmas = self.sigmas if self.whitening is None else (1.0, 1.0)
+            shift *= weights / sigmas[0]
             if self.oriented:
-                turn /= self.sigmas[1]
+                turn *= weights / sigmas[1]
+            if self.whitening is not None:
+                shift, turn = self._whitened(shift, turn, part), nothing
             yield part, shift, turn if self.oriented else nothing, model
 
     def products(
