@@ -82,10 +82,12 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
     not_excited = [p.name for p in found.parameters if p.status == 'not excited']
     if not_excited:
+        frames = dict.fromkeys(n.owner for n in not_excited if problem.model.owns_frame(n))
+        known = f' ({", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
         yield Reason(
             Rule.EXCITATION,
             f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            'in more combinations, or fix these parameters',
+            f'in more combinations, or fix these parameters{known}',
         )
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in found.parameters if p.beyond(*limits)]:

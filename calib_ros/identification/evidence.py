@@ -232,9 +232,9 @@ def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float]]:
         return chain, {}
     travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
     chain = chain.with_effects(travels)
-    names = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
+    names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
-    return chain, {n: chain.value(n) for n in names} | dict.fromkeys(map(str, travels), 1.0)
+    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}
 
 
 def _told(
