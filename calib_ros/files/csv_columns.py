@@ -162,7 +162,7 @@ def regular(
     if not data.endswith(b'\n'):
         data += b'\n'
     begin = 0 if header else data.index(b'\n') + 1
-    names = tuple(header or data[: begin - 1].decode().split(separator))
+    names = tuple(header or map(str.strip, data[: begin - 1].decode().split(separator)))
     width = len(names)
     if len(set(names)) < width or width > MOST_ENTRIES:
         return None
@@ -207,11 +207,12 @@ def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
         for row in reader:
             told(min(reader.line_num / most, 1.0))
             if not (row and header):
-                header = header or row
+                header = header or [name.strip() for name in row]
                 if len(header) > MOST_ENTRIES:
                     raise InputError(f'{path} has {len(header)} columns, more than {MOST_ENTRIES}')
                 continue
             if any(row[len(header) :]):
+                refuse_separator(path, header)
                 raise InputError(
                     f'{path}, line {reader.line_num}: more values than the {len(header)} columns'
                 )
@@ -229,3 +230,14 @@ def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
     cells = zip(*rows, strict=True) if rows else [()] * len(header)
     words = dict(zip(header, cells, strict=True))
     return MadeColumns(path, np.array(lines, dtype=np.intp), {}, words)
+
+
+def refuse_separator(path: Path, header: Sequence[str]) -> None:
+    """Say how to read a table whose cells are not separated by commas."""
+    for name, mark in (('semicolon', ';'), ('tab', '\t')):
+        if any(mark in cell for cell in header):
+            raise InputError(
+                f'the cells of {path} are separated by {name}s: give --separator {name} (and, '
+                'where they differ, --decimal comma, --columns, --length, --angle), or convert it '
+                'with calib_ros import'
+            )

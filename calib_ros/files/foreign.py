@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -44,17 +43,6 @@ UNITS = {
     'inches': 'in',
     **{unit: unit for unit in LENGTHS},
 }
-
-
-def refuse_separator(path: Path, header: Sequence[str]) -> None:
-    """Say how to read a table whose cells are not separated by commas."""
-    for name, mark in (('semicolon', ';'), ('tab', '\t')):
-        if any(mark in cell for cell in header):
-            raise InputError(
-                f'the cells of {path} are separated by {name}s: give --separator {name} (and, '
-                'where they differ, --decimal comma, --columns, --length, --angle), or convert it '
-                'with calib_ros import'
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from calib_ros.files.columns import (
     lines_in_words,
     numbered,
 )
-from calib_ros.files.foreign import refuse_separator
+from calib_ros.files.csv_columns import refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray

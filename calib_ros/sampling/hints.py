@@ -45,6 +45,24 @@ def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
     )
 
 
+def apart(
+    waiting: int, unmatched: int, measurements: int, ahead: float, lateness: float
+) -> Hint | None:
+    """Tell that clocks disagree by more than can be looked for, if many measurements say so.
+
+    Measurements wait for joint states, or have found none; they are `ahead` of those [s].
+    """
+    many = unmatched > max(EXCEPTION * measurements, NO_ACCIDENT)
+    if abs(ahead) <= lateness or not (many or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
+        return None
+    words = f'{abs(ahead):.0f} s {"after" if ahead > 0.0 else "before"}'
+    return Hint(
+        f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree',
+        f'the newest measurement is stamped {words} the newest joint state: make the clocks of '
+        'both agree (NTP, PTP), if both still come',
+    )
+
+
 def disagreement(delay: float, known: float) -> Hint:
     """Tell that the clocks disagree: the `delay` [s] that the motion shows is not the `known`."""
     left = delay - known

@@ -12,9 +12,12 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
+from calib_ros.sampling.hints import Hint, apart
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
 from calib_ros.sampling.strays import Gate
+from calib_ros.sampling.track import CAUSES
+from calib_ros.sampling.waiting import TOO_LATE
 from calib_ros.settings import Settings
 
 LEAST_FAR = Settings.lateness
@@ -70,6 +73,15 @@ class Road:
         made, shaken = self.collector.maker.take()
         count = self._taken(made)
         self.clocks.watch.wake(self.collector.maker.unrest, count - shaken, count)
+
+    def hints(self, measurements: int) -> list[Hint]:
+        """Return what looks wrong with the stamps, of so many measurements."""
+        ahead = 1e-9 * (self._newest[POSES] - self._newest[JOINTS])
+        collector, lateness = self.collector, self.clocks.settings.lateness
+        unmatched = collector.dropped[f'{POSES}: {CAUSES[2]}' if ahead > 0.0 else TOO_LATE]
+        hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
+        found = [hint] if hint is not None and all(self._newest.values()) else []
+        return found + self.clocks.hints() + collector.hints(measurements)
 
     def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
         """Yield messages up to one that gives something to do, when those before are kept."""

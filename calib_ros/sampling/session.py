@@ -226,8 +226,7 @@ class CalibrationSession:
         found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
-        found += self._clocks.hints()
-        return found + self._collector.hints(self.received[POSES])
+        return found + self._road.hints(self.received[POSES])
 
     @property
     def delay(self) -> Delay | None:

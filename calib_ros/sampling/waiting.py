@@ -16,6 +16,7 @@ from calib_ros.values import MOST_NAMES
 
 MOST_STREAMS = MOST_NAMES
 """Streams of measurements that are told apart: a tracker may number markers without end."""
+TOO_LATE = 'measurements: later than lateness allows'
 TOO_MANY = f'measurements: of one more than {MOST_STREAMS} targets, or frames'
 
 
@@ -52,7 +53,7 @@ class Waiting(dict[StreamKey, Rows]):
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
         if len(due) < len(stamps):
-            self._dropped['measurements: later than lateness allows'] += len(stamps) - len(due)
+            self._dropped[TOO_LATE] += len(stamps) - len(due)
         if len(taken) < len(due):
             self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])

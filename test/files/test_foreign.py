@@ -324,9 +324,10 @@ def test_faults_are_named(read, text, layout, said):
         read(text, **layout)
 
 
-def test_a_table_of_semicolons_says_what_to_give(tmp_path, capsys):
+@pytest.mark.parametrize('row', ['1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5'])
+def test_a_table_of_semicolons_says_what_to_give(tmp_path, row):
     path = tmp_path / 'cell.csv'
-    path.write_text('q1;q2;x;y;z\n1;2;3;4;5\n')
+    path.write_text(f'q1;q2;x;y;z\n{row}\n')
     with pytest.raises(InputError, match='separated by semicolons: give --separator semicolon'):
         read_table(path, 2)
 

@@ -155,6 +155,7 @@ FAULTS = [
         POINTS.replace('\n-0.3', '\n\n\n\n-0.3').replace('4.5', 'bad'),
         'line 6: x must be a finite number',
     ),
+    (POINTS.replace('5.5', '1e7'), r'line 3: y must be at most 1e\+06, not 1e\+07'),
     (f'{POINTS}0.1,0.2,1,2\n', 'line 4: z must be a finite number'),
     (f'{POINTS}0.1,0.2,1,2,\n', 'line 4: z must be a finite number'),
     (f'{POINTS}0.1\n', 'line 4: q2 must be a finite number'),
@@ -189,6 +190,7 @@ KINDS = {
     'split': SPLIT,
     'windows': POINTS.replace('\n', '\r\n'),
     'blank lines': POSES.replace('\n', '\n\n'),
+    'blanks in the header': POINTS.replace(',', ', ', 4),
     'mixed': "stamp_ns,device,target,q1,q2,x,y,z,qx,qy,qz,qw,distance,eye_in_hand,split,"
     + """v1,v2,s1,s2
 5,left,,1,0,1,0,0,,,,,,,,,,1,-3

@@ -128,6 +128,17 @@ def test_joint_states_that_are_too_slow_are_told_and_the_rate_needed():
     assert told(better) == ()
 
 
+@pytest.mark.parametrize('seconds', [-3600.0, 3.0, 37.0])
+def test_clocks_too_far_apart_for_the_delay_to_be_found_are_told(seconds):
+    made = heard(tour(15), 29.5, late=lambda times: seconds)
+    words = f'{abs(seconds):.0f} s {"before" if seconds < 0 else "after"}'
+    assert f'stamped {words} the newest joint state: make the clocks' in told(made)[0]
+    made.finish()
+    if abs(seconds) > 30.0:
+        with pytest.raises(InputError, match='make the clocks of both agree'):
+            made.identify()
+
+
 @pytest.mark.parametrize(('pause', 'count'), [(2.0, 0), (4.0, 1)])
 def test_of_a_pause_in_the_joint_states_a_tenth_must_have_been_measured(pause, count):
     made = heard(tour(15), 29.5, hole=(10.0, 10.0 + pause))
