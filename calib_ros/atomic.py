@@ -53,8 +53,9 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
     except OSError as err:
         raise OSError(err.errno, err.strerror, str(path)) from err
     finally:
-        for partial in partials.values():
-            partial.unlink(missing_ok=True)
+        with suppress(OSError):  # a disk that cannot be written
+            for partial in partials.values():
+                partial.unlink(missing_ok=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
@@ -152,6 +153,8 @@ def _claim(work: Path, path: Path) -> int:
             made = True
         except FileExistsError:
             made = False
+        except OSError as err:
+            raise OSError(err.errno, err.strerror, str(path)) from err
         with suppress(FileNotFoundError):  # its owner has just ended: once more
             handle = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             try:

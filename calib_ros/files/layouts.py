@@ -61,6 +61,11 @@ JOINT = re.compile('[qsva][0-9]+')
 """Columns of ours with a number of each joint: values, signs of last moves, and rates."""
 
 
+def joint_columns(joints: int, letter: str = 'q') -> tuple[str, ...]:
+    """Return the names of the columns with a number of each joint."""
+    return tuple(f'{letter}{k + 1}' for k in range(joints))
+
+
 @dataclass(frozen=True)
 class Expression:
     """A sum, difference, product or quotient of columns and numbers.

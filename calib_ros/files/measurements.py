@@ -23,7 +23,7 @@ from calib_ros.files.columns import (
     numbered,
 )
 from calib_ros.files.csv_columns import refuse_separator
-from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER
+from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.sample import socket_place
@@ -165,11 +165,11 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     placed = kind == POSE
     read = _Blocks(columns, joints)
     count = len(columns.lines)
-    angles = read.of(named('q', joints), True)
+    angles = read.of(joint_columns(joints), True)
     assert angles is not None
     position = read.of(POSITION, placed)
     oriented, rotation = _turned(columns, read.of(QUATERNION, False), placed)
-    signs = read.of(named('s', joints), False, LARGEST_RATE)
+    signs = read.of(joint_columns(joints, 's'), False, LARGEST_RATE)
     split = choices(columns, 'split', SPLITS, 'train or test')
     ones = np.ones(count, dtype=np.int64)
     return Measurements(
@@ -178,8 +178,8 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         _stamps(columns),
         angles,
         None if signs is None else np.sign(signs),
-        read.of(named('v', joints), False, LARGEST_RATE),
-        read.of(named('a', joints), False, LARGEST_RATE),
+        read.of(joint_columns(joints, 'v'), False, LARGEST_RATE),
+        read.of(joint_columns(joints, 'a'), False, LARGEST_RATE),
         kind,
         np.zeros((count, 3)) if position is None else position,
         rotation,
@@ -200,17 +200,12 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     )
 
 
-def named(letter: str, joints: int) -> tuple[str, ...]:
-    """Return the names of the columns with a number of each joint."""
-    return tuple(f'{letter}{k + 1}' for k in range(joints))
-
-
 class _Blocks:
     """The numbers of a table, read at once."""
 
     def __init__(self, columns: Columns, joints: int) -> None:
         self._columns = columns
-        blocks = [named(letter, joints) for letter in 'qsva']
+        blocks = [joint_columns(joints, letter) for letter in 'qsva']
         singles = [(name,) for name in ('distance', 'delay', 'count', 'spread')]
         self._at: dict[Sequence[str], slice] = {}
         names: list[str] = []
@@ -241,10 +236,15 @@ class _Blocks:
 def _check_header(columns: Columns, joints: int) -> None:
     """Refuse a table without columns that it needs, or with a part of a block."""
     header = set(columns.header)
-    needed = [*named('q', joints)]
+    needed = [*joint_columns(joints)]
     if not set(KINDS[1:]) & header:
         needed += POSITION
-    together = (*(named(letter, joints) for letter in 'sva'), POSITION, QUATERNION, COVARIANCE)
+    together = (
+        *(joint_columns(joints, letter) for letter in 'sva'),
+        POSITION,
+        QUATERNION,
+        COVARIANCE,
+    )
     for block in (*together, ('location', 'socket')):
         needed += block if set(block) & header else ()
     missing = [name for name in dict.fromkeys(needed) if name not in header]

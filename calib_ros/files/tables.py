@@ -24,7 +24,7 @@ from calib_ros.escapes import to_cell
 from calib_ros.files.columns import Columns, MadeColumns
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER
+from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.files.measurements import (
     DISTANCE,
     PLANE,
@@ -33,7 +33,6 @@ from calib_ros.files.measurements import (
     Measurements,
     distinct,
     measurements,
-    named,
 )
 from calib_ros.files.views import view_cell, view_of
 from calib_ros.identification.observations import Observations
@@ -255,7 +254,7 @@ def _samples(made: Measurements) -> Iterator[Sample]:
 
 def columns(joints: int) -> list[str]:
     """Return the columns of a table that can hold every kind of sample."""
-    names = ['stamp_ns', *(name for letter in 'qsva' for name in named(letter, joints))]
+    names = ['stamp_ns', *(name for letter in 'qsva' for name in joint_columns(joints, letter))]
     names += [*POSITION, *QUATERNION, 'distance', *COVARIANCE, 'device', 'target', 'frame_id']
     names += ['eye_in_hand', 'delay', 'count', 'spread', 'session', 'split']
     return [*names, 'location', 'socket', 'view']

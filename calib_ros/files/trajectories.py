@@ -19,7 +19,8 @@ import numpy as np
 from calib_ros.apply.program import Program
 from calib_ros.errors import InputError
 from calib_ros.files.csv_columns import columns_of
-from calib_ros.files.waypoints import joint_columns, joint_values
+from calib_ros.files.layouts import joint_columns
+from calib_ros.files.waypoints import joint_values
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, parse_yaml, read_text
 from calib_ros.values import parse_numbers
@@ -57,7 +58,7 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
 def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
     found = columns_of(path, text.encode())
     positions = joint_values(found, len(joints))
-    signs = [f's{k + 1}' for k in range(len(joints))]
+    signs = joint_columns(len(joints), 's')
     signed = set(signs) <= set(found.header)
     approach = np.sign(found.block(signs)) if signed else None
 

@@ -15,7 +15,7 @@ import numpy as np
 from calib_ros.errors import InputError
 from calib_ros.files.columns import Columns, check_quaternions
 from calib_ros.files.csv_columns import read_columns, with_rows
-from calib_ros.files.layouts import POSITION, QUATERNION
+from calib_ros.files.layouts import POSITION, QUATERNION, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import limits
@@ -58,11 +58,6 @@ def read_poses(path: Path) -> FloatArray:
     numbers = found.block(POSE)
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
-
-
-def joint_columns(joints: int) -> list[str]:
-    """Return the names of the columns of joint values."""
-    return [f'q{k + 1}' for k in range(joints)]
 
 
 def joints_csv(joints: FloatArray) -> str:

@@ -30,6 +30,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms
 from calib_ros.identification.suspects import Sets, Suspect, suspects
+from calib_ros.identification.suspicions import coupled
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
@@ -65,20 +66,26 @@ class Explained:
 def remarked(problem: Problem, result: Identification) -> Identification:
     """Return the result with the mistake that explains its errors, if there are such.
 
-    It stands first among the refusals, or among the remarks of a result that is not refused.
+    It stands first among the refusals, to which measurements that are not what they should be
+    belong; another arm is a remark where the result is not refused.
     """
     if not _suspicious(problem, result):
         return result
     found = explained(problem)
     if found is None:
         return result
-    if result.refusals:
+    if result.refusals or not any(each.chain for each in found.suspects):
         return replace(result, refusals=(Reason(Rule.MISTAKE, str(found)), *result.refusals))
     return replace(result, remarks=(str(found), *result.remarks))
 
 
 def _suspicious(problem: Problem, result: Identification) -> bool:
-    """Tell whether errors, before or after, are larger than those of faulty arms."""
+    """Tell whether errors, before or after, are larger than those of faulty arms.
+
+    Couplings may explain most of what is left, however small.
+    """
+    if not result.refusals and coupled(result):
+        return True
     judged = result.validation or result.fitted
     for each in (judged.before, judged.after, result.fitted.before):
         turns = each.orientation[~np.isnan(each.orientation[:, 0])]

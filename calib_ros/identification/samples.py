@@ -101,27 +101,28 @@ class Samples:
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         nothing = np.zeros((0, 0, 0))
         joints, velocity = self.moving(chain)
+        out = None
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
+            if start + BLOCK > self.count:
+                out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
-            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving)
+            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving, out)
+            out = shift, turn
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
             if self.oriented:
                 turn[-1] = orientation_error(self.rotations[:, :, part], axes)
-            if self.weights is not None:
-                shift *= self.weights[part]
-                if self.oriented:
-                    turn *= self.weights[part]
-            if self.whitening is not None:
-                yield part, self._whitened(shift, turn, part), nothing, model
-                continue
-            shift /= self.sigmas[0]
+            weights = 1.0 if self.weights is None else self.weights[part]
+            sigmas = self.sigmas if self.whitening is None else (1.0, 1.0)
+            shift *= weights / sigmas[0]
             if self.oriented:
-                turn /= self.sigmas[1]
+                turn *= weights / sigmas[1]
+            if self.whitening is not None:
+                shift, turn = self._whitened(shift, turn, part), nothing
             yield part, shift, turn if self.oriented else nothing, model
 
     def products(

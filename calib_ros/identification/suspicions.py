@@ -206,9 +206,14 @@ def lacking(
     return (added, share) if share >= EXPLAINED else ((), 0.0)
 
 
+def coupled(result: Identification) -> bool:
+    """Tell whether couplings of the wrist that are not fitted explain what is left."""
+    return any('.coupling_' in name for name in {*result.posterior.names} - {*result.names})
+
+
 def _coupling(result: Identification) -> str:
     """Return in words that couplings of the wrist explain what is left."""
-    if not any('.coupling_' in name for name in {*result.posterior.names} - {*result.names}):
+    if not coupled(result):
         return ''
     return (
         'couplings of the last joints explain most of the residuals: are the joint values those '

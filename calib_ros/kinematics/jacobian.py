@@ -81,6 +81,7 @@ class ErrorModel:
         q: FloatArray,
         approach: FloatArray | None = None,
         velocity: FloatArray | None = None,
+        out: tuple[FloatArray, FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return pose and derivatives for one block of samples.
 
@@ -92,6 +93,8 @@ class ErrorModel:
             Signs of the velocities before, for backlash.
         velocity : (n, B), optional
             Velocities of the joints, for the delay of the measuring device.
+        out : (P + 1, 3, B), (P_rotational + 1, 3, B), optional
+            Get the derivatives: those of a block before, which are not needed any longer.
 
         Returns
         -------
@@ -114,8 +117,10 @@ class ErrorModel:
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
         se3.cross(axes, target[3] - flat[layout.points], levers[:-1])
-        shift = np.empty((len(self.names) + 1, 3, samples))
-        turn = np.empty((self.rotations + 1, 3, samples))
+        shift, turn = out or (
+            np.empty((len(self.names) + 1, 3, samples)),
+            np.empty((self.rotations + 1, 3, samples)),
+        )
         np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
         np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
         np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')

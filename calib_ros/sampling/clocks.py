@@ -32,9 +32,9 @@ CLOCKS_MOVED = SMOOTHING
 LOOK_AGAIN_NS = 4 * ADVANCE_NS
 """Time between two looks for the delay."""
 EARLY = CLOCKS_MOVED / 2.0**0.5
-"""Time [s] by which measurements of a stop may be stamped too early: as near as one
-delay is told. Of what then shows the arm leaving, most is left out as spikes; the rest moves the
-mean by less than the noise of a measurement."""
+"""Time [s] by which measurements of a stop may be stamped too early: the accuracy of one delay. Of
+what then shows the arm leaving, most is left out as spikes; the rest moves the mean by less than
+the noise of a measurement."""
 
 
 class Watch:

@@ -34,7 +34,7 @@ class Means:
     """The means of what was measured at S stops: `values` (S, 3) or (S, 1) [m].
 
     `used` (N,) are the measurements in them, `spreads` (S,) the RMS of one coordinate about them
-    [m]; at a stop that does not `rests` (S,) measurements spread more than their noise.
+    [m]; where `rests` (S,) is False measurements spread more than their noise.
     """
 
     used: NDArray[np.bool_]

@@ -144,6 +144,20 @@ def test_without_locks_leftovers_are_left_to_the_user(tmp_path, monkeypatch):
     assert (tmp_path / '.out.partial').exists()
 
 
+def test_a_disk_that_cannot_be_written_is_told_by_the_name_asked_for(tmp_path, monkeypatch):
+    def refused(self, *_, **__):
+        if self == tmp_path:
+            return
+        raise OSError(errno.EROFS, 'Read-only file system', str(self))
+
+    for module, name in ((os, 'open'), (Path, 'unlink'), (Path, 'mkdir')):
+        monkeypatch.setattr(module, name, refused)
+    for write in (lambda path: write_file(path, 'A'), lambda path: make(path, 'A')):
+        with pytest.raises(OSError, match='Read-only') as caught:
+            write(tmp_path / 'out')
+        assert caught.value.filename == str(tmp_path / 'out')
+
+
 def test_what_is_no_folder_of_ours_is_not_followed(tmp_path):
     elsewhere = tmp_path / 'elsewhere'
     (elsewhere / 'out').mkdir(parents=True)

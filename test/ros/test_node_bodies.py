@@ -3,7 +3,6 @@
 """A real node that hears a motion capture system; its messages are built for these tests."""
 
 import os
-import sys
 
 import numpy as np
 import pytest
@@ -13,8 +12,6 @@ if 'CI' not in os.environ:
 
 from mocap4r2_msgs.msg import Marker, RigidBodies, RigidBody
 from ros_cell import Cell, direct, joint_messages, pose_messages
-
-from calib_ros.errors import ConfigError
 
 SOURCE = '/rigid_bodies type=RigidBodies parent=tracker child=4'
 
@@ -41,12 +38,3 @@ def test_a_body_is_measured_as_a_pose_would_be(tmp_path, recording):
                 getattr(live.problem().observations, name),
                 getattr(expected.problem().observations, name),
             )
-
-
-def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, 'mocap4r2_msgs.msg', None)
-    with (
-        pytest.raises(ConfigError, match=r'install ros-[a-z]+-mocap4r2-msgs'),
-        Cell(chain='ur10e', sources=[SOURCE], data_dir=str(tmp_path)),
-    ):
-        pass
