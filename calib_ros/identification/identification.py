@@ -247,9 +247,7 @@ def identify(
         With fewer equations than parameters.
 
     """
-    known = None
-    if simpler is not None:
-        known = Simpler(simpler.chain, simpler.distances, simpler.noise)
+    known = None if simpler is None else Simpler(simpler.chain, simpler.distances, simpler.noise)
     structural, start, fitted = fit(problem, known)
     names = fitted.names
     problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
@@ -265,8 +263,7 @@ def identify(
     coarse = rounded(problem)
     wrist, share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     more = (*considered(chain, names), *wrist)
-    size = float(np.sqrt(1.0 - share)) * _size(fitted)
-    posterior = fitted.posterior(size, more, rounding_errors(problem, coarse))
+    posterior = fitted.posterior(_size(fitted, share), more, rounding_errors(problem, coarse))
     found = _findings(fitted, before, posterior, validation, parameters, coarse)
     result = Identification(
         chain=chain,
@@ -323,13 +320,17 @@ def _findings(
     )
 
 
-def _size(fitted: Fitted) -> float:
-    """Return the size of the noise [sigma given]; targets of one stop share what a model lacks."""
+def _size(fitted: Fitted, explained: float) -> float:
+    """Return the size of the noise [sigma given] without the share that is explained.
+
+    Targets of one stop share what a model lacks.
+    """
+    size = float(np.sqrt(1.0 - explained)) * fitted.size
     if fitted.noise.consistent:
-        return fitted.size
+        return size
     numbers = fitted.problem.configurations
     seen = sum(distinct(each) for each in numbers)
-    return fitted.size * float(np.sqrt(seen / distinct(np.concatenate(numbers))))
+    return size * float(np.sqrt(seen / distinct(np.concatenate(numbers))))
 
 
 def _priors(problem: Problem) -> dict[str, float]:
