@@ -16,7 +16,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.progress import share_of
 from calib_ros.report import words
-from calib_ros.report.advice import advice
+from calib_ros.report.advice import WRONG_ARM, advice
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_of
@@ -64,7 +64,11 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     if result.accepted:
         for note in words.notes(result):
             screen.bullet(note)
-    elif result.noise.position > 1.0 and not result.noise.consistent:
+    elif (
+        result.noise.position > 1.0
+        and not result.noise.consistent
+        and {each.rule for each in result.refusals}.isdisjoint(WRONG_ARM)
+    ):
         screen.bullet(words.scatter_in_words(result.noise))
     for line in words.cameras_in_words(result):
         screen.bullet(line)

@@ -59,10 +59,12 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     turning = np.array([joint.type == 'revolute' for joint in chain.joints])
     degrees = _joints(np.diag(np.where(turning, np.radians(1.0), 1.0)))
     if not any(each.socket for each in sets):
-        yield from _units(degrees)
+        yield from _units(chain, degrees)
         if all(each.oriented.any() for each in sets):
             whole = all(each.oriented.all() for each in sets)
-            yield from _conventions(degrees, any(each.inverse for each in sets), whole)
+            in_mm = _lengths(chain, SCALES['mm'])
+            inverse = any(each.inverse for each in sets)
+            yield from _conventions(in_mm, degrees, inverse, whole)
         yield Suspect(
             'the axes of the measuring device are left-handed',
             'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
@@ -89,23 +91,34 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
         )
 
 
-def _units(degrees: Change) -> Iterator[Suspect]:
+def _units(chain: Chain, degrees: Change) -> Iterator[Suspect]:
     """Yield units of lengths, and of angles at the same time."""
+    linear = [k for k, joint in enumerate(chain.joints, 1) if joint.type == 'prismatic']
+    what = 'positions and linear joints' if linear else 'positions'
     for unit, size in SCALES.items():
-        for way, option, scaled in (
-            (f'in {unit}, not metres', f'--length {unit}', _scaled(size)),
-            (f'in metres, not {unit}', '--length m', _scaled(1.0 / size)),
+        for way, option, factor in (
+            (f'in {unit}, not metres', f'--length {unit}', size),
+            (f'in metres, not {unit}', '--length m', 1.0 / size),
         ):
-            yield Suspect(f'the positions are {way}', option, scaled)
+            scaled, positions = _lengths(chain, factor), _scaled(factor)
+            yield Suspect(f'the {what} are {way}', option, scaled)
             yield Suspect(
-                f'the positions are {way} and the joint values in degrees',
+                f'the {what} are {way} and the joint values in degrees',
                 f'{option} --joint-angle deg',
                 _one_by_one(scaled, degrees),
                 2,
             )
+            if linear:
+                alone = _one_by_one(scaled, _scaled(1.0 / factor))
+                for name, columns, change in (
+                    ('positions', 'xyz', positions),
+                    ('linear joints', [f'q{k}' for k in linear], alone),
+                ):
+                    option = ','.join(f'{each}={each}*{factor:g}' for each in columns)
+                    yield Suspect(f'the {name} are {way}', f'--columns {option}', change, 2)
 
 
-def _conventions(degrees: Change, inverse: bool, whole: bool) -> Iterator[Suspect]:
+def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> Iterator[Suspect]:
     """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too.
 
     Only `whole` poses, all with an orientation, may be those of a camera on the flange.
@@ -135,7 +148,6 @@ def _conventions(degrees: Change, inverse: bool, whole: bool) -> Iterator[Suspec
         ),
         (*flange, _as_it_is if inverse else Observations.inverted),
     )
-    in_mm = _scaled(SCALES['mm'])
     for what, remedy, change in ways if whole else ways[:-1]:
         for more, option, others in (
             ('', '', ()),
@@ -233,6 +245,12 @@ def _one_by_one(*changes: Change) -> Change:
 
 def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
     return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
+
+
+def _lengths(chain: Chain, size: float) -> Change:
+    """Return what `--length` changes: positions and the values of prismatic joints."""
+    sizes = [size if joint.type == 'prismatic' else 1.0 for joint in chain.joints]
+    return _one_by_one(_scaled(size), _joints(np.diag(sizes)))
 
 
 def _scaled(size: float) -> Change:

@@ -226,7 +226,15 @@ RULES: dict[Rule, Advice] = {
 
 WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 """Where the description does not fit the arm; the first of them that is there is the cause."""
-FOLLOWING = {*WRONG_ARM, Rule.GAIN, Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
+FOLLOWING = {
+    *WRONG_ARM,
+    Rule.CONVERGENCE,
+    Rule.DRIFT,
+    Rule.GAIN,
+    Rule.REGION,
+    Rule.ORIENTATION,
+    Rule.SCALE,
+}
 """What a description that does not fit brings by itself."""
 
 

@@ -88,6 +88,22 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     assert 5.0 * found.so < found.given
 
 
+@pytest.mark.parametrize(
+    ('travel', 'positions', 'remedy'),
+    [
+        (1e3, 1e3, '--length mm'),
+        (1e3, 1.0, '--columns q1=q1*0.001'),
+        (1.0, 1e3, '--columns x=x*0.001,y=y*0.001,z=z*0.001'),
+    ],
+)
+def test_linear_joints_in_millimetres_are_named(travel, positions, remedy):
+    rail = load_chain('ur10e_on_linear_axis')
+    seen = seen_of(rail)
+    sizes = [travel if joint.type == 'prismatic' else 1.0 for joint in rail.joints]
+    spoilt = replace(seen, joints=seen.joints * sizes, positions=positions * seen.positions)
+    assert remedy in str(explained(Problem(rail, spoilt)))
+
+
 def test_another_robot_and_the_other_convention_are_named():
     seen = seen_of()
     assert '--chain ur10e' in str(explained(Problem(load_chain('ur5e'), seen)))

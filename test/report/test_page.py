@@ -173,7 +173,7 @@ def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
 
 
 def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
-    rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.CONVERGENCE)
+    rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.OUTLIERS)
     told = advice.advice([Reason(rule, rule.name) for rule in rules], 1000.0)
     assert [bool(each.steps) for each in told] == [True, False, False, True]
     assert [each.meaning == advice.FOLLOWS for each in told] == [False, True, True, False]
