@@ -67,13 +67,15 @@ class Entry:
                     if count:
                         self.miss(JOINTS, count, cause)
                 places, stamps, values = places[good], stamps[good], values[good]
+            if not len(stamps):
+                continue
             self.received[JOINTS] += len(stamps)
-            if len(columns) == self._joint_count and len(stamps) and places[-1] > latest:
+            if len(columns) == self._joint_count and places[-1] > latest:
                 latest = int(places[-1])
                 self.latest = (int(stamps[-1]), values[-1].tolist())
             if recording:
                 yield Piece(columns, places, stamps, values)
-            elif len(stamps):
+            else:
                 self.unused['joints: not recording'] += len(stamps)
 
     def _measured(self, parts: Sequence[Part], recording: bool, wanted: str) -> Iterator[Piece]:

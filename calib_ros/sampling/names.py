@@ -17,6 +17,7 @@ from calib_ros.settings import EXCEPTION
 from calib_ros.values import MOST_NAMES
 
 Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
+OTHERS = 'none of the joints in the message'
 
 
 class JointNames:
@@ -44,7 +45,7 @@ class JointNames:
             self.foreign = tuple(sorted(named)) if missing else ()
         layout = self._layouts[key]
         if not layout[0]:
-            raise MessageError('none of the joints in the message')
+            raise MessageError(OTHERS)
         return layout
 
     def foreign_ones(self, missing: Sequence[int]) -> str:

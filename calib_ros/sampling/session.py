@@ -25,7 +25,7 @@ from calib_ros.sampling.entry import Entry, Part
 from calib_ros.sampling.hints import Hint, progress
 from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
-from calib_ros.sampling.names import FrameNames, JointNames
+from calib_ros.sampling.names import OTHERS, FrameNames, JointNames
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.problems import (
     check_joint_names,
@@ -37,7 +37,7 @@ from calib_ros.sampling.problems import (
 )
 from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import Sample, named, socket_place
-from calib_ros.sampling.slices import POSES, SILENCE
+from calib_ros.sampling.slices import JOINTS, POSES, SILENCE
 from calib_ros.sampling.strays import STRAY
 from calib_ros.settings import Settings
 
@@ -143,6 +143,8 @@ class CalibrationSession:
         self._road.hand_over()
         self._settle(wait=True)
         taken = len(self.samples) - before
+        if self._collector.track.missing and self._refused:
+            why = self.state
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
     def remove_last(self) -> Sample:
@@ -188,7 +190,21 @@ class CalibrationSession:
         silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
         if silent:
             return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
-        return self._names.foreign_ones(track.missing) or self._collector.state()
+        if others := self._names.foreign_ones(track.missing):
+            return others
+        if track.missing and self._refused:
+            return f'waiting for joint states; of those that came {self._refused}'
+        return self._collector.state()
+
+    @property
+    def _refused(self) -> str:
+        """Return in words how many joint states were refused, and why; empty if none were."""
+        dropped = sorted(self._entry.dropped.items())
+        return ', '.join(
+            f'{count} x {cause.partition(": ")[2]}'
+            for cause, count in dropped
+            if cause.startswith(JOINTS) and not cause.endswith(OTHERS)
+        )
 
     def account(self) -> Account:
         """Return what became of the messages so far."""

@@ -102,6 +102,18 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
     )
 
 
+@pytest.mark.parametrize(
+    ('stamp', 'value', 'cause'),
+    [(10**18, np.nan, 'NaN or infinite joint value'), (0, 0.1, 'zero stamp')],
+)
+def test_the_status_tells_why_no_joint_state_is_used(stamp, value, cause):
+    made = session()
+    take(made, *[of_joints(joint_state(stamp, UR5E.joint_names, [value] * 6))] * 50)
+    said = f'waiting for joint states; of those that came 50 x {cause}'
+    assert made.status().startswith(said)
+    assert made.capture() == (0, said)
+
+
 def test_the_status_is_never_an_error():
     only_judging = session(samples(10, validation=True))
     assert '; 0 poses' in only_judging.status()
