@@ -9,10 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib_ros.identification.configurations import configurations, distinct
 from calib_ros.identification.levels import NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.live import Estimate, barely_moved
+from calib_ros.sampling.live import START, Estimate, barely_moved
+from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.settings import EXCEPTION, Settings
 
@@ -91,6 +93,25 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
         f'clocks moved after about {max(count for _, count in steps)} poses: make them agree',
         f'the stamps of the measurements moved against those of the joint states {words} poses: '
         'make the clocks agree, and measure again what came after',
+    )
+
+
+def frozen(samples: Sequence[Sample]) -> Hint | None:
+    """Tell that a device measures the same to the nanometre wherever the arm is, if it does."""
+    places: dict[tuple[object, ...], list[FloatArray]] = {}
+    for each in samples:
+        if each.position is not None and not each.socket:
+            key = (each.session, each.device, each.target, *each.position.round(9).tolist())
+            places.setdefault(key, []).append(each.joints)
+    place, joints = max(places.items(), key=lambda item: len(item[1]), default=((), []))
+    if len(joints) < START or distinct(configurations(np.array(joints))) < START:
+        return None
+    where = ', '.join(f'{value:g}' for value in place[3:])
+    return Hint(
+        f'{len(joints)} poses are one and the same: is the device frozen?',
+        f'{len(joints)} poses are at {where} m, though the arm was elsewhere each time: does the '
+        'device see the target, and does its driver send what it measures now? Clear and measure '
+        'again',
     )
 
 

@@ -22,7 +22,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, Part
-from calib_ros.sampling.hints import Hint, progress
+from calib_ros.sampling.hints import Hint, frozen, progress
 from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.names import OTHERS, FrameNames, JointNames
@@ -242,6 +242,8 @@ class CalibrationSession:
         found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
+        if hint := frozen(self.samples):
+            found.append(hint)
         return found + self._road.hints(self.received[POSES])
 
     @property
