@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import mmap
 import re
+import shutil
 import sqlite3
 import struct
 from collections.abc import Iterable, Iterator, Mapping
@@ -49,20 +50,47 @@ def recorded(path: Path) -> int | None:
 
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
-    """Give a bag folder whose files are not compressed: it itself, or one that goes away again."""
-    packed = sorted(path.glob('*.zstd')) if path.is_dir() else []
-    if not packed:
+    """Give a bag whose files are whole: it itself, or one that goes away again.
+
+    Neither are they compressed, nor is a part of them in a write-ahead log beside.
+    """
+    files = _files(path, '.mcap', '.db3', '.zstd')
+    if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
         yield path
         return
     with TemporaryDirectory() as name:
         folder = Path(name)
-        for file in packed:
-            _unpack_file(file, folder / file.stem)
+        for file in files:
+            if file.suffix != '.zstd':
+                _with_log(file, folder / file.name)
+            elif not (folder / file.stem).exists():
+                _unpack_file(file, folder / file.stem)
         with suppress(ConfigError):
-            text = read_text(path / 'metadata.yaml')
+            text = read_text((path if path.is_dir() else path.parent) / 'metadata.yaml')
             text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
             (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
-        yield folder
+        yield folder if path.is_dir() else folder / path.name
+
+
+def _log(file: Path) -> Path:
+    """Return where a database has its write-ahead log while it is written, or was when killed."""
+    return file.with_name(f'{file.name}-wal')
+
+
+def _with_log(file: Path, target: Path) -> None:
+    """Copy a file that has a log, with what is in it; link to one that has none."""
+    if not _log(file).is_file():
+        target.symlink_to(file.resolve())
+        return
+    shutil.copyfile(file, target)
+    shutil.copyfile(_log(file), _log(target))
+    try:
+        with closing(sqlite3.connect(target)) as connection:
+            connection.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+    except sqlite3.OperationalError as err:  # of a full disk
+        raise InputError(f'{_log(file)} cannot be applied to a copy of {file}: {err}') from err
+    except sqlite3.DatabaseError:  # no database; what is missing will be told
+        return
 
 
 def _unpack_file(file: Path, target: Path) -> None:
@@ -136,9 +164,9 @@ def salvage(path: Path) -> Salvage | None:
     return found if found.count else None
 
 
-def _files(path: Path) -> tuple[Path, ...]:
+def _files(path: Path, *kinds: str) -> tuple[Path, ...]:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return tuple(file for file in files if file.suffix in ('.mcap', '.db3'))
+    return tuple(file for file in files if file.suffix in (kinds or ('.mcap', '.db3')))
 
 
 def _open(file: Path) -> sqlite3.Connection:

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
 import shutil
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -73,6 +75,31 @@ def test_a_bag_that_was_never_closed_is_read(tmp_path, storage):
     session, warnings = session_of(path)
     assert_equal(session.problem().observations, whole)
     assert len(warnings) == 1
+
+
+@pytest.mark.parametrize('alone', [True, False])
+def test_the_log_beside_a_database_is_read_and_left_as_it_is(tmp_path, long_bags, alone):
+    """Of a recorder that was killed, what came last is in its write-ahead log only."""
+    folder, whole = long_bags
+    (file,) = shutil.copytree(folder / 'sqlite3', tmp_path / 'at work').glob('*.db3')
+    path = tmp_path / 'bag'
+    path.mkdir()
+    with closing(sqlite3.connect(file, isolation_level=None)) as recorder:
+        recorder.execute('PRAGMA journal_mode=WAL')
+        recorder.execute('CREATE TEMP TABLE last AS SELECT * FROM messages WHERE id > 100')
+        recorder.execute('DELETE FROM messages WHERE id > 100')
+        recorder.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+        recorder.execute('INSERT INTO messages SELECT * FROM last')
+        for each in (file, file.with_name(f'{file.name}-wal')):
+            shutil.copy(each, path)
+            (path / each.name).chmod(0o444)
+    before = {each: each.read_bytes() for each in path.iterdir()}
+    path.chmod(0o555)
+    session, warnings = session_of(path / file.name if alone else path)
+    path.chmod(0o755)
+    assert_equal(session.problem().observations, whole)
+    assert len(warnings) == (0 if alone else 1)  # without metadata it was not closed
+    assert {each: each.read_bytes() for each in path.iterdir()} == before
 
 
 @storages
