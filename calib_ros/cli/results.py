@@ -16,11 +16,11 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.progress import share_of
 from calib_ros.report import words
-from calib_ros.report.advice import WRONG_ARM, advice
+from calib_ros.report.advice import WRONG_ARM
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_of
-from calib_ros.report.reports import identification_report
+from calib_ros.report.reports import identification_report, reasons_of
 from calib_ros.settings import Settings
 
 RESULT_FILES = (
@@ -59,7 +59,7 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
     else:
         screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
     screen.table(_rows(result))
-    for each in advice(result.refusals, result.noise.position):
+    for each in reasons_of(result):
         screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if result.accepted:
         for note in words.notes(result):

@@ -224,6 +224,14 @@ RULES: dict[Rule, Advice] = {
 }
 
 
+GOOD_ARM = Advice(
+    'There is nothing to correct that this device could see',
+    'The error is within the stated noise of the measuring device: the arm is as good as this '
+    'device can see.',
+    ('To look for smaller errors, measure with a more accurate device.',),
+)
+"""In place of `Rule.GAIN`, where the error before is no larger than the noise."""
+
 WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 """Where the description does not fit the arm; the first of them that is there is the cause."""
 FOLLOWING = {

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,11 +17,12 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
-from calib_ros.report.advice import SPREAD, Advice, advice
+from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
 from calib_ros.report.sections import (
+    INTERVAL,
     ISO_9283,
     accuracy_section,
     coverage,
@@ -44,7 +46,7 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
-    reasons = advice(result.refusals, result.noise.position)
+    reasons = reasons_of(result)
     limits = limits_of(judged, 1, CONFIDENT)
     return Report(
         kind='Kinematic calibration',
@@ -104,19 +106,26 @@ def _verdict(
     )
 
 
+def reasons_of(result: Identification) -> tuple[Advice, ...]:
+    """Return why a result was refused, in plain words, and what to do.
+
+    What the fit left, by its ratio to the stated noise, is that noise in the same figure. A fit of
+    few poses leaves less, and does not show that an arm is good.
+    """
+    judged, noise = result.validation, result.noise.position
+    if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
+        lower, _ = limits_of(judged, 0, INTERVAL)
+        if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
+            return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
+    return advice(result.refusals, noise)
+
+
 def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
     """Return why nothing is corrected: an arm with no error that the device sees is no bad one."""
     tried = 'No correction was saved or sent to the robot. The figures show what was tried.'
-    noise = result.noise
-    if {each.rule for each in result.refusals} == {Rule.GAIN} and (
-        noise.consistent or noise.position < 1.0
-    ):
-        why = (
-            'Not accepted, because the error is within the stated noise of the measuring device: '
-            'the arm is as good as this device can see.'
-        )
-        heading = 'Nothing to correct: the robot stays as it was'
-        return Verdict('info', heading, (why, tried, *_left(result)))
+    if reasons[0].heading == GOOD_ARM.heading:
+        heading = 'Not accepted, nothing to correct: the robot stays as it was'
+        return Verdict('info', heading, (GOOD_ARM.meaning, tried, *_left(result)))
     whys = '. '.join(each.heading for each in reasons if each.steps)
     found = [f'What was found: {x}.' for x in result.refusals if x.rule is Rule.MISTAKE]
     heading = 'Not accepted: the robot stays as it was'
@@ -140,6 +149,8 @@ def _steps(
     tolerance: float | None,
 ) -> tuple[str, ...]:
     """Return what to do with a result."""
+    if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
+        return ()
     if not result.accepted:
         return (
             'Follow the steps above, those of the first reason first.',

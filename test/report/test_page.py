@@ -15,6 +15,7 @@ from measured import TEST, TRAIN, TRUE, UR, measured
 from pages import Page, page_of, problem_of, report_of
 from plotly import graph_objects
 
+from calib_ros.apply import simulation
 from calib_ros.apply.verification import verify
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
@@ -170,6 +171,20 @@ def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
     (coarse,) = advice.advice([Reason(rule, 'little gain')], 47.6)
     assert '48 times' in coarse.steps[0]
     assert coarse.steps[1:] == usual.steps
+
+
+@pytest.mark.parametrize(('share', 'count', 'state'), [(0.0, 60, 'info'), (0.5, 8, 'bad')])
+def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
+    """Few poses that do not show a gain do not show a good arm either."""
+    rng = np.random.default_rng(1)
+    true = simulation.faulty(UR, simulation.Cell(), rng)
+    names = [name for joint in UR.joints for name in joint.parameters]
+    arm = UR.with_offsets({name: share * true.offset(name, UR) for name in names})
+    rows = simulation.measure(arm, UR.random_joints(count, rng), rng, 3e-4, 6e-4)
+    problem = Problem(UR, rows, sigma_position=3e-4, sigma_orientation=6e-4)
+    result = identify(problem)
+    assert {each.rule for each in result.refusals} == {Rule.GAIN}
+    assert report_of(problem, result).verdict.state == state
 
 
 def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
