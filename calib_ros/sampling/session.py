@@ -242,7 +242,7 @@ class CalibrationSession:
         found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
-        if hint := frozen(self.samples):
+        if frozen(self.samples[-RECENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
         return found + self._road.hints(self.received[POSES])
 
