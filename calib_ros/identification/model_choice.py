@@ -50,7 +50,8 @@ def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Ide
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
         return identify(problem, progress=progress)
-    poses, columns = sum(map(len, problem.sets)), 2 * len(HARMONICS) * len(problem.chain.joints)
+    poses = max(1, sum(map(len, problem.sets)))  # of none nothing is fitted
+    columns = 2 * len(HARMONICS) * len(problem.chain.joints)
     fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
     first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
     result = identify(problem, progress=share_of(progress, 0.0, first))

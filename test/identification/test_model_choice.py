@@ -7,7 +7,7 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.errors import UnknownNameError
+from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import Observations
@@ -215,6 +215,14 @@ def test_a_model_is_named_in_the_settings(rng):
     with pytest.raises(UnknownNameError, match='ratio') as caught:
         Problem(UR10E, seen, **Settings(model='ratio+excentricity').for_problem())
     assert caught.value.name == 'excentricity'
+
+
+@pytest.mark.filterwarnings('error')
+def test_no_poses_are_refused_in_words(rng):
+    """A choice of models says the same of nothing to fit as one model does, without a warning."""
+    nothing = measure(UR10E, UR10E.random_joints(1, rng), rng, *NOISE).select(np.zeros(1, bool))
+    with pytest.raises(InputError, match='no pairs to fit'):
+        identify_model(Problem(UR10E, nothing, **SIGMAS), 'auto')
 
 
 def test_few_poses_leave_the_geometric_result(rng):
