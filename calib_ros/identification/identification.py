@@ -323,9 +323,9 @@ def _findings(
 def _size(fitted: Fitted, explained: float) -> float:
     """Return the size of the noise [sigma given] without the share that is explained.
 
-    Targets of one stop share what a model lacks.
+    No explanation makes it smaller than that given. Targets of one stop share what a model lacks.
     """
-    size = float(np.sqrt(1.0 - explained)) * fitted.size
+    size = max(float(np.sqrt(1.0 - explained)) * fitted.size, min(fitted.size, 1.0))
     if fitted.noise.consistent:
         return size
     numbers = fitted.problem.configurations
