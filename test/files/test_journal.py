@@ -185,6 +185,16 @@ def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, conten
     assert path.read_text() == content
 
 
+@pytest.mark.parametrize('tail', [b'', b'1,2', b'\0' * 10, b'\0' * 200_000])
+def test_what_a_crash_left_behind_the_last_row_is_cut_off(tmp_path, tail):
+    path = tmp_path / 'cell.csv'
+    Journal(path, JOINTS).close()
+    rows = path.read_bytes() + b'1,2,3\n' * 20_000
+    path.write_bytes(rows + tail)
+    Journal(path, JOINTS).close()
+    assert path.read_bytes() == rows
+
+
 WRITER = """
 import sys
 from pathlib import Path
