@@ -218,7 +218,7 @@ def test_a_full_disk(tmp_path, recording):
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
         unsaved = cell.call('save')
         assert not unsaved.success
-        assert 'File too large' in unsaved.message
+        assert 'too large for this disk' in unsaved.message
         assert unsaved.message.endswith('write to another place')
         assert [each.name for each in tmp_path.iterdir() if 'yaml' in each.name] == [
             path.with_suffix('.settings.yaml').name
