@@ -15,7 +15,7 @@ AMENT = (
     *('ros', 'target-dependencies', 'test', 'version'),
 )
 SHARE = f'share/{NAME}'
-BAGS = 'rosbags>=0.11.0'
+BAGS = 'rosbags>=0.11.6'
 REPORT = ['jinja2>=3.1.2', 'plotly>=5.15.0']
 # Ubuntu 24.04 has it with the libraries that it needs.
 PDF = 'weasyprint>=61.1'

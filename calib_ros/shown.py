@@ -16,8 +16,8 @@ from calib_ros.errors import ConfigError
 
 NAMED = 5
 """Things of a kind that a sentence names."""
-LISTED = 20
-"""Things of a kind that a table or a longer text lists."""
+LISTED = 4 * NAMED
+"""Things of a kind that a table or a longer text lists, as four sentences."""
 
 
 def some(words: Sequence[str], most: int = NAMED) -> list[str]:

@@ -6,12 +6,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError
+from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError, UnknownNameError
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
@@ -44,6 +45,23 @@ def parse_number(
     if abs(number) > largest:
         raise error(f'{where} must be at most {largest:g}, not {number:g}')
     return number
+
+
+def parse_mapping(
+    value: object, keys: Sequence[str], where: str, needed: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return a mapping from YAML that has no other keys, and those that are needed."""
+    if not isinstance(value, dict):
+        raise ConfigError(
+            f'{where} must be a mapping with the keys {", ".join(keys)}, not {value!r:.100}'
+        )
+    for key in value:
+        if key not in keys:
+            raise UnknownNameError(f'key in {where}', str(key), keys)
+    for key in needed:
+        if value.get(key) is None:
+            raise ConfigError(f'{where}: key "{key}" is missing')
+    return value
 
 
 def parse_name(value: object, where: str) -> str:

@@ -40,13 +40,12 @@ def next_pose(
     candidates: FloatArray,
     task: FloatArray,
     wanted: float,
-    criterion: Criterion = 'd',
 ) -> Suggestion:
     """Return the next best pose of candidates (N, n), after those that the design knows.
 
     `task` (T, n) are poses at which the RMS error of position is to be `wanted` [m].
     """
-    index = choose(design, candidates, 1, criterion, task)
+    index = choose(design, candidates, 1)
     now, then = predicted(design, task), predicted(design.after(candidates[index]), task)
     return Suggestion(candidates[index[0]], now, then, now <= wanted)
 
@@ -102,13 +101,16 @@ def plan(
     velocities: FloatArray | None = None,
     draws: int = 25,
     told: Told = nobody,
+    chosen: NDArray[np.intp] | None = None,
 ) -> Plan:
     """Plan a number of measurements, and compare them with so many random draws.
 
-    `choose` and `visit_order` say what the other arguments mean.
+    `chosen` are indices that `fewest` found already; `choose` and `visit_order` say what the other
+    arguments mean.
     """
     excited = design.determined_by(candidates)
-    chosen = choose(excited, candidates, count, criterion, task, apart, told)
+    if chosen is None:
+        chosen = choose(excited, candidates, count, criterion, task, apart, told)
     joints = candidates[chosen]
     speeds = np.ones(joints.shape[1]) if velocities is None else velocities
     visit = visit_order(joints, speeds)
@@ -131,7 +133,7 @@ def plan(
     )
 
 
-def poses_needed(
+def fewest(
     design: Design,
     candidates: FloatArray,
     task: FloatArray,
@@ -139,8 +141,11 @@ def poses_needed(
     criterion: Criterion = 'd',
     apart: float = STILL,
     told: Told = nobody,
-) -> int:
-    """Return how many poses bring the RMS position error at task poses (T, n) to `wanted` [m]."""
+) -> NDArray[np.intp]:
+    """Return the indices (K,) of the fewest poses with the accuracy `wanted`, the best first.
+
+    It is the predicted RMS position error [m] at the task poses (T, n).
+    """
     excited = design.determined_by(candidates)
     best = predicted(excited.after(candidates), task)
     if best > wanted:
@@ -151,18 +156,24 @@ def poses_needed(
     count = len(excited.names)  # poses determine several parameters each
     while True:
         count = min(count, len(candidates))
-        chosen = choose(excited, candidates, count, criterion, task, apart, told)
-        reached = np.flatnonzero(accuracy(excited, candidates[chosen], task) <= wanted)
-        if reached.size:
+        found = choose(excited, candidates, count, criterion, task, apart, told, exchanged=False)
+        errors = accuracy(excited, candidates[found], task)
+        if errors[-1] <= wanted:
             break
-        count *= 2
-    count = int(reached[0]) + 1
-    while count > 1:  # the first of many are not quite the best of few
-        fewer = choose(excited, candidates, count - 1, criterion, task, apart, told)
-        if accuracy(excited, candidates[fewer], task)[-1] > wanted:
+        growth = (errors[-1] / wanted) ** 2  # errors fall with the root of the number
+        count = max(count + 1, int(count * min(growth, 2.0)))
+    reached = int(np.flatnonzero(errors <= wanted)[0]) + 1
+    while reached > 1:  # the first of many are not quite the best of few
+        start = found[:reached] if reached < len(found) else found[: reached - 1]
+        for begin in (start, None):  # the quick way first
+            fewer = choose(excited, candidates, len(start), criterion, task, apart, told, begin)
+            errors = accuracy(excited, candidates[fewer], task)
+            if errors[-1] <= wanted:
+                break
+        else:
             break
-        count -= 1
-    return count
+        found, reached = fewer, int(np.flatnonzero(errors <= wanted)[0]) + 1
+    return found[:reached]
 
 
 def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> str:

@@ -29,6 +29,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
@@ -187,8 +188,8 @@ def verify(
         know, or measurements far from all that was commanded.
 
     """
-    _check(arm.chain, sets, tolerance, confidence)
     fitted = ('base',) * new_base + ('tool',) * new_tool
+    _check(arm.chain, sets, tolerance, confidence, fitted)
     comparison, left = _compared(arm, sets, commanded, fitted)
     told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
@@ -199,7 +200,9 @@ def verify(
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     verdict = _decided(tolerance, lower, upper, numbers)
-    common = 1.0 if new_base else _rms(moments_of(left, group), LOST['base'], least=0) / rms
+    common = 1.0
+    if not new_base and all(each.pixels is None for each in sets):  # which have no positions
+        common = _rms(moments_of(left, group), LOST['base'], least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, arm.holds(rms), arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
@@ -248,7 +251,11 @@ def _decided(
 
 
 def _check(
-    chain: Chain, sets: Sequence[Observations], tolerance: float | None, confidence: float
+    chain: Chain,
+    sets: Sequence[Observations],
+    tolerance: float | None,
+    confidence: float,
+    fitted: tuple[str, ...],
 ) -> None:
     """Refuse limits that are none, and measurements that the calibration says nothing about."""
     if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
@@ -264,18 +271,23 @@ def _check(
                 f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
                 f'{each.base} and {each.tool}: measure with the same device and target'
             )
+        if fitted and each.pixels is not None:
+            raise InputError(
+                'images do not tell a new place of base or tool: leave both as they were for the '
+                'calibration, or measure poses'
+            )
 
 
 def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
     """Return the commanded joint values (N, n) that are nearest to those measured (N, n)."""
-    away = np.abs(joints[:, np.newaxis] - commanded).max(axis=2)
-    far = np.flatnonzero(away.min(axis=1) > Compensator.largest_turn)  # more than is corrected
+    away, nearest = cKDTree(commanded).query(joints, p=np.inf)
+    far = np.flatnonzero(away > Compensator.largest_turn)  # more than is corrected
     if far.size:
         raise InputError(
-            f'measurement {far[0] + 1} was taken {away.min(axis=1)[far[0]]:.3g} rad or m from '
+            f'measurement {far[0] + 1} was taken {away[far[0]]:.3g} rad or m from '
             'the nearest commanded joint values: is it of that program?'
         )
-    return np.asarray(commanded[away.argmin(axis=1)])
+    return np.asarray(commanded[nearest])
 
 
 def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str, ...]) -> Chain:

@@ -147,9 +147,7 @@ def _add_identify(parser: argparse.ArgumentParser) -> None:
     common.add_out(group, 'calibration, result and report')
     common.add_history(group)
     group.add_argument('--json', action='store_true', help='print the result as JSON')
-    group.add_argument(
-        '--tolerance', type=float, metavar='MM', help='wanted RMS position error, for the report'
-    )
+    group.add_argument('--tolerance', type=float, metavar='MM', help='wanted RMS position error')
     common.add_detections(parser)
     common.add_settings(parser)
     common.add_layout(parser)

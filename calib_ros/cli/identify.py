@@ -61,7 +61,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))
     else:
-        show(found, screen, options.out)
+        show(found, screen, options.out, options.tolerance)
     return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 

@@ -90,13 +90,15 @@ def _measurement(
         if not len(candidates):
             raise InputError(f'the target can be measured at no pose of {options.candidates}')
     choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
-    needed = None
+    needed = chosen = None
     if options.accuracy is not None:
         wanted = 1e-3 * options.accuracy
-        needed = planning.poses_needed(design, candidates, task, wanted, **choice)
+        fewest = planning.fewest(design, candidates, task, wanted, **choice)
+        needed = len(fewest)
+        chosen = fewest if options.poses in (None, needed) else None
     count = options.poses or needed or 25
-    speeds = np.broadcast_to(options.velocity, size)
-    plan = planning.plan(design, candidates, task, count, **choice, velocities=speeds)
+    choice |= {'velocities': np.broadcast_to(options.velocity, size), 'chosen': chosen}
+    plan = planning.plan(design, candidates, task, count, **choice)
     words = planning.in_words(plan, len(candidates), options.accuracy, needed)
     return plan.joints[plan.visit], words, plan
 

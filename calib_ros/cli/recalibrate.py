@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from calib_ros.cli import options as common
 from calib_ros.cli.given import calibration_of
+from calib_ros.cli.results import set_aside
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.recalibration import Recalibration, recalibrate, years_since
@@ -24,6 +25,8 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
         contents['result.json'] = _document(found)
         if found.accepted:
             contents['calibration.yaml'] = found.calibration.dump()
+        elif options.out is not None:
+            contents |= set_aside(options.out)
     if options.json:
         screen.data(_document(found))
     else:

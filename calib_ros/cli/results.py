@@ -20,7 +20,7 @@ from calib_ros.report.advice import WRONG_ARM
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_of
-from calib_ros.report.reports import identification_report, reasons_of
+from calib_ros.report.reports import identification_report, reasons_of, within_tolerance
 from calib_ros.settings import Settings
 
 RESULT_FILES = (
@@ -49,13 +49,22 @@ def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origi
         return Identified(loaded, loaded.identified(settings.model, work), origin)
 
 
-def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
-    """Print a result: the verdict, six rows, and each reason or note once."""
+def show(
+    found: Identified, screen: Screen, out: Path | None = None, tolerance: float | None = None
+) -> None:
+    """Print a result: the verdict, six rows, and each reason or note once.
+
+    `tolerance` is the wanted error [mm].
+    """
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
     if result.accepted:
-        screen.title('accepted: the calibration makes the arm better', True)
+        within = within_tolerance(result.validation or result.fitted, _in_metres(tolerance))
+        title = 'accepted: the calibration makes the arm better'
+        if within:
+            title = f'accepted: the arm gets better, {within}'
+        screen.title(title, None if 'not' in within else True)
     else:
         screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
     screen.table(_rows(result))
@@ -76,6 +85,10 @@ def show(found: Identified, screen: Screen, out: Path | None = None) -> None:
         screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
     else:
         screen.say(f'wrote {out}: open {out / "report.html"}')
+
+
+def _in_metres(tolerance: float | None) -> float | None:
+    return None if tolerance is None else 1e-3 * tolerance
 
 
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
@@ -140,16 +153,20 @@ def result_files(
         contents['before_after.png'] = before_after_png(result)
         work('report.html, 3 of 3')
         work(2 / 3)
-        wanted = None if tolerance is None else 1e-3 * tolerance
+        wanted = _in_metres(tolerance)
         report = identification_report(
             loaded.problem, result, poses, found.origin, found.loaded.warnings, wanted
         )
         contents['report.md'] = markdown(report, loaded.samples)
         contents |= page_of(report, screen, pdf=pdf)
-    earlier = out / 'calibration.yaml'
     if result.accepted:
         kept = Calibration.of(result, owners=loaded.owners, fitted=loaded.problem.sets)
         contents['calibration.yaml'] = kept.dump()
-    elif earlier.exists():
-        contents['calibration.previous.yaml'] = earlier.read_bytes()
-    return contents
+        return contents
+    return contents | set_aside(out)
+
+
+def set_aside(out: Path) -> dict[str, bytes]:
+    """Return the calibration that was accepted earlier, if any, under another name."""
+    earlier = out / 'calibration.yaml'
+    return {'calibration.previous.yaml': earlier.read_bytes()} if earlier.exists() else {}

@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from calib_ros.atomic import whole_folder, write_file, write_files
+from calib_ros.atomic import whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
 from calib_ros.files.journal import Journal
 from calib_ros.files.tables import read_journal
@@ -25,7 +25,7 @@ CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
 class Archive:
     """Files ROBOT_TIME of one robot in a folder, which is made if there is none.
 
-    The robot's name has its serial number if there are several. `configuration` returns what to
+    The robot's name tells it from others of its kind. `configuration` returns what to
     write beside a journal.
     """
 
@@ -35,7 +35,7 @@ class Archive:
         self.folder = folder
         self.error = ''
         """Why poses are in memory only; empty while all are in the journal."""
-        self._robot = re.sub(r'[^\w.-]', '_', robot)
+        self._robot = re.sub(r'/+|[^\w.-]', '_', robot)
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None
@@ -144,13 +144,9 @@ class Archive:
         The configuration by which it was made, where that is known, is written beside it.
         """
         path = path or self._new_path(CALIBRATION)
-        beside = path.with_suffix(SETTINGS)
-        if configuration and beside.exists():
-            raise InputError(f'{beside} exists already: move it or choose another name')
+        beside = {path.with_suffix(SETTINGS): configuration} if configuration else {}
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, text)
-        if configuration:
-            write_file(beside, configuration)
+        write_together({path: text, **beside})
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:

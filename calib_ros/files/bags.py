@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files.cameras import cameras_of
-from calib_ros.files.mcap import LARGEST_CHUNK
 from calib_ros.files.salvage import (
     NOT_CLOSED,
     Salvage,
@@ -29,7 +27,7 @@ from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.account import Account
-from calib_ros.sampling.intake import BATCH, Deserialise, Stream, feed, links_of
+from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
@@ -310,17 +308,6 @@ def _decodable(messages_on: Reading) -> Reading:
     return lambda streams: (each for each in messages_on(streams) if _is_message(*each))
 
 
-def _extend(batch: list[tuple[Stream, bytes]], messages: Iterator[tuple[Stream, bytes]]) -> bool:
-    """Add messages to a batch, up to an error; return whether they have ended."""
-    size = 0
-    for each in itertools.islice(messages, BATCH):
-        batch.append(each)
-        size += len(each[1]) if isinstance(each[1], bytes) else 0
-        if size > LARGEST_CHUNK:  # images
-            return False
-    return len(batch) < BATCH
-
-
 def _feed(
     session: CalibrationSession,
     messages: Iterator[tuple[Stream, bytes]],
@@ -328,13 +315,10 @@ def _feed(
     told: Callable[[int], None] = lambda count: None,
 ) -> tuple[int, str | None]:
     """Feed serialised messages, and tell how many so far; return that and what is wrong if any."""
-    count, problem, ended = 0, None, False
-    while not ended:
-        batch: list[tuple[Stream, bytes]] = []
-        try:
-            ended = _extend(batch, messages)
-        except Exception as err:  # see `replay`
-            problem, ended = str(err) or type(err).__name__, True
+    count, problem = 0, None
+    for batch, err in batches(messages):
+        if err is not None:
+            problem = str(err) or type(err).__name__
         usable = [each for each in batch if _is_message(*each)]
         problems = feed(session, usable, deserialise)
         count += len(usable) - len(problems)

@@ -38,7 +38,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
 from calib_ros.texts import csv_text, parse_yaml, read_text
-from calib_ros.values import parse_number
+from calib_ros.values import parse_mapping, parse_number
 
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
@@ -71,9 +71,9 @@ class Board:
                 raise ConfigError(
                     f'{name} of a board must be from {least} to {MOST_ENTRIES}, not {count}'
                 )
-        if not 0.0 < self.marker < self.square:
+        if not 0.0 < self.marker < self.square < 1.0:
             raise ConfigError(
-                f'a board needs 0 < marker < square in metres, not {self.marker:g} and '
+                f'a board needs 0 < marker < square < 1 in metres, not {self.marker:g} and '
                 f'{self.square:g}'
             )
 
@@ -114,15 +114,8 @@ class Board:
 
 def read_board(path: Path) -> Board:
     """Read the YAML of a board."""
-    content = parse_yaml(read_text(path, what='board '), str(path))
-    if not isinstance(content, dict):
-        raise ConfigError(f'{path} must be a mapping with the keys {", ".join(KEYS)}')
-    for key in content:
-        if key not in KEYS:
-            raise UnknownNameError(f'key in {path}', str(key), KEYS)
-    for key in KEYS[:-1]:
-        if key not in content:
-            raise ConfigError(f'{path}: key "{key}" is missing')
+    text = read_text(path, what='board ')
+    content = parse_mapping(parse_yaml(text, str(path)), KEYS, str(path), KEYS[:-1])
     counts = {}
     for key in ('columns', 'rows'):
         if type(content[key]) is not int:
@@ -160,8 +153,8 @@ def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], wh
         raise ConfigError(f'{where}: distortion_model must be plumb_bob, not {model!r}')
     if len(matrix) != 9:
         raise ConfigError(f'{where}: camera_matrix must hold 9 numbers, not {len(matrix)}')
-    fx, skew, cx, _, fy, cy = matrix[:6]
-    if skew or fx <= 0.0 or fy <= 0.0:
+    fx, skew, cx, under, fy, cy, *last = matrix
+    if skew or under or last != [0.0, 0.0, 1.0] or fx <= 0.0 or fy <= 0.0:
         raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
     if any(distortion[5:]):
         raise ConfigError(f'{where}: of distortion only k1 k2 p1 p2 k3 are known')

@@ -31,9 +31,11 @@ class BoardCamera:
         self._board = read_board(Path(source.board).expanduser())
         self._detector = Detector(self._board)
         self._lens: Lens | Refusal = NO_INFO
+        self._size = (0, 0)
 
     def learn(self, info: Any) -> None:
         """Take a CameraInfo; one that cannot be used refuses the images after it."""
+        self._size = (info.height, info.width)
         try:
             self._lens = replace(lens_in(info), fixed=self._source.lens == 'given')
         except CalibrationError as err:
@@ -45,7 +47,12 @@ class BoardCamera:
         if isinstance(lens, Refusal):
             return lens
         try:
-            found = self._detector.of(image_of(message))
+            image = image_of(message)
+            if image.size and all(self._size) and image.shape != self._size:
+                sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, self._size))
+                reason = f'it and its CameraInfo are of {sizes} px: set both alike'
+                return Refusal('of another size than its CameraInfo', reason)
+            found = self._detector.of(image)
         except CalibrationError as err:
             return Refusal('that cannot be decoded', str(err))
         if isinstance(found, Refusal):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_b
 IRREGULAR = (b'"', b'\r', b'\0')
 """What cells are not cut at separators alone with."""
 BLOCK = 2**18
-"""Bytes that are looked at together: they stay in the cache."""
+"""Bytes that are looked at together: they stay in the cache (benchmarks/tables.py)."""
 WIDEST, FEW = 40, 100
 """Characters of a text, and how many different ones, that are told apart all at once."""
 
@@ -198,38 +198,44 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
 
 def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
     """Return the columns of a text with quotes, or with rows that end early."""
-    reader = csv.reader(csv_lines(text, str(path)), strict=True)
     header: list[str] = []
     rows: list[list[str]] = []
     lines: list[int] = []
     most = text.count('\n') + 1
-    try:
-        for row in reader:
-            told(min(reader.line_num / most, 1.0))
-            if not (row and header):
-                header = header or [name.strip() for name in row]
-                if len(header) > MOST_ENTRIES:
-                    raise InputError(f'{path} has {len(header)} columns, more than {MOST_ENTRIES}')
-                continue
-            if any(row[len(header) :]):
-                refuse_separator(path, header)
-                raise InputError(
-                    f'{path}, line {reader.line_num}: more values than the {len(header)} columns'
-                )
-            if len(rows) == MOST_ROWS:
-                raise InputError(
-                    f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
-                )
-            rows.append([*row[: len(header)], *[''] * (len(header) - len(row))])
-            lines.append(reader.line_num)
-    except csv.Error as err:
-        raise InputError(f'cannot read {path}: {err}') from err
+    for line, row in csv_rows(path, text, strict=True):
+        told(min(line / most, 1.0))
+        if not (row and header):
+            header = header or [name.strip() for name in row]
+            continue
+        if any(row[len(header) :]):
+            refuse_separator(path, header)
+            raise InputError(f'{path}, line {line}: more values than the {len(header)} columns')
+        if len(rows) == MOST_ROWS:
+            raise InputError(
+                f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
+            )
+        rows.append([*row[: len(header)], *[''] * (len(header) - len(row))])
+        lines.append(line)
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
     cells = zip(*rows, strict=True) if rows else [()] * len(header)
     words = dict(zip(header, cells, strict=True))
     return MadeColumns(path, np.array(lines, dtype=np.intp), {}, words)
+
+
+def csv_rows(
+    path: Path, text: str, separator: str = ',', strict: bool = False
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the lines at which rows of a text end, and their cells."""
+    reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
+    try:
+        for row in reader:
+            if len(row) > MOST_ENTRIES:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
+            yield reader.line_num, row
+    except csv.Error as err:
+        raise InputError(f'cannot read {path}: {err}') from err
 
 
 def refuse_separator(path: Path, header: Sequence[str]) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
 from calib_ros.files.images import Image, opencv
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 
@@ -26,8 +27,8 @@ Corners = tuple[NDArray[np.intp], FloatArray]
 Markers = tuple[FloatArray, NDArray[np.intp]]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
-FEWEST = 6
-"""Corners of an image from which on it is used."""
+FEWEST = len(parameters_of('base'))
+"""Corners of an image that is used: half of their coordinates make its pose, half check it."""
 BLURRED = 8.0
 """Width [px] of the sharpest edges from which on an image is blurred."""
 WINDOW = 0.6

@@ -29,10 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import CalibrationError
 from calib_ros.escapes import from_cell, to_cell
-from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import System, minimise
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.samples import Samples
+from calib_ros.identification.start import likened
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash
@@ -288,7 +285,4 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         or ('zero' in kinds and name in driven)
     ]
     joints = joints[:: max(1, len(joints) // 200)]  # to be fitted; it is judged on all
-    poses = chain.forward(joints)
-    observations = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
-    system = System((Samples(observations, 1e-4, 1e-3),))
-    return minimise(start, structurally_independent(start, names), system).chain
+    return likened(start, names, chain, joints, 1e-3)[0]

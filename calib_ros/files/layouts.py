@@ -21,7 +21,7 @@ from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 from calib_ros.kinematics.chain_file import shared_files
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import LONGEST_NAME, MOST_NAMES
+from calib_ros.values import LONGEST_NAME, MOST_NAMES, parse_mapping
 
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""
@@ -232,19 +232,14 @@ def load_layout(name_or_path: str) -> Layout:
     """Return a preset, or the layout in a YAML file of the user's."""
     path = Path(name_or_path)
     if path.suffix not in ('.yaml', '.yml'):
-        known = presets()
-        if name_or_path not in known:
-            raise UnknownNameError('preset (or path of a .yaml)', name_or_path, sorted(known))
-        path = known[name_or_path]
-    content = parse_yaml(read_text(path), str(path))
-    if not isinstance(content, dict):
-        raise ConfigError(f'{path} must be a mapping of the keys of a layout')
-    known_keys = [item.name for item in fields(Layout)]
-    for key, value in content.items():
-        if key not in known_keys:
-            raise UnknownNameError(f'key in {path}', str(key), known_keys)
-        if key == 'columns' and isinstance(value, dict):
-            content[key] = {str(k): str(v) for k, v in value.items()}
+        shipped = presets()
+        if name_or_path not in shipped:
+            raise UnknownNameError('preset (or path of a .yaml)', name_or_path, sorted(shipped))
+        path = shipped[name_or_path]
+    known = [item.name for item in fields(Layout)]
+    content = parse_mapping(parse_yaml(read_text(path), str(path)), known, str(path))
+    if isinstance(columns := content.get('columns'), dict):
+        content['columns'] = {str(k): str(v) for k, v in columns.items()}
     try:
         return Layout(**content)
     except ConfigError as err:

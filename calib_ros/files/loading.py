@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def replayed(
 def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
     """Return what is to be fitted of a bag, of which no more than a share may be lost."""
     problem, account = session.problem(), session.account()
-    samples = {'recorded': read.recorded, 'read': read.read, **account.as_document()}
+    samples = {'recorded': read.recorded, 'read': read.read, **asdict(account)}
     refusals = read.refusals(account, largest_loss)
     words, owners = f'{read}; {account}', named(session.usable).owners
     return Loaded(problem, samples, read.warnings, words, refusals=refusals, owners=owners)

@@ -25,6 +25,8 @@ from calib_ros.files import mcap
 from calib_ros.texts import parse_yaml, read_text
 
 NOT_CLOSED = 'the recording was not closed'
+WAL_HEAD = 32
+"""Bytes at the beginning of a write-ahead log of SQLite, before its pages."""
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
     'messages': 'SELECT id FROM messages NOT INDEXED',
@@ -86,11 +88,16 @@ def _with_log(file: Path, target: Path) -> None:
     shutil.copyfile(_log(file), _log(target))
     try:
         with closing(sqlite3.connect(target)) as connection:
-            connection.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+            _, pages, _ = connection.execute('PRAGMA wal_checkpoint').fetchone()
     except sqlite3.OperationalError as err:  # of a full disk
         raise InputError(f'{_log(file)} cannot be applied to a copy of {file}: {err}') from err
     except sqlite3.DatabaseError:  # no database; what is missing will be told
         return
+    if pages == 0 and _log(file).stat().st_size > WAL_HEAD:
+        raise InputError(
+            f'{_log(file)} is damaged, what was recorded last cannot be read: copy it again, or '
+            'move it away to use the rest'
+        )
 
 
 def _unpack_file(file: Path, target: Path) -> None:

@@ -7,8 +7,6 @@ What is guessed (the coding, the separator, the decimal sign, the line of the he
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 import zipfile
 from collections.abc import Sequence
@@ -20,7 +18,7 @@ import numpy as np
 
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import Columns, MadeColumns, lines_in_words
-from calib_ros.files.csv_columns import regular
+from calib_ros.files.csv_columns import csv_rows, regular
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
@@ -66,7 +64,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     """
     notes: list[str] = []
     if path.suffix.lower() in SHEETS:
-        rows = _workbook(path, layout.sheet)
+        rows = _workbook(path, layout.sheet, notes)
         text, separator = '', ''
     else:
         text, coding = _text(path)
@@ -134,8 +132,8 @@ def _text(path: Path) -> tuple[str, str]:
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is no UTF-8'
 
 
-def _workbook(path: Path, name: str) -> list[tuple[int, list[str]]]:
-    """Return the rows of a sheet of a workbook with their numbers."""
+def _workbook(path: Path, name: str, notes: list[str]) -> list[tuple[int, list[str]]]:
+    """Return the rows of a sheet with their numbers, by default of the first not hidden."""
     try:
         import openpyxl
     except ImportError as err:
@@ -151,7 +149,11 @@ def _workbook(path: Path, name: str) -> list[tuple[int, list[str]]]:
         book = openpyxl.load_workbook(path, read_only=True, data_only=True)
         if name and name not in book.sheetnames:
             raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(book.sheetnames)}')
-        sheet = book[name] if name else book.worksheets[0]
+        seen = [each for each in book.worksheets if each.sheet_state == 'visible']
+        sheet = book[name] if name else seen[0]
+        if len(seen) > 1 and not name:
+            notes.append(f'sheet "{sheet.title}" is read, the first of {len(seen)} (--sheet)')
+        sheet.reset_dimensions()  # programs write smaller ones than there are rows
         rows = []
         for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
             if len(row) > MOST_ENTRIES:
@@ -213,16 +215,11 @@ def _decimal(rows: Sequence[tuple[int, Sequence[str]]], separator: str, notes: l
 
 def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:
     """Return the cells of all lines that hold any, with the numbers of the lines."""
-    reader = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
-    try:
-        found = []
-        for row in reader:
-            if len(row) > MOST_ENTRIES:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
-            if any(cell.strip() for cell in row):
-                found.append((reader.line_num, [' '.join(cell.split()) for cell in row]))
-    except csv.Error as err:
-        raise InputError(f'cannot read {path}: {err}') from err
+    found = [
+        (line, [' '.join(cell.split()) for cell in row])
+        for line, row in csv_rows(path, text, separator)
+        if any(cell.strip() for cell in row)
+    ]
     if not found:
         raise InputError(f'{path} has no rows')
     return found

@@ -12,8 +12,8 @@ stand in one table.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,51 +36,23 @@ from calib_ros.files.measurements import (
 )
 from calib_ros.files.views import view_cell, view_of
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.sampling.problems import with_lenses
+from calib_ros.sampling.problems import Measured
 from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
-from calib_ros.settings import Settings
-from calib_ros.shown import Shown
 from calib_ros.texts import LARGEST_TABLE, csv_text, read_bytes
 
 Sets = tuple[Observations, ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Table(Shown):
-    """The sets to fit and held out, each with frames of its own.
+class Table(Measured):
+    """What a table holds; with `by_line` a sample's stamp is its line, in seconds."""
 
-    `pairs` names the frames of the two sockets of each location, `world_frame` is the first frame
-    of measurements that the table names, if any. `by_line` tells that the table has no stamps: a
-    sample's is its line, in seconds. `lenses` are those at the frames of cameras.
-    """
-
-    fitted: tuple[Observations, ...]
-    held_out: tuple[Observations, ...]
-    pairs: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
-    world_frame: str = ''
     by_line: bool = False
-    lenses: Mapping[str, Lens] = field(default_factory=dict)
-
-    def problem(
-        self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any
-    ) -> Problem:
-        """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
-        return Problem(
-            with_lenses(chain, self.lenses),
-            self.fitted[0],
-            self.held_out,
-            more=self.fitted[1:],
-            separations=tuple((*pair, sockets) for pair in self.pairs),
-            world_frame=self.world_frame,
-            **more,
-        )
 
 
 def read_table(
@@ -151,7 +123,7 @@ def table_of(
     first = np.flatnonzero(np.array([bool(name) for name in names])[place])[:1]
     world_frame = names[place[first[0]]] if len(first) else ''
     by_line = 'stamp_ns' not in found.header
-    return Table(fitted, held_out, pairs, warnings, world_frame, by_line, cameras)
+    return Table(fitted, held_out, pairs, world_frame, cameras, warnings, by_line)
 
 
 def check_table(made: MadeColumns) -> None:

@@ -64,7 +64,7 @@ def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
 
     def text_with(corrected: Program) -> str:
         header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
-        at = [header.index(name) for name in joint_columns(len(joints))]
+        at = [found.header.index(name) for name in joint_columns(len(joints))]
         for row, values in zip(rows, corrected.positions.tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value)

@@ -17,7 +17,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import parse_number
+from calib_ros.values import parse_mapping, parse_number
 
 COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
 """What a group says for its robots, and a robot for itself."""
@@ -74,12 +74,12 @@ def read_plant(path: Path) -> tuple[Robot, ...]:
 
 def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Robot, ...]:
     """Return the robots of the text of a plant file."""
-    content = _mapping(parse_yaml(text, where), 'the plant', where)
+    content = parse_mapping(parse_yaml(text, where), KEYS['the plant'], where)
     groups = content.get('groups') or {}
     if not isinstance(groups, dict):
         raise ConfigError(f'{where}: groups must be a mapping of names, not {groups!r}')
     groups = {
-        str(name): _mapping(values, 'a group', f'{where}: group {name}')
+        str(name): parse_mapping(values, KEYS['a group'], f'{where}: group {name}')
         for name, values in groups.items()
     }
     rows = content.get('robots')
@@ -105,7 +105,7 @@ def _robot(
     where: str,
     chains: dict[str, Chain],
 ) -> Robot:
-    own = _mapping(row, 'a robot', where)
+    own = parse_mapping(row, KEYS['a robot'], where)
     serial = parse_serial(own.get('serial'), f'{where}: serial')
     where = f'{where} ({serial})'
     group = own.get('group')
@@ -115,7 +115,7 @@ def _robot(
     given = {**shared, **own}
     chosen: dict[str, Any] = {}
     for each in (shared, own):
-        chosen |= _mapping(each.get('settings') or {}, 'settings', f'{where}: settings')
+        chosen |= parse_mapping(each.get('settings') or {}, KEYS['settings'], f'{where}: settings')
     tolerance = given.get('tolerance')
     if tolerance is not None:
         tolerance = parse_number(tolerance, f'{where}: tolerance')
@@ -154,7 +154,7 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
     for entry in entries:
         if not isinstance(entry, dict):
             entry = {'files': entry}
-        entry = _mapping(entry, 'measured', f'{where}: measured')
+        entry = parse_mapping(entry, KEYS['measured'], f'{where}: measured')
         files, session = entry.get('files'), entry.get('session', '')
         if not isinstance(files, str) or not files or len(files) > MOST_ENTRIES:
             raise ConfigError(
@@ -188,16 +188,6 @@ def _settings(given: Mapping[str, Any], where: str) -> Settings:
         return Settings(**values)
     except ConfigError as err:
         raise ConfigError(f'{where}: {err}') from err
-
-
-def _mapping(value: object, kind: str, where: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        keys = ', '.join(KEYS[kind])
-        raise ConfigError(f'{where} must be a mapping with keys of {keys}, not {value!r:.100}')
-    for key in value:
-        if key not in KEYS[kind]:
-            raise UnknownNameError(f'key in {where}', str(key), KEYS[kind])
-    return value
 
 
 def _moment(value: object, where: str) -> datetime | None:

@@ -56,21 +56,10 @@ ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
 class Explanation(Shown):
     """What may have changed, by how much, and how well that explains what was seen.
 
-    Attributes
-    ----------
-    owner : str
-        Joint or frame.
-    names : tuple of Parameter
-        Its parameters that have changed, (k,) in all.
-    gain : float
-        Of chi-squared, with k degrees of freedom.
-    chance : float
-        Probability of so large a gain for any explanation, if nothing has changed.
-    share : float
-        Of the evidence of all explanations.
-    change, sigma : (k,)
-        By how much each parameter has changed [m, rad], and the standard deviation of that.
-
+    k parameters `names` of a joint or frame, the `owner`, have changed by `change` (k,) with
+    standard deviations `sigma` (k,) [m, rad]. That gains so much of chi-squared with k degrees of
+    freedom. `chance` is the probability of so large a gain for any explanation if nothing has
+    changed, `share` that of the evidence of all explanations.
     """
 
     owner: str

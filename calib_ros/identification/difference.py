@@ -38,12 +38,10 @@ from calib_ros.identification.changes import (
 )
 from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.levels import CONFIDENT, chance_of
-from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.samples import Samples
+from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
@@ -54,26 +52,12 @@ from calib_ros.shown import Shown
 class Difference(Shown):
     """The second of two calibrations less the first.
 
-    Attributes
-    ----------
-    names : tuple of Parameter
-        P parameters of the arm.
-    change, sigma : (P,)
-        Their differences [m, rad], and the standard deviations of these.
-    chance : float
-        Probability of so large a difference by the noise of both.
-    beyond : float
-        The same with what the models lack as well.
-    rms, limit : float
-        RMS difference [m] of predicted positions over the joint range in the best frames, and its
-        upper limit (95 %).
-    left : float
-        What of it [m] no parameters of the first model can follow.
-    changed : tuple of tuple of Explanation
-        What has changed, each with what cannot be told apart from it.
-    unexplained : float
-        Probability of what these leave.
-
+    P parameters of the arm, `names`, differ by `change` (P,) with standard deviations `sigma` (P,)
+    [m, rad]. `chance` is the probability of so large a difference by the noise of both, `beyond`
+    with what the models lack as well. Predicted positions differ by `rms` [m] over the joint
+    range in the best frames, by `limit` [m] at most (95 %); no parameters of the first model can
+    follow `left` [m] of it. `changed` is what has changed, each with what cannot be told apart
+    from it, `unexplained` the probability of what these leave.
     """
 
     names: tuple[Parameter, ...]
@@ -213,13 +197,9 @@ def _in_parameters_of(
     independent = structurally_independent(chain, [*frames, *arm])
     names = tuple(Parameter(name) for name in independent if name in arm)
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    poses = other.forward(joints)
-    seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     start = replace(chain, base=other.base, tool=other.tool)
-    fit = minimise(start, [*frames, *names], System((Samples(seen, 1e-4, 1e-4 / LEVER),)))
-    left = fit.chain.forward(joints)[:, :3, 3] - poses[:, :3, 3]
-    change = np.array([fit.chain.offset(name, chain) for name in names])
-    return names, chain, change, float(np.sqrt((left**2).sum(axis=1).mean()))
+    fitted, left = likened(start, [*frames, *names], other, joints)
+    return names, chain, np.array([fitted.offset(name, chain) for name in names]), left
 
 
 def _in_names(

@@ -33,12 +33,9 @@ larger, in RMS residuals)."""
 PATIENCE = 3
 """Steps in succession that may raise the cost before they are damped."""
 STALLED = 50
-"""Iterations in which the cost must fall by LEAST_FALL, or the step left to go by half."""
-LEAST_FALL = 1e-3
+"""Iterations in which the cost must fall by a thousandth, or the step left to go by half."""
 DAMPED, UNDAMPED = 1e-6, 1e-12
 """Damping, of columns of unit length, with which it begins and below which it ends."""
-WELL_CONDITIONED = 1e-6 / np.finfo(float).eps
-"""Condition of the scaled normal matrix up to which a covariance from it has 6 digits."""
 SEPARATION_SIGMA = 1e-5
 """Standard deviation [m] of a known distance between sockets."""
 SMALL_STEP = 1e-3
@@ -168,7 +165,7 @@ class Normal:
             return None
         scaled = self.matrix / np.outer(scale, scale)
         sizes = np.linalg.eigvalsh(scaled) if len(scaled) else np.ones(1)
-        if not sizes[-1] < WELL_CONDITIONED * sizes[0]:
+        if not np.finfo(float).eps * sizes[-1] < 1e-6 * sizes[0]:  # the covariance has 6 digits
             return None
         return np.asarray(np.linalg.cholesky(scaled).T * scale)
 
@@ -285,7 +282,7 @@ def minimise(
         if settled:
             return Fit(chain, normal, iteration, True, left)
         stalled += 1
-        if best.cost < (1.0 - LEAST_FALL) * least_cost or left < 0.5 * least_left:
+        if best.cost < 0.999 * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
         foreseen = float(step @ (2.0 * normal.gradient - normal.matrix @ step))
         normal = normal_equations(chain, names, system)

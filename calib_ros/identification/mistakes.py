@@ -55,7 +55,7 @@ class Explained:
     so: float
 
     def __str__(self) -> str:
-        """Return the mistake and the option to give."""
+        """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
         return (
             f'{" -- or ".join(whats)} (typical error then {1e3 * self.so:.2f} mm, as given '
@@ -139,6 +139,8 @@ def explained(problem: Problem) -> Explained | None:
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
     named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
+    if problem.of_messages:
+        named = [replace(each, remedy=each.published) for each in named]
     return Explained(tuple(named[:3]), given.error, best.error)
 
 

@@ -82,6 +82,8 @@ class Problem(Shown):
         RMS position error [m] on held-out poses beyond which nothing is accepted.
     learned : Learned, optional
         Priors that the data themselves have told, for parameters without one (`evidence.py`).
+    of_messages : bool
+        True if the samples were messages, which have no options of a table.
 
     """
 
@@ -104,6 +106,7 @@ class Problem(Shown):
     learned: Learned | None = None
     sigma_pixel: float = 0.3
     sigma_touch: float = 1e-4
+    of_messages: bool = False
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""

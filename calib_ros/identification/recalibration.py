@@ -34,7 +34,7 @@ from calib_ros.identification.changes import (
     reasons_of,
 )
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.fingerprint import Fingerprint
+from calib_ros.identification.fingerprint import Fingerprint, reused_in_words
 from calib_ros.identification.leastsquares import (
     System,
     minimise,
@@ -63,20 +63,13 @@ MOST_FOLDS = 20
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recalibration(Shown):
-    """An earlier calibration after some new poses.
+    """An earlier calibration, brought up to date by some new poses.
 
-    Attributes
-    ----------
-    calibration : Calibration
-        Brought up to date.
-    changed : tuple of tuple of Explanation
-        What has changed, one after the other: the best explanation of each change, and those that
-        cannot be told apart from it.
-    unexplained : float
-        Probability of residuals as large as those that are left.
-    before, after : ErrorFigures
-        Errors of the new poses by the earlier calibration, and by what the other poses tell.
-
+    `changed` is what has changed, one after the other: the best explanation of each change, and
+    those that cannot be told apart from it; `unexplained` is the probability of residuals as large
+    as those that are left. `before` and `after` are errors of the new poses by the earlier
+    calibration, and by what the other poses tell. `reused` is the share of the poses that the
+    earlier calibration was fitted to: they would count twice.
     """
 
     calibration: Calibration
@@ -84,18 +77,20 @@ class Recalibration(Shown):
     unexplained: float
     before: ErrorFigures
     after: ErrorFigures
+    reused: float = 0.0
 
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
         better = self.after.rms_mm <= self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
-        return self.unexplained > FALSE and bool(agrees)
+        return self.unexplained > FALSE and bool(agrees) and not self.reused
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
             'accepted': self.accepted,
+            'reused': self.reused,
             'changed': [reasons_document(each) for each in self.changed],
             'unexplained': self.unexplained,
             'before': asdict(self.before),
@@ -108,6 +103,8 @@ class Recalibration(Shown):
             f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
             'new poses (each left out in turn)'
         )
+        if self.reused:
+            return f'NOT accepted: {reused_in_words(self.reused)}, and give only those. {text}'
         if self.unexplained <= FALSE:
             return (
                 f'NOT accepted: no few parameters explain what has changed; identify anew. {text}'
@@ -186,6 +183,7 @@ def recalibrate(
         found.unexplained(arm.square, system.rows, previous.freedom),
         before,
         after,
+        previous.reused(sets),
     )
 
 

@@ -12,11 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from calib_ros.errors import ConfigError
-from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.samples import Samples
+from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
 from calib_ros.kinematics.parameter import DH_KINDS, parameters_of
@@ -181,8 +179,6 @@ def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: st
     if {'base', 'tool'} & set(known):
         return replace(nominal, **parse_frames(known, f'{where}: calibration.nominal'))
     joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
-    poses = chain.forward(joints)
-    wanted = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     start = replace(
         nominal, base=chain.frame('base'), tool=chain.frame('tool'), frames=chain.frames
     )
@@ -192,10 +188,7 @@ def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: st
         if not start.frame(frame).fixed
         for name in parameters_of(frame)
     ]
-    if not names:
-        return start
-    independent = structurally_independent(start, names)
-    return minimise(start, independent, System((Samples(wanted, 1e-4, 1e-4 / 0.3),))).chain
+    return likened(start, names, chain, joints)[0] if names else start
 
 
 def covariance_of(

@@ -49,22 +49,10 @@ SHELL = SOME_POSES // 20
 class Region(Shown):
     """The joint values at which a calibration may be used.
 
-    Attributes
-    ----------
-    chain : Chain
-        The calibrated arm, with the effects considered.
-    names : tuple of str
-        Parameters, (P,) in all.
-    square : (P, P)
-        Expected squares of their errors.
-    limit : float
-        Expected error [m] of predicted positions up to which the calibration is used; infinite
-        where it is used over the whole range of the joints.
-    share : float
-        Of the range of the joints in which it is used.
-    base, tool : str
-        Frames between which it was measured.
-
+    `chain` is the calibrated arm with the effects considered, `square` (P, P) the expected squares
+    of the errors of its parameters `names`. Predicted positions may be off by `limit` [m], which
+    is infinite where the whole range of the joints is used; `share` is the share of it in use.
+    `base` and `tool` are the frames between which it was measured.
     """
 
     chain: Chain

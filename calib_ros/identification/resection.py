@@ -20,7 +20,8 @@ from calib_ros.identification.identifiability import DEGENERATE
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
+from calib_ros.kinematics.newton import Normal, minimise
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,36 +174,27 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
 def _refined(
     poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
 ) -> BoardPoses:
-    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2).
+    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2)."""
+    count = np.bincount(index)
 
-    Images that still move at once, each with its own damping; `leastsquares` solves one problem.
-    """
-    count, few = np.bincount(index), np.arange(len(poses))
-    poses, best, least = poses.copy(), poses.copy(), np.full(len(poses), np.inf)
-    damping, normal = np.full(len(poses), ROUNDING), np.zeros((len(poses), 7, 7))
-    for _ in range(ROUNDS):
-        seen = _seen(lens, poses[few], index, points)
+    def linearise(poses: FloatArray, which: NDArray[np.intp]) -> Normal:
+        moving = np.zeros(len(count), dtype=bool)
+        moving[which] = True
+        these = np.flatnonzero(moving[index])
+        owner = (np.cumsum(moving) - 1)[index[these]]
+        seen = _seen(lens, poses.transpose(2, 0, 1), owner, points[:, these])
         rows = np.empty((7, *seen.pixels.shape))
         seen.by_twist(rows[:6])
-        rows[6] = pixels.T - seen.pixels
-        found = image_products(rows, np.cumsum(count[few]) - count[few])
-        fall = least[few] - found[:, 6, 6]
-        better, moving = fall > 0.0, ~(np.abs(fall) < HALF_THE_DIGITS * least[few])
-        won = few[better]
-        best[won], least[won], normal[won] = poses[won], found[better, 6, 6], found[better]
-        less = np.maximum(0.1 * damping[few], ROUNDING)
-        damping[few] = np.where(better, less, 100.0 * damping[few])
-        few, these = few[moving], moving[index]
-        if not len(few):
-            break
-        index = (np.cumsum(moving) - 1)[index[these]]
-        points, pixels = points[:, these], pixels[these]
-        matrix, gradient = normal[few, :6, :6], normal[few, :6, 6]
-        scale = np.sqrt(np.maximum(np.einsum('mpp->mp', matrix), 1e-300))
-        scaled = matrix / (scale[:, :, np.newaxis] * scale[:, np.newaxis])
-        scaled += damping[few, np.newaxis, np.newaxis] * np.eye(6)
-        step = np.linalg.solve(scaled, (gradient / scale)[..., np.newaxis])[..., 0] / scale
-        poses[few] = best[few]
-        poses[few, :3, 3] += step[:, :3]
-        poses[few, :3, :3] = se3.exp_rotation(step[:, 3:]) @ best[few, :3, :3]
-    return BoardPoses(best, np.sqrt(least / count))
+        rows[6] = pixels[these].T - seen.pixels
+        found = image_products(rows, np.cumsum(count[which]) - count[which]).transpose(1, 2, 0)
+        return Normal(found[:6, :6], found[:6, 6], found[6, 6])
+
+    def move(poses: FloatArray, step: FloatArray) -> FloatArray:
+        moved = poses.copy()
+        moved[:3, 3] += step[:3]
+        turn = se3.exp_rotation(step[3:].T).transpose(1, 2, 0)
+        moved[:3, :3] = np.einsum('ijb,jkb->ikb', turn, poses[:3, :3])
+        return moved
+
+    found = minimise(linearise, poses.transpose(1, 2, 0), move, fall=HALF_THE_DIGITS)
+    return BoardPoses(found.x.transpose(2, 0, 1), np.sqrt(found.cost / count))

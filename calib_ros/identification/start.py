@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.identification.identifiability import DEGENERATE, excited
+from calib_ros.identification.identifiability import DEGENERATE, excited, structurally_independent
 from calib_ros.identification.leastsquares import (
     System,
     factor_of,
@@ -39,6 +39,7 @@ from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.trimmed import STARTS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
@@ -138,6 +139,26 @@ def _start_one(
         if best_error <= GOOD * spread:
             break
     return robust_fit(best, determined, system, loss).fit.chain
+
+
+def likened(
+    chain: Chain,
+    names: Sequence[str],
+    arm: Chain,
+    joints: FloatArray,
+    sigma_orientation: float = 1e-4 / LEVER,
+) -> tuple[Chain, float]:
+    """Return a chain that does as an arm does at joint values (N, n), and the RMS distance [m].
+
+    Parameters are fitted, the first ones of those that do the same, to exact poses; a turn by
+    `sigma_orientation` [rad] counts as much as a shift by 0.1 mm.
+    """
+    poses = arm.forward(joints)
+    seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
+    system = System((Samples(seen, 1e-4, sigma_orientation),))
+    fitted = minimise(chain, structurally_independent(chain, names), system).chain
+    left = fitted.forward(joints)[:, :3, 3] - seen.positions
+    return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:

@@ -45,32 +45,17 @@ PLACES = 40
 """Stops at which steps are looked for first."""
 LEAST_ASIDE = 3
 """Stops before and after a step: fewer are gross errors."""
-ROWS_NS = 10**15
-"""Whole seconds below that are the numbers of rows, in place of stamps."""
 
 
 @dataclass(frozen=True)
 class Step:
     """What moved, when and by how much.
 
-    Attributes
-    ----------
-    what : str
-        A base or tool frame, or a joint.
-    kind : str
-        'base', 'tool' or 'joint'.
-    set, sample, stamp_ns : int
-        The first sample after it.
-    size : float
-        RMS change of the positions or, where it weighs more, of the orientations; of a joint that
-        of its zero.
-    unit : str
-        'm' or 'rad'.
-    share : float
-        Of the squares of the residuals that it explains beyond as many useless parameters.
-    outside : bool
-        All that was measured on one side of it are outliers, so that the fit is not spoilt by it.
-
+    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `set`, `sample` and
+    `stamp_ns` are those of the first sample after it. `size` is the RMS change of positions ('m')
+    or, where it weighs more, of orientations ('rad'); of a joint that of its zero. `share` is what
+    it explains of the squares of the residuals beyond as many useless parameters. It is `outside`
+    if all that was measured on one side are outliers: the fit is not spoilt by it.
     """
 
     what: str
@@ -96,8 +81,9 @@ class Step:
     def __str__(self) -> str:
         """Return what moved and what to do about it."""
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
-        if self.stamp_ns < ROWS_NS and self.stamp_ns % 10**9 == 0:
-            when = f'line {self.stamp_ns // 10**9}, without stamps the order of the rows is taken'
+        line, fraction = divmod(self.stamp_ns, 10**9)
+        if line < 10**6 and not fraction:  # no clock, the numbers of rows
+            when = f'line {line}, without stamps the order of the rows is taken'
         text = f'something moved at pose {self.sample + 1}'
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'

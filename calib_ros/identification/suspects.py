@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The usual mistakes in what is given for an arm: what makes each good, and the option to give."""
+"""The usual mistakes in what is given for an arm: what makes each good, and what to do."""
 
 from __future__ import annotations
 
@@ -27,23 +27,12 @@ SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A mistake that may have been made.
+    """A mistake that may have been made, in words, and the option to give with a table.
 
-    Attributes
-    ----------
-    what : str
-        What was done, in words.
-    remedy : str
-        The option to give.
-    change : callable
-        Makes of the samples those that should have been given.
-    rank : int
-        Of those that explain the same, the lowest are named.
-    chain : Chain, optional
-        The nominal chain, as it had to be; as it is if None.
-    rows : int
-        By how many rows below the joint values of a measurement stand.
-
+    `change` makes of the samples those that should have been given, `chain` is the nominal one as
+    it had to be; joint values stand so many `rows` below their measurement. Of those that explain
+    the same, the lowest in `rank` are named. `published` is what to do about messages, live or of
+    a bag.
     """
 
     what: str
@@ -52,6 +41,7 @@ class Suspect:
     rank: int = 1
     chain: Chain | None = None
     rows: int = 0
+    published: str = 'correct it where it is published'
 
 
 def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
@@ -88,6 +78,7 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
             _as_it_is,
             2,
             rows=rows,
+            published='check the stamps, and delay',
         )
 
 
@@ -127,8 +118,10 @@ def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> 
         'the poses are those of the world in the target, as by a camera on the flange',
         '--eye-in-hand (or --inverse, where the device stands)',
     )
+    in_sources = 'set eye_in_hand=true in sources'
     if inverse:
         flange = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
+        in_sources = 'set eye_in_hand=false in sources'
     again: Change = Observations.inverted if inverse else _as_it_is
     ways: tuple[tuple[str, str, Change], ...] = (
         (
@@ -159,8 +152,16 @@ def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> 
                 (in_mm, degrees),
             ),
         ):
-            made = _one_by_one(_as_measured, *others, change)
-            yield Suspect(f'{what}{more}', f'{remedy}{option}', made, 2 if more else 1)
+            found = Suspect(
+                f'{what}{more}',
+                f'{remedy}{option}',
+                _one_by_one(_as_measured, *others, change),
+                2 if more else 1,
+            )
+            if (what, remedy) == flange:
+                rest = ', and correct the rest where it is published' if more else ''
+                found = replace(found, published=in_sources + rest)
+            yield found
 
 
 def _of_joints(chain: Chain) -> Iterator[Suspect]:
@@ -171,17 +172,20 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
     for k, name in enumerate(names):
         other_way = np.eye(count)
         other_way[k, k] = -1.0
+        in_file = f'sign: {-chain.joints[k].sign} in the chain file'
         yield Suspect(
             f'{name} counts the other way round',
-            f'sign: {-chain.joints[k].sign} in the chain file, or --columns q{k + 1}=-q{k + 1}',
+            f'{in_file}, or --columns q{k + 1}=-q{k + 1}',
             _joints(other_way),
+            published=in_file,
         )
         for degrees, angle in QUARTERS.items() if revolute[k] else ():
+            in_file = f'theta {degrees} degrees in the chain file'
             yield Suspect(
                 f'{name} has its zero {degrees[1:]} degrees away',
-                f'theta {degrees} degrees in the chain file, or --columns '
-                f'q{k + 1}=q{k + 1}{degrees[0]}{abs(angle):.16g}',
+                f'{in_file}, or --columns q{k + 1}=q{k + 1}{degrees[0]}{abs(angle):.16g}',
                 _joints(np.eye(count), angle * np.eye(count)[k]),
+                published=in_file,
             )
     for i in range(count):
         for j in range(i + 1, count):
@@ -192,6 +196,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
                 f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}',
                 _joints(np.eye(count)[order]),
                 2,
+                published='swap them in joint_names',
             )
     for k in range(1, count):
         for sign in (1.0, -1.0) if revolute[k] and revolute[k - 1] else ():
@@ -216,6 +221,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
         replace(
             chain, convention='modified' if other == 'modified' else 'standard', parallel=None
         ),
+        published=f'convention: {other} in the chain file',
     )
     types = [joint.type for joint in chain.joints]
     for ours in shipped_chains():
@@ -227,6 +233,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
                 _as_it_is,
                 2,
                 replace(ours, base=chain.base, tool=chain.tool),
+                published=f'set chain to {ours.name}',
             )
 
 

@@ -29,14 +29,13 @@ import numpy as np
 from scipy import special
 
 from calib_ros.identification.evidence import SCALE
-from calib_ros.identification.identifiability import excited, growth
-from calib_ros.identification.leastsquares import System, factor_of, minimise, stacked
+from calib_ros.identification.identifiability import growth
+from calib_ros.identification.leastsquares import stacked
 from calib_ros.identification.levels import NEARER
-from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
-from calib_ros.identification.samples import Samples
+from calib_ros.identification.start import likened
 from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -156,15 +155,8 @@ def _sister(problem: Problem, result: Identification) -> str:
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     """Return the RMS distance [m] of two arms' targets at (N, n), in the best base and tool."""
-    exact = found.forward(joints)
-    poses = Observations.from_arrays(joints, exact[:, :3, 3], exact[:, :3, :3])
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
-    names: list[str] = [*parameters_of('base'), *parameters_of('tool')]
-    system = System((Samples(poses, 1e-4, 1e-4 / 0.3),))
-    names = list(excited(factor_of(start, names, system), names))
-    near = minimise(start, names, system, tolerance=1e-2).chain
-    away = near.forward(joints)[:, :3, 3] - poses.positions
-    return float(np.sqrt((away**2).sum(axis=1).mean()))
+    return likened(start, [*parameters_of('base'), *parameters_of('tool')], found, joints)[1]
 
 
 def _gravity(problem: Problem, result: Identification) -> str:
@@ -231,14 +223,13 @@ def _explained(
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0.0] = 1.0
     rows = rows / scale
-    basis, _ = np.linalg.qr(rows[:, :count])
-    rest = rows[:, count:] - basis @ (basis.T @ rows[:, count:])
+    if len(rows) - count - len(added) < len(rows) // 3:
+        return 0.0
+    rest = np.asarray(np.linalg.qr(rows, mode='r'))[
+        count:, count:
+    ]  # what those fitted cannot follow
     residual = rest[:, -1]
     total = float(residual @ residual)
     solution = np.linalg.lstsq(rest[:, :-1], residual, rcond=1e-6)[0]
     gone = residual - rest[:, :-1] @ solution
-    left = float(gone @ gone)
-    spare = len(rows) - count - len(added)
-    if not total > 0.0 or spare < len(rows) // 3:
-        return 0.0
-    return 1.0 - left / total
+    return 1.0 - float(gone @ gone) / total if total > 0.0 else 0.0

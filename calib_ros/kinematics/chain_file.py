@@ -33,6 +33,7 @@ from calib_ros.values import (
     LARGEST,
     MOST_NAMES,
     QUATERNION_TOLERANCE,
+    parse_mapping,
     parse_name,
     parse_number,
     parse_numbers,
@@ -108,7 +109,7 @@ def shared_files(folder: str) -> dict[str, Path]:
 def parse_chain(text: str, where: str = 'chain file') -> Chain:
     """Turn the text of a chain file into a chain; `where` names it in errors."""
     document = parse_yaml(text, where)
-    content = _mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
+    content = parse_mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
@@ -236,20 +237,6 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     return str(text)
 
 
-def _mapping(
-    value: object, keys: tuple[str, ...], where: str, needed: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ConfigError(f'{where} must be a mapping with the keys {", ".join(keys)}')
-    for key in value:
-        if key not in keys:
-            raise UnknownNameError(f'key in {where}', str(key), keys)
-    for key in needed:
-        if value.get(key) is None:
-            raise ConfigError(f'{where}: key "{key}" is missing')
-    return value
-
-
 def _flag(content: dict[str, Any], where: str, default: bool) -> bool:
     """Return whether a frame or lens is fixed."""
     fixed = content.get('fixed', default)
@@ -279,7 +266,7 @@ def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _joint(row: object, where: str) -> Joint:
-    content = _mapping(row, JOINT_KEYS, where, ('name', 'a', 'alpha', 'd', 'theta'))
+    content = parse_mapping(row, JOINT_KEYS, where, ('name', 'a', 'alpha', 'd', 'theta'))
     numbers = {
         key: parse_number(content[key], f'{where}: {key}')
         for key in (*DH_KINDS, 'sign', 'mass', 'gear_ratio')
@@ -306,7 +293,7 @@ def _joint(row: object, where: str) -> Joint:
 def _frame(value: object, where: str) -> Frame | None:
     if value is None:
         return None
-    content = _mapping(value, FRAME_KEYS, where)
+    content = parse_mapping(value, FRAME_KEYS, where)
     xyz = parse_numbers(content.get('xyz', [0.0, 0.0, 0.0]), 3, f'{where}.xyz')
     quat = parse_numbers(content.get('quat_xyzw', [0.0, 0.0, 0.0, 1.0]), 4, f'{where}.quat_xyzw')
     length = float(np.linalg.norm(quat))
@@ -322,7 +309,7 @@ def _frame(value: object, where: str) -> Frame | None:
 
 
 def _lens(value: object, where: str) -> Lens:
-    content = _mapping(value, (*LENS_KINDS, 'fixed'), where, IN_PIXELS)
+    content = parse_mapping(value, (*LENS_KINDS, 'fixed'), where, IN_PIXELS)
     given = [kind for kind in LENS_KINDS if kind in content]
     numbers = {kind: parse_number(content[kind], f'{where}.{kind}') for kind in given}
     return Lens(**numbers, fixed=_flag(content, where, True))

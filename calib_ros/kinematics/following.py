@@ -27,8 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import LEVER, Aim, limits, solve_positive
+from calib_ros.kinematics.inverse import LEVER, Aim, limits
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.newton import Minimum, Normal, minimise
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, transform
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Told, nobody
@@ -42,24 +43,11 @@ POSITION_FIRST = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution(Shown):
-    """Changes of the joints, and the errors with and without them.
+    """Changes (N, n) to be added to commands [rad or m], and the errors with and without them.
 
-    Attributes
-    ----------
-    change : (N, n)
-        To be added to the commands [rad or m].
-    position, orientation : (N,)
-        Errors that remain [m], [rad].
-    position_before, orientation_before : (N,)
-        Errors without a change.
-    iterations : int
-        Of the slowest sample.
-    converged : (N,) bool
-    limited : (N, n) bool
-        Joints that are held at a limit.
-    damped : (N,) bool
-        Samples whose full change would exceed the largest one: changed in part.
-
+    Errors (N,) of `position` [m] and `orientation` [rad] remain, those `before` are without a
+    change. `iterations` are those of the slowest sample. Joints `limited` (N, n) are held at a
+    limit; samples `damped` (N,) are changed in part, as the full change would exceed the largest.
     """
 
     change: FloatArray
@@ -121,7 +109,6 @@ class Follower:
         # where more joints than freedoms make J^T J singular, D stands above its rounding
         ridge = ROUNDING if len(unit) > freedoms else HALF_THE_DIGITS**2
         self._ridge = ridge * np.eye(len(unit))[:, :, np.newaxis]
-        self._diagonal = np.diag_indices(len(unit))
 
     def solve(
         self,
@@ -179,7 +166,7 @@ class Follower:
 
         Where the first attempt fails the weight of the orientation makes the compromise.
         """
-        x, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
+        x, _, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
         errors = self._errors(task, x)
         damped = np.zeros_like(converged)
         rest = np.flatnonzero(
@@ -188,7 +175,7 @@ class Follower:
         if rest.size:
             part = task.select(rest)
             stiffness, damped[rest] = self._stiffness(part)
-            x[:, rest], converged[rest], more = self._minimise(
+            x[:, rest], _, converged[rest], more = self._minimise(
                 part, stiffness, self._weight, settle=True
             )
             errors[rest] = self._errors(part, x[:, rest])
@@ -197,56 +184,24 @@ class Follower:
 
     def _minimise(
         self, task: _Task, stiffness: FloatArray, weight: float, settle: bool = False
-    ) -> tuple[FloatArray, Flags, int]:
+    ) -> Minimum:
         """Minimise |e|^2 + x^T D x, the cost.
 
-        A step that raises the cost is not taken, and tried again with more damping, from a
-        thousandth of the diagonal on (Marquardt 1963). Samples settle for a cost that does not
-        fall any more if told so; else they are given up when x is longer than 1. `inverse.solve`
-        has neither D nor such an end, and stays within the limits instead.
-
-        Returns
-        -------
-        x, converged, iterations : (n, B), (B,), int
-
+        Samples settle for a cost that does not fall any more if told so; else they are given up
+        when x is longer than 1.
         """
-        found = task.start.copy()
-        converged = np.zeros(found.shape[1], dtype=bool)
-        active = np.arange(found.shape[1])
-        stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], active.size))
-        x, caution, still = task.start, np.zeros(active.size), np.zeros(active.size, dtype=bool)
-        error, columns = self._linearise(task, x, weight)
-        iterations = 0
-        while iterations < ROUNDS:
-            iterations += 1
-            normal = np.einsum('ikb,jkb->ijb', columns, columns) + stiffness
-            normal[self._diagonal] *= 1.0 + caution
-            slope = np.einsum('ikb,kb->ib', columns, error)
-            slope -= np.einsum('ijb,jb->ib', stiffness, x)
-            step = solve_positive(normal, np.where(task.held | still, 0.0, slope))
-            new = x + step
-            found[:, active] = new
-            settled = still | (np.abs(step).max(axis=0) <= HALF_THE_DIGITS)
-            far = ~(settle | (np.einsum('ib,ib->b', new, new) <= 1.0))
-            converged[active[settled & ~far]] = True
-            going = np.flatnonzero(~settled & ~far)
-            if not going.size:
-                break
-            active, task = active[going], task.select(going)
-            x, new, error, columns, stiffness, caution = (
-                part[..., going] for part in (x, new, error, columns, stiffness, caution)
-            )
-            new_error, new_columns = self._linearise(task, new, weight)
-            cost, new_cost = _cost(error, x, stiffness), _cost(new_error, new, stiffness)
-            taken = new_cost <= cost * (1.0 + ROUNDING)
-            still = settle & taken & (new_cost >= cost * (1.0 - ROUNDING))
-            x = np.where(taken, new, x)
-            error = np.where(taken, new_error, error)
-            columns = np.where(taken, new_columns, columns)
-            caution = np.where(taken, 0.1 * caution, np.maximum(10.0 * caution, 1e-3))
-        else:
-            found[:, active] = x
-        return found, converged, iterations
+        stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], len(task.q[0])))
+
+        def linearise(x: FloatArray, which: NDArray[np.intp]) -> Normal:
+            some, soft = task.select(which), stiffness[..., which]
+            error, columns = self._linearise(some, x, weight)
+            pull = np.einsum('ijb,jb->ib', soft, x)
+            slope = np.where(some.held, 0.0, np.einsum('ikb,kb->ib', columns, error) - pull)
+            cost = np.einsum('kb,kb->b', error, error) + np.einsum('ib,ib->b', x, pull)
+            return Normal(np.einsum('ikb,jkb->ijb', columns, columns) + soft, slope, cost)
+
+        fall, longest = (ROUNDING, np.inf) if settle else (0.0, 1.0)
+        return minimise(linearise, task.start, fall=fall, longest=longest, rounds=ROUNDS)
 
     def _linearise(
         self, task: _Task, x: FloatArray, weight: float
@@ -290,9 +245,3 @@ class _Task(NamedTuple):
     def select(self, index: NDArray[np.intp]) -> _Task:
         """Return some of the samples."""
         return _Task._make(None if each is None else each[..., index] for each in self)
-
-
-def _cost(error: FloatArray, x: FloatArray, stiffness: FloatArray) -> FloatArray:
-    """Return |e|^2 + x^T D x (B,)."""
-    pull = np.einsum('ijb,jb->ib', stiffness, x)
-    return np.asarray(np.einsum('kb,kb->b', error, error) + np.einsum('ib,ib->b', x, pull))

@@ -5,10 +5,10 @@
 Newton's method on the error e = (p_wanted - p, rotation vector from R to R_wanted), with
 J = -de/dq by the error model's columns (`jacobian.py`) for theta or d of every joint. The step
 
-    dq = (J^T J + lambda I)^-1 J^T e
+    dq = (J^T J + tiny I)^-1 J^T e
 
-is the shortest one that removes e (redundant arms). It is damped (Levenberg 1944, Marquardt 1963)
-until it lowers |e|, as near singular configurations.
+is the shortest one that removes e (redundant arms). It is damped until it lowers |e|, as near
+singular configurations (`newton.py`).
 
 Arrays are laid out (component, sample), as in `jacobian.py`.
 """
@@ -16,35 +16,26 @@ Arrays are laid out (component, sample), as in `jacobian.py`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.se3 import ROUNDS, FloatArray
+from calib_ros.kinematics.newton import Normal, minimise
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.values import SAME
 
 LEVER = 0.3
 """Length [m] at which a turn counts as much as a shift."""
-DAMPING = (1e-12, 1e-6, 1e3)
-"""Least damping, the first one, and that beyond which no step helps [m^2]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """Joint values for wanted poses, and what is left.
+    """Joint values (N, n) [rad or m] for wanted poses, within the limits, and what is left.
 
-    Attributes
-    ----------
-    joints : (N, n)
-        Joint values [rad or m], within the limits.
-    position, orientation : (N,)
-        Distance [m] and angle [rad] to the wanted pose.
-    converged : (N,)
-        Whether the pose is reached. Others are out of reach, or need another start.
-
+    `position` (N,) [m] and `orientation` (N,) [rad] are the distances to the wanted poses. Those
+    not `converged` (N,) are out of reach, or need another start.
     """
 
     joints: FloatArray
@@ -63,8 +54,6 @@ def solve(
     iterations: int = ROUNDS,
 ) -> Inverse:
     """Return the joint values near a start that bring the target to wanted poses.
-
-    Thousands of small problems at once, each with its own damping.
 
     Parameters
     ----------
@@ -86,32 +75,22 @@ def solve(
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
-    def missed(q: FloatArray, which: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def linearise(q: FloatArray, which: NDArray[np.intp]) -> Normal:
         error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], LEVER)
-        return error[part], columns[:, part], np.linalg.norm(error[part], axis=0)
+        error, columns = error[part], columns[:, part]
+        normal = np.einsum('ikb,jkb->ijb', columns, columns)
+        normal[np.diag_indices(len(q))] += ROUNDING
+        slope = np.einsum('ikb,kb->ib', columns, error)
+        return Normal(normal, slope, np.einsum('kb,kb->b', error, error))
 
-    q = _within(chain, np.array(start, dtype=float).T)
-    error, columns, size = missed(q, slice(None))
-    least, first, most = DAMPING
-    damping = np.full(len(poses), first)
-    diagonal = np.diag_indices(len(q))
-    for _ in range(iterations):
-        (active,) = np.nonzero((size > SAME) & (damping < most))
-        if not active.size:
-            break
-        own = columns[:, :, active]
-        normal = np.einsum('ikb,jkb->ijb', own, own)
-        normal[diagonal] += damping[active]
-        slope = np.einsum('ikb,kb->ib', own, error[:, active])
-        tried = _within(chain, q[:, active] + solve_positive(normal, slope))
-        new_error, new_columns, new_size = missed(tried, active)
-        better = new_size < size[active]
-        damping[active] = np.maximum(damping[active] * np.where(better, 0.1, 10.0), least)
-        moved = active[better]
-        q[:, moved], error[:, moved] = tried[:, better], new_error[:, better]
-        columns[:, :, moved], size[moved] = new_columns[:, :, better], new_size[better]
+    def within(q: FloatArray, step: FloatArray | float) -> FloatArray:
+        return _within(chain, q + step)
+
+    begin = within(np.array(start, dtype=float).T, 0.0)
+    q = minimise(linearise, begin, within, enough=SAME**2, rounds=iterations).x
+    error, _ = aim.linearise(q, None, positions, axes, LEVER)
     apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / LEVER))
-    return Inverse(q.T, apart, turned, size <= SAME)
+    return Inverse(q.T, apart, turned, np.linalg.norm(error[part], axis=0) <= SAME)
 
 
 def _within(chain: Chain, q: FloatArray) -> FloatArray:
@@ -183,16 +162,3 @@ def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
         np.array([-np.inf if lower is None else lower for lower, _ in ends]),
         np.array([np.inf if upper is None else upper for _, upper in ends]),
     )
-
-
-def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve positive definite systems (n, n, B) for right hand sides (n, B), by elimination."""
-    rows, x = matrix.copy(), right.copy()
-    for k in range(len(x) - 1):
-        factor = rows[k + 1 :, k] / rows[k, k]
-        rows[k + 1 :, k + 1 :] -= factor[:, np.newaxis] * rows[k, np.newaxis, k + 1 :]
-        x[k + 1 :] -= factor * x[k]
-    for k in reversed(range(len(x))):
-        x[k] -= np.einsum('jb,jb->b', rows[k, k + 1 :], x[k + 1 :])
-        x[k] /= rows[k, k]
-    return x

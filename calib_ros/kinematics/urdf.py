@@ -39,8 +39,6 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
 from calib_ros.values import MOST_NAMES, SAME
 
-DIGITS = np.finfo(float).precision - 1
-"""Lengths [m] and angles [rad] are rounded to so many; angles that are right by so many are."""
 MOST_APART = 0.2
 """Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
 
@@ -239,8 +237,8 @@ def _towards(row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray)
 
 
 def _clean(length: float) -> float:
-    """Return a length [m] as it was before sums of such were rounded."""
-    return round(length, DIGITS) + 0.0
+    """Return a length [m] as it was before sums of such were rounded, in their last digit."""
+    return round(length, np.finfo(float).precision - 1) + 0.0
 
 
 def _clean_angle(angle: float) -> float:

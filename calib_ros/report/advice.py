@@ -29,9 +29,9 @@ class Advice:
 
 
 RIGHT_CHAIN = (
-    'Check that --chain names the arm measured: type, size and generation.',
-    'Check the units of the table: joint values in radians, positions in metres.',
-    'Check that the columns q1, q2, ... are in the order of the arm, from its foot to its tool.',
+    'Check that the chain is that of the arm measured: type, size and generation.',
+    'Check the units: joint values in radians, positions in metres.',
+    'Check that the joint values are in the order of the arm, from its foot to its tool.',
 )
 SPREAD = 'spread over the whole workspace, with every joint moved through most of its range'
 
@@ -44,6 +44,7 @@ RULES: dict[Rule, Advice] = {
             'Check the mastering (zero position) of the joint named.',
             'Keep only the measurements after the slip, or measure again.',
         ),
+        again='on what was measured after the slip',
     ),
     Rule.MOVED: Advice(
         'Something moved while you measured',
@@ -53,14 +54,15 @@ RULES: dict[Rule, Advice] = {
             'Fasten the target, the device and the robot, then measure again.',
             'Or keep the data: name two sessions, before and after, and fit both.',
         ),
+        again='on the new measurements alone, or on the two sessions',
     ),
     Rule.OWN_BEHAVIOUR: Advice(
         'The poses set aside show the arm itself',
         'Some poses did not fit and were set aside as faulty measurements. But they all depend '
         'on one joint: the cause is the arm, not the device.',
         (
-            'Run again with --model auto: it looks for such effects.',
-            'Or run with --loss none to set no pose aside.',
+            'Set model to auto and run again: it looks for such effects.',
+            'Or set loss to none, so that no pose is set aside.',
         ),
     ),
     Rule.CONVERGENCE: Advice(
@@ -75,7 +77,7 @@ RULES: dict[Rule, Advice] = {
         'parameters named.',
         (
             f'Add poses {SPREAD}. `calib_ros plan` chooses them.',
-            'If a joint cannot move, hold its parameters with --fixed.',
+            'If a joint cannot move, name its parameters in fixed.',
         ),
     ),
     Rule.COMMON_SENSE: Advice(
@@ -119,7 +121,7 @@ RULES: dict[Rule, Advice] = {
             'If the error is much larger, check that the arm stood still at each pose, that the '
             'target is fixed to the flange, and the device to the floor.',
             f'Measure more poses, {SPREAD}.',
-            'Try --model auto: the error may come from gears or gravity.',
+            'Set model to auto: the error may come from gears or gravity.',
         ),
     ),
     Rule.DRIFT: Advice(
@@ -150,7 +152,7 @@ RULES: dict[Rule, Advice] = {
         'is worse than before. Perhaps they were right.',
         (
             'Look at the poses marked as outliers, and measure them again.',
-            'Run with --model auto or --loss none.',
+            'Set model to auto or loss to none.',
         ),
     ),
     Rule.ROUNDING: Advice(
@@ -167,7 +169,7 @@ RULES: dict[Rule, Advice] = {
         'On poses not used to compute it, the corrected arm points less precisely than before. '
         'Often the stated accuracy of the device is wrong.',
         (
-            'Check --sigma-position and --sigma-orientation against the data sheet of the device.',
+            'Check sigma_position and sigma_orientation against the data sheet of the device.',
             'Check that the target sits rigidly on the flange.',
         ),
     ),
@@ -179,6 +181,7 @@ RULES: dict[Rule, Advice] = {
             'Check the scale of the device with a known length, such as a scale bar.',
             'Check the temperature and pressure set in the device.',
         ),
+        again='on new measurements alone: those so far have the wrong scale',
     ),
     Rule.UNKNOWN_LOSS: Advice(
         'Nobody can tell how much of the recording is missing',

@@ -15,6 +15,7 @@ from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
+from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import figures, words
 from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
@@ -51,11 +52,12 @@ def identification_report(
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
-        verdict=_verdict(result, reasons, limits, tolerance),
+        verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
         accuracy=accuracy_section(
             f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
             (
+                *_unproven(result),
                 f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
                 f'{result.validated_by}.',
                 'RMS (root mean square) is the usual size of the error; its interval is that over '
@@ -84,26 +86,39 @@ def identification_report(
 def _verdict(
     result: Identification,
     reasons: Sequence[Advice],
-    limits: tuple[float, float],
     tolerance: float | None,
 ) -> Verdict:
-    both = gain(result.validation or result.fitted)
     if not result.accepted:
         return _refused(result, reasons)
     how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(each for each in (how, where) if each)
+    judged = result.validation or result.fitted
+    within = within_tolerance(judged, tolerance)
+    heading = 'Accepted' + (f', {within}' if within else '')
+    return Verdict('open' if 'not' in within else 'good', heading, text, gain(judged))
+
+
+def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
+    """Return whether the error left is within the tolerance [m], if one is given."""
     if tolerance is None:
-        return Verdict('good', 'Accepted', text, both)
-    wanted = f'{1e3 * tolerance:g} mm'
-    lower, upper = limits
+        return ''
+    wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
+    lower, upper = limits_of(judged, 1, CONFIDENT)
     if upper <= tolerance:
-        return Verdict('good', f'Accepted, and within the tolerance of {wanted}', text, both)
+        return f'and {wanted}'
     if lower > tolerance:
-        return Verdict('open', f'Accepted, but beyond the tolerance of {wanted}', text, both)
-    return Verdict(
-        'open', f'Accepted; whether it is within the tolerance of {wanted} is open', text, both
-    )
+        return f'but not {wanted}'
+    return f'but perhaps not {wanted}'
+
+
+def _unproven(result: Identification) -> Iterator[str]:
+    """Yield that figures prove nothing where no pose was left out."""
+    if result.validation is None:
+        yield (
+            'These poses were all used to compute the correction: a small error "after" proves '
+            'nothing.'
+        )
 
 
 def reasons_of(result: Identification) -> tuple[Advice, ...]:

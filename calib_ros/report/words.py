@@ -252,10 +252,9 @@ def scatter_in_words(noise: Noise) -> str:
     if noise.consistent:
         return f'{text}: consistent with it (chi-squared test).'
     if noise.position < 1.0:
-        return f'{text}: less than --sigma-position and --sigma-orientation say.'
+        return f'{text}: less than sigma_position and sigma_orientation say.'
     return (
-        f'{text}: more than --sigma-position and --sigma-orientation say. The intervals allow '
-        'for it.'
+        f'{text}: more than sigma_position and sigma_orientation say. The intervals allow for it.'
     )
 
 

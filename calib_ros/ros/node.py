@@ -43,7 +43,7 @@ from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.filer import Filer
 from calib_ros.ros.identifying import Identifying, Snapshot
 from calib_ros.ros.inputs import Inputs, deserialised
-from calib_ros.ros.outputs import Keeper, Published
+from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.running import run
 from calib_ros.ros.to_ros import LATCHED
@@ -81,7 +81,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._boundary = Boundary(self.get_logger())
         self._archive = Archive(
             given.data_dir or home / 'calib_ros',
-            f'{chain.name}_{given.serial}' if given.serial else chain.name,
+            f'{chain.name}/{given.serial or self.get_namespace()}'.rstrip('/'),
             len(chain.joints),
             self._configuration,
         )
@@ -172,8 +172,11 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return words.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
-        """Refuse settings that no identification could use."""
+        """Refuse settings that no identification could use, and files of others."""
         try:
+            for each in changes:
+                if each.name in FILENAMES:
+                    self._keeper.file_of(each.name, each.value)
             check_settings(self.session.chain, changed(self.session.settings, changes))
         except CalibrationError as err:
             return SetParametersResult(successful=False, reason=str(err))

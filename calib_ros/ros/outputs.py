@@ -31,6 +31,9 @@ from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
 
+FILENAMES = ('target_filename', 'calibration_filename')
+"""Parameters that name files."""
+
 
 class Published(NamedTuple):
     """A calibration as the text of a file, and how it was made, if that is known.
@@ -42,13 +45,6 @@ class Published(NamedTuple):
     text: str
     configuration: str
     page: Callable[[], str | None] = lambda: None
-
-
-class Exportable(NamedTuple):
-    """The calibration, and the joint values of the samples."""
-
-    calibration: Calibration
-    joints: FloatArray | None
 
 
 class Keeper:
@@ -69,7 +65,7 @@ class Keeper:
         self._posed: tuple[int, Sequence[float]] | None = None
         self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', LATCHED)
         self._calibration = node.create_publisher(String, '~/calibration', LATCHED)
-        for name in ('target_filename', 'calibration_filename'):
+        for name in FILENAMES:
             self._named(name)  # refused now rather than after a day's work
         sources = parse_sources(given.settings.sources)
         in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
@@ -140,20 +136,21 @@ class Keeper:
         self.adopt(calibration, Published(text, ''))
         return path
 
-    def exportable(self) -> Exportable:
-        """Return what there is to export, as it is now."""
+    def exportable(self) -> tuple[Calibration, FloatArray | None]:
+        """Return the calibration, and the joint values of the samples, as they are now."""
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
         joints = np.array([sample.joints for sample in session.samples])
         with self._lock:
-            return Exportable(session.calibration, joints if len(joints) else None)
+            return session.calibration, joints if len(joints) else None
 
-    def export(self, found: Exportable) -> tuple[bool, str]:
+    def export(self, found: tuple[Calibration, FloatArray | None]) -> tuple[bool, str]:
         """Write a calibration in all forms; return success, and where in words."""
-        chain, record = found.calibration.chain, found.calibration.record
-        nominal, links = self._session.chain, self._given.links
-        forms = exports(chain, nominal, found.joints, record)
+        (calibration, joints), nominal = found, self._session.chain
+        chain, record = calibration.chain, calibration.record
+        links = self._given.links
+        forms = exports(chain, nominal, joints, record)
         ends = {'base_link': links['base_link'], 'tip_link': links['tip_link']}
         forms += vendor_files(chain, nominal, record, self._urdf, ends)
         files = {each.name: each.content for each in forms}
@@ -175,7 +172,10 @@ class Keeper:
 
     def _named(self, parameter: str) -> Path | None:
         """Return the file that a parameter names, which any node may have set, if it does."""
-        name = self._node.get_parameter(parameter).value
+        return self.file_of(parameter, self._node.get_parameter(parameter).value)
+
+    def file_of(self, parameter: str, name: str) -> Path | None:
+        """Return the file of a name that a parameter has or shall have; None without a name."""
         if not name:
             return None
         if not name.endswith(('.yaml', '.yml')):

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -22,10 +21,6 @@ class Account:
     dropped: dict[str, int]
     notes: dict[str, int]
     foreign_names: tuple[str, ...]
-
-    def as_document(self) -> dict[str, Any]:
-        """Return the account as plain values."""
-        return asdict(self)
 
     def __str__(self) -> str:
         """Return the account in words."""

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.levels import ALIKE, TELLING
+from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -30,8 +30,8 @@ MOST_DELAY = Settings.lateness
 """Largest delay that is looked for [s]: as late as measurements may come."""
 LEAST_MOTION = 3.0 * MOST_DELAY
 """Time in motion that is needed [s]: so that most of it is compared at every delay."""
-ALIKE_ENOUGH = 0.8
-"""Least correlation."""
+ALIKE_ENOUGH = float(np.sqrt(1.0 - MOST_OUTLIERS))
+"""Least correlation: no more of the speeds' variance may be something else than of samples."""
 RISE = 0.02
 """Least rise of the correlation beyond a valley for another peak."""
 IN_MOTION = 0.1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.sampling.messages import LARGEST, MessageError, Readings
-from calib_ros.sampling.names import FrameNames, JointNames
+from calib_ros.sampling.names import OTHERS, FrameNames, JointNames
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, StreamKey
 from calib_ros.sampling.sources import Source
 
@@ -33,6 +33,8 @@ class Entry:
         self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unused: Counter[str] = Counter()
+        self.refused: dict[str, str] = {}
+        """Why the last messages of a kind cannot be used; without kinds that can."""
         self.latest: tuple[int, Sequence[float]] | None = None
 
     def pieces(self, parts: Sequence[Part], recording: bool, wanted: str) -> list[Piece]:
@@ -45,6 +47,8 @@ class Entry:
         """Count messages that came and cannot be used."""
         self.received[kind] += count
         self.dropped[f'{kind}: {cause}'] += count
+        if cause != OTHERS:
+            self.refused[kind] = cause
 
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
         """Yield joint values that can be used, those of the chain."""
@@ -70,6 +74,7 @@ class Entry:
             if not len(stamps):
                 continue
             self.received[JOINTS] += len(stamps)
+            self.refused.pop(JOINTS, None)
             if len(columns) == self._joint_count and places[-1] > latest:
                 latest = int(places[-1])
                 self.latest = (int(stamps[-1]), values[-1].tolist())
@@ -84,6 +89,7 @@ class Entry:
             assert source is not None
             count, frame_id = len(places), readings.strings[0]
             self.received[POSES] += count
+            self.refused.pop(POSES, None)
             if not recording:
                 self.unused['measurements: not recording'] += count
             elif self._is_in_frame(source.device, frame_id, wanted, count):

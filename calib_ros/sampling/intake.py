@@ -9,6 +9,7 @@ arrays, with the place of each message in the batch.
 
 from __future__ import annotations
 
+import itertools
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -40,6 +41,7 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Links, Pair
+from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000
 """Messages that are taken at once (benchmarks/bags.py, benchmarks/soak.py)."""
@@ -107,6 +109,27 @@ def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream
 def links_of(streams: Iterable[Stream]) -> list[Links]:
     """Return the links between frames that come on some streams."""
     return list(dict.fromkeys(each.links for each in streams if each.links is not None))
+
+
+def batches(
+    messages: Iterator[tuple[Stream, bytes]],
+) -> Iterator[tuple[list[tuple[Stream, bytes]], Exception | None]]:
+    """Yield messages by the batch, up to an error, which is with the last ones."""
+    error, ended = None, False
+    while not ended:
+        batch: list[tuple[Stream, bytes]] = []
+        size = 0
+        try:
+            for each in itertools.islice(messages, BATCH):
+                batch.append(each)
+                size += len(each[1]) if isinstance(each[1], bytes) else 0
+                if size > LARGEST_TABLE:  # images
+                    break
+            else:
+                ended = len(batch) < BATCH
+        except Exception as err:  # a damaged recording fails in many ways
+            error, ended = err, True
+        yield batch, error
 
 
 def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) -> list[str]:

@@ -11,7 +11,7 @@ yet; at the end they weigh nothing, and the estimate is that of the batch.
 A sample that lies too far from where the others predict it is left out as suspicious. The first
 ones cannot be judged so, because the estimate bends to them. So it begins anew, from the nominal
 chain and by the robust fit of the identification (`robust.py`), each time the number of samples
-has grown by a fifth: an early gross error is found, and what was left out wrongly comes back.
+has grown by a quarter: an early gross error is found, and what was left out wrongly comes back.
 
 The robust fit alone, each time on some hundred samples, would be less code, but it takes too long
 beside the messages: 0.05 s with 50 samples of a six-axis arm, 0.2 s with 100 to 300, 4 s with
@@ -49,6 +49,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
+from calib_ros.settings import EXCEPTION
 
 WIDE = (0.01, 0.02)
 """Standard deviations [m, rad] of arm parameters before anything is measured."""
@@ -56,8 +57,9 @@ START = len(parameters_of('base'))
 """Configurations with which two frames are found: of three coordinates each, for two unknowns."""
 MOST_THOROUGH = 60
 """Parameters up to which it begins with the thorough fit: it takes 4 s instead of 1 s for 200."""
-GROWN = 1.2
-"""Growth of the number of samples from which all of them are judged anew."""
+GROWN = (1.0 - EXCEPTION) ** -2
+"""Growth of the number of samples from which all of them are judged anew: by it standard
+deviations shrink by EXCEPTION."""
 MOST_AT_ONCE = 4 * SOME
 """Samples that one update adds at most; the rest waits for the next ones."""
 LITTLE = 0.35

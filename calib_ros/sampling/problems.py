@@ -5,7 +5,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.sample import Frames, Sample, collect, lenses, named, socket_pairs
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
+from calib_ros.shown import Shown
 
 
 def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
@@ -49,6 +51,35 @@ def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
     return chain
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Measured(Shown):
+    """The sets to fit and held out, each with frames of its own.
+
+    `pairs` names the frames of the two sockets of each location, `world_frame` is the first frame
+    of the devices, `lenses` are those at the frames of cameras.
+    """
+
+    fitted: Sequence[Observations]
+    held_out: Sequence[Observations] = ()
+    pairs: Sequence[tuple[str, str]] = ()
+    world_frame: str = ''
+    lenses: Mapping[str, Lens] = field(default_factory=dict)
+
+    def problem(
+        self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any
+    ) -> Problem:
+        """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
+        return Problem(
+            with_lenses(chain, self.lenses),
+            self.fitted[0],
+            self.held_out,
+            more=self.fitted[1:],
+            separations=tuple((*pair, sockets) for pair in self.pairs),
+            world_frame=self.world_frame,
+            **more,
+        )
+
+
 def problem_of(
     chain: Chain,
     samples: Sequence[Sample],
@@ -64,16 +95,11 @@ def problem_of(
     fitted, held_out = collect(samples, sigmas, frames, posed)
     if not fitted:
         return None
-    pairs = socket_pairs(samples, frames)
-    return Problem(
-        chain if posed else with_lenses(chain, lenses(samples, frames)),
-        fitted[0],
-        held_out,
-        more=fitted[1:],
-        separations=tuple((*pair, settings.socket_distance) for pair in pairs),
-        world_frame=samples[0].frame_id,  # it is the frame of `base`
-        **settings.for_problem(),
-    )
+    pairs, world_frame = socket_pairs(samples, frames), samples[0].frame_id  # that of `base`
+    cameras = {} if posed else lenses(samples, frames)
+    measured = Measured(fitted, held_out, pairs, world_frame, cameras)
+    more = {'of_messages': True, **settings.for_problem()}
+    return measured.problem(chain, settings.socket_distance, **more)
 
 
 def in_frames_of(
@@ -105,11 +131,10 @@ def problem_since(
     calibration: Calibration, chain: Chain, sets: Sequence[Observations], settings: Settings
 ) -> Problem:
     """Return sets between the frames of a calibration as a problem of the nominal chain."""
-    first, *more = sets
     cameras = {each.camera for each in sets if each.pixels is not None}
     known = {name: calibration.chain.frame(name).lens for name in cameras}
-    chain = with_lenses(chain, {name: lens for name, lens in known.items() if lens})
-    return Problem(chain, first, more=tuple(more), **settings.for_problem())
+    seen = {name: lens for name, lens in known.items() if lens}
+    return Measured(sets, lenses=seen).problem(chain, **settings.for_problem())
 
 
 def refuse_other_joints(calibration: Calibration, chain: Chain) -> None:

@@ -25,7 +25,7 @@ from calib_ros.sampling.entry import Entry, Part
 from calib_ros.sampling.hints import Hint, frozen, progress
 from calib_ros.sampling.kept import Kept
 from calib_ros.sampling.live import Estimate, LiveEstimate
-from calib_ros.sampling.names import OTHERS, FrameNames, JointNames
+from calib_ros.sampling.names import FrameNames, JointNames
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.problems import (
     check_joint_names,
@@ -37,7 +37,7 @@ from calib_ros.sampling.problems import (
 )
 from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import Sample, named, socket_place
-from calib_ros.sampling.slices import JOINTS, POSES, SILENCE
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.sampling.strays import STRAY
 from calib_ros.settings import Settings
 
@@ -45,8 +45,8 @@ ONE_FRAME = (
     'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
     'its own for each source'
 )
-RECENT = 20
-"""Samples that a check of the calibration in use looks at: a few stops of daily work."""
+RECENT = NO_ACCIDENT
+"""Samples that a check of the calibration in use looks at."""
 
 
 class CalibrationSession:
@@ -120,6 +120,7 @@ class CalibrationSession:
         """Make samples of everything that still waits; nothing more will come."""
         self._road.finish()
         self._settle(wait=True)
+        self._kept.leave_out_strange()
 
     @property
     def received(self) -> Counter[str]:
@@ -143,7 +144,7 @@ class CalibrationSession:
         self._road.hand_over()
         self._settle(wait=True)
         taken = len(self.samples) - before
-        if self._collector.track.missing and self._refused:
+        if JOINTS in self._entry.refused:
             why = self.state
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
@@ -192,19 +193,9 @@ class CalibrationSession:
             return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
         if others := self._names.foreign_ones(track.missing):
             return others
-        if track.missing and self._refused:
-            return f'waiting for joint states; of those that came {self._refused}'
+        if why := self._entry.refused.get(JOINTS):
+            return f'nothing can be sampled: joint states are refused, {why}'
         return self._collector.state()
-
-    @property
-    def _refused(self) -> str:
-        """Return in words how many joint states were refused, and why; empty if none were."""
-        dropped = sorted(self._entry.dropped.items())
-        return ', '.join(
-            f'{count} x {cause.partition(": ")[2]}'
-            for cause, count in dropped
-            if cause.startswith(JOINTS) and not cause.endswith(OTHERS)
-        )
 
     def account(self) -> Account:
         """Return what became of the messages so far."""
@@ -266,7 +257,10 @@ class CalibrationSession:
         What an operator must know or do comes first: who has room for a line only cuts the rest.
         `work` is what goes on besides.
         """
-        told = [self.state, work, *(hint.status for hint in self.hints)]
+        told = [self.state, work]
+        if why := self._entry.refused.get(POSES):
+            told.append(f'measurements are refused, {why}')
+        told += [hint.status for hint in self.hints]
         if self.pictures.refused:
             told.append(f'the last image is not used: {self.pictures.refused}')
         estimate = self.estimate
@@ -359,7 +353,12 @@ class CalibrationSession:
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
         """Keep the samples that were made; return how many there are now."""
         self.pictures.through(made)
-        fresh = [each for each in self.pictures.ready(wait) if not self._kept.is_strange(each)]
+        usual = self._frames.usual  # until it is known what came last may tell otherwise
+        fresh = [
+            each
+            for each in self.pictures.ready(wait)
+            if usual(each.device) is None or not self._kept.is_strange(each)
+        ]
         self._kept.samples += fresh
         for sample in fresh:
             self.on_sample(sample)

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.intake import BATCH, Deserialise, Intake, Stream, measured
+from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
 from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS
 from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sources import (
@@ -89,8 +89,11 @@ def _links(
 
 
 def _learn(messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise) -> None:
-    """Let the links of streams learn of all that comes on them."""
-    for batch in _batches(messages):
+    """Let the links of streams learn of all that comes on them.
+
+    What is wrong with a recording is told when it is replayed.
+    """
+    for batch, _ in batches(messages):
         Intake(batch, deserialise)
 
 
@@ -144,28 +147,13 @@ def _joint_values(
 ) -> dict[tuple[str, str], list[tuple[Stamps, FloatArray]]]:
     """Return stamps and values by topic and joint."""
     found = defaultdict(list)
-    for batch in _batches(messages):
+    for batch, _ in batches(messages):
         for topic in dict.fromkeys(stream.topic for stream, _ in batch):
             of_topic = [each for each in batch if each[0].topic == topic]
             for _, _, (stamps, (_, *names), values) in Intake(of_topic, deserialise).parts:
                 for name, column in zip(names, values.T, strict=True):
                     found[topic, name].append((stamps, column))
     return found
-
-
-def _batches(
-    messages: Iterator[tuple[Stream, bytes]],
-) -> Iterator[list[tuple[Stream, bytes]]]:
-    """Yield messages by the batch; what is wrong with a recording is told when it is replayed."""
-    ended = False
-    while not ended:
-        batch: list[tuple[Stream, bytes]] = []
-        try:
-            batch.extend(itertools.islice(messages, BATCH))
-            ended = not batch
-        except Exception:
-            ended = True
-        yield batch
 
 
 def _apart(

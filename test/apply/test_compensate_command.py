@@ -151,7 +151,7 @@ def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
     given = trajectory(q, **rates)
     if suffix == '.csv':
         rows = [','.join([*map(repr, row[:2]), 'ä', *map(repr, row[2:])]) for row in q.tolist()]
-        given = '\n'.join(['q1,q2,note,q3,q4,q5,q6', *rows]) + '\n'
+        given = '\n'.join(['q1,q2,note, q3,q4,q5,q6', *rows]) + '\n'
     path, again = tmp_path / f'program{suffix}', tmp_path / f'again{suffix}'
     path.write_text(given, encoding='utf-8')
     source = read_program(path, UR.joint_names)

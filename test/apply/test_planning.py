@@ -247,14 +247,14 @@ def test_the_next_pose_is_where_the_others_were_not():
 def test_so_many_poses_are_needed_and_no_fewer(criterion):
     chain = arm()
     design, q, task = design_of(chain), some(chain, 200), some(chain, 100, 2)
-    needed = planning.poses_needed(design, q, task, 1e-4, criterion)
+    found = planning.fewest(design, q, task, 1e-4, criterion)
 
     def best(count):
         return accuracy(design, q[choose(design, q, count, criterion, task)], task)[-1]
 
-    assert best(needed) <= 1e-4 < best(needed - 1)
+    assert accuracy(design, q[found], task)[-1] <= 1e-4 < best(len(found) - 1)
     with pytest.raises(InputError, match='all 200 candidates together'):
-        planning.poses_needed(design, q, task, 1e-6)
+        planning.fewest(design, q, task, 1e-6)
 
 
 def travel(q, order, speeds):

@@ -316,9 +316,9 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
         verify(arm, [replace(seen, base='base_other')], 1e-3)
     with pytest.raises(InputError, match='not distances'):
         verify(arm, [replace(seen, distances=np.ones(len(seen)))], 1e-3)
-
-
-# On the command line
+    images = replace(seen, pixels=np.zeros((len(seen), 2)), points=np.zeros((len(seen), 3)))
+    with pytest.raises(InputError, match='images do not tell a new place'):
+        verify(arm, [images], 1e-3, new_base=True)
 
 
 @pytest.fixture

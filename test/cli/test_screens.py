@@ -32,6 +32,7 @@ from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
 from calib_ros.files import bags
 from calib_ros.files.boards import read_board
+from calib_ros.sampling import intake
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -283,7 +284,7 @@ def test_work_tells_the_time_left(monkeypatch):
 
 
 def test_a_bag_tells_how_much_of_it_is_read(cell, monkeypatch):
-    monkeypatch.setattr(bags, 'BATCH', 100)
+    monkeypatch.setattr(intake, 'BATCH', 100)
     told = []
     bags.replay(cell / 'bag', CalibrationSession(UR), told.append)
     assert told == sorted(told)
@@ -327,7 +328,7 @@ def test_a_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, shown)
     monkeypatch.setattr(Work, '__call__', lambda self, at: told.append(at))
     assert shown('plan', *UR5E, '--accuracy', '0.1', '--draw', '100')[0] == 0
     assert re.fullmatch(r'\d+ poses', told[0])
-    assert re.fullmatch(r'\d+ poses, exchange 2', told[1])
+    assert any(re.fullmatch(r'\d+ poses, exchange 2', each) for each in told)
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def test_no_calibration_is_overwritten(tmp_path):
     with pytest.raises(InputError, match='exists already'):
         archive.save('second', 'settings: b\n', path)
     with full_disk(2), pytest.raises(OSError, match='File too large'):
-        archive.save('third', '')
+        archive.save('3', 'settings: c\n')  # of the two files the smaller one fits
     assert path.read_text() == 'first'
     assert path.with_suffix('.settings.yaml').read_text() == 'settings: a\n'
     assert not list(tmp_path.glob('*Z.yaml'))

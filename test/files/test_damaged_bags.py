@@ -100,6 +100,11 @@ def test_the_log_beside_a_database_is_read_and_left_as_it_is(tmp_path, long_bags
     assert_equal(session.problem().observations, whole)
     assert len(warnings) == (0 if alone else 1)  # without metadata it was not closed
     assert {each: each.read_bytes() for each in path.iterdir()} == before
+    log = path / f'{file.name}-wal'
+    log.chmod(0o644)
+    log.write_bytes(b'\0' + log.read_bytes()[1:])
+    with pytest.raises(InputError, match='wal is damaged, what was recorded last cannot be read'):
+        session_of(path / file.name if alone else path)
 
 
 @storages

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables that others have written."""
 
+import re
+import zipfile
+
 import numpy as np
 import pytest
 from robots import DATA, needs_data
@@ -346,6 +349,19 @@ def test_workbooks(tmp_path):
     assert_same(read_table(path, 2, foreign=Foreign(Layout(sheet='measured'))), None)
     with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
         read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
+    other = book.create_sheet('later')
+    other.append(['q1', 'q2', 'x', 'y', 'z'])
+    book['first'].sheet_state = 'hidden'
+    book.save(path)
+    found = read_table(path, 2, foreign=Foreign(Layout()))
+    assert_same(found, None)
+    assert 'sheet "measured" is read, the first of 2 (--sheet)' in str(found.warnings)
+    smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
+    with zipfile.ZipFile(path) as whole, smaller:
+        for name in whole.namelist():
+            text = re.sub(rb'<dimension ref="[^"]*"', b'<dimension ref="A1:E3"', whole.read(name))
+            smaller.writestr(name, text)
+    assert_same(read_table(tmp_path / 'smaller.xlsx', 2, foreign=Foreign(Layout())), None)
     path.write_bytes(b'no workbook')
     with pytest.raises(InputError, match='cannot read'):
         read_table(path, 2, foreign=Foreign(Layout()))

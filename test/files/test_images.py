@@ -102,6 +102,7 @@ BOARD = 'type: charuco\ncolumns: 5\nrows: 7\nsquare: 0.036\nmarker: 0.026\ndicti
         ('columns: 5', 'columns: 5.0', 'columns must be a whole number'),
         ('columns: 5', 'columns: 1', 'columns of a board must be from 2 to 1000, not 1'),
         ('marker: 0.026', 'marker: 0.036', 'needs 0 < marker < square'),
+        ('square: 0.036', 'square: 36', 'in metres, not 0.026 and 36'),
         ('rows: 7\n', '', 'key "rows" is missing'),
         ('charuco', 'chess', 'unknown type of board "chess"'),
         ('rows', 'lines', 'unknown key'),
@@ -140,6 +141,9 @@ def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
     path.write_text(INTRINSICS.replace('plumb_bob', 'equidistant'))
     with pytest.raises(ConfigError, match='must be plumb_bob'):
         boards.read_lens(path)
+    for matrix in ([800, 0, 0, 0, 800, 0, 320, 240, 1], [800, 0, 320, 0, 800, 240, 0, 0, 2]):
+        with pytest.raises(ConfigError, match='camera_matrix must be'):
+            boards.lens_of('plumb_bob', matrix, [], 'camera')
 
 
 def test_the_virtual_arm_is_where_the_flange_is(rng):

@@ -111,6 +111,28 @@ def test_another_robot_and_the_other_convention_are_named():
     assert 'convention: standard' in str(explained(Problem(other, seen)))
 
 
+@pytest.mark.parametrize(
+    ('mistake', 'remedy'),
+    [
+        ('both', 'correct it where it is published'),
+        ('inverse', 'set eye_in_hand=true in sources'),
+        ('sign', 'sign: -1 in the chain file'),
+        ('zero', 'theta -90 degrees in the chain file'),
+        ('swapped', 'swap them in joint_names'),
+        ('shift', 'check the stamps'),
+    ],
+)
+def test_mistakes_in_messages_name_no_option_of_a_table(mistake, remedy):
+    found = str(explained(Problem(UR, SPOILT[mistake][0](seen_of()), of_messages=True)))
+    assert remedy in found
+    assert '--' not in found.replace(' -- or ', '')
+
+
+def test_another_robot_in_messages_is_named_as_the_chain_to_set():
+    problem = Problem(load_chain('ur5e'), seen_of(), of_messages=True)
+    assert 'set chain to ur10e (' in str(explained(problem))
+
+
 @pytest.mark.parametrize('seed', range(2))
 def test_where_nothing_is_wrong_nothing_is_said(seed):
     rng = np.random.default_rng(seed)

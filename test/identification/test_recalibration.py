@@ -131,3 +131,11 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, tmp_path
     assert read.chain.value('elbow_joint.theta') == pytest.approx(
         previous.chain.value('elbow_joint.theta') + 5e-4, abs=1e-4
     )
+    given[-7:-4] = [str(tmp_path / 'again'), '--previous', str(tmp_path / 'out')]
+    assert main(given) == 3
+    said = ' '.join(capsys.readouterr().out.split())
+    assert 'NOT accepted: these are the measurements that the calibration was fitted to' in said
+    assert not (tmp_path / 'again' / 'calibration.yaml').exists()
+    given[-7] = str(tmp_path / 'out')  # over what it brings up to date
+    assert main([*given, '--force']) == 3
+    assert (tmp_path / 'out' / 'calibration.previous.yaml').read_text() == text

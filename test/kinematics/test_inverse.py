@@ -9,7 +9,8 @@ from hypothesis import given, strategies as st
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
-from calib_ros.kinematics.inverse import limits, solve, solve_positive
+from calib_ros.kinematics.inverse import limits, solve
+from calib_ros.kinematics.newton import solve_positive
 from calib_ros.kinematics.se3 import log_rotation
 from calib_ros.values import SAME
 

@@ -37,6 +37,7 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
     told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
     arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
     assert main([*arguments, '--tolerance', '5', '--pdf']) == 0
+    assert 'arm gets better, and within the tolerance of 5 mm' in capsys.readouterr().out
     content = (out / 'report.pdf').read_bytes()
     assert content.startswith(b'%PDF')
     assert len(content) < 2e6

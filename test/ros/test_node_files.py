@@ -6,6 +6,7 @@ import os
 
 import pytest
 from ros_cell import Cell, true_arm
+from std_srvs.srv import Trigger
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.records import nominal_document
@@ -34,14 +35,20 @@ def cell(data, tmp_path):
         yield cell
 
 
+def called(cell, service, parameter, name):
+    """Return the answer to a call after a file was named, or why that name is refused."""
+    (result,) = cell.set_parameters({parameter: str(name)})
+    if result.successful:
+        return cell.call(service)
+    return Trigger.Response(success=False, message=result.reason)
+
+
 def load(cell, name):
-    assert cell.set_parameters({'calibration_filename': str(name)})[0].successful
-    return cell.call('load')
+    return called(cell, 'load', 'calibration_filename', name)
 
 
 def save(cell, name):
-    assert cell.set_parameters({'target_filename': str(name)})[0].successful
-    return cell.call('save')
+    return called(cell, 'save', 'target_filename', name)
 
 
 def everything(folder):
@@ -112,6 +119,33 @@ def test_files_are_written_into_the_folders_only(cell, data, tmp_path):
         assert (data / name).read_text() == text
         assert load(cell, name).success
     assert 'exists already' in save(cell, 'new.yaml').message
+
+
+def test_a_name_that_was_good_is_looked_at_again(cell, data, tmp_path):
+    """A link may be put in its place after it was set."""
+    assert load(cell, 'good.yaml').success
+    (data / 'good.yaml').rename(tmp_path / 'moved.yaml')
+    (data / 'good.yaml').symlink_to(tmp_path / 'moved.yaml')
+    answer = cell.call('load')
+    assert not answer.success
+    assert 'outside the folders of the node' in answer.message
+
+
+def test_a_file_elsewhere_is_refused_when_it_is_named(cell):
+    (result,) = cell.set_parameters({'target_filename': '/etc/x.yaml'})
+    assert not result.successful
+    assert 'choose target_filename in data_dir' in result.reason
+
+
+def test_robots_of_a_kind_in_namespaces_keep_their_files_apart(data):
+    name = 'ur10e_left_20260101T000000000000Z.yaml'
+    (data / 'good.yaml').rename(data / name)
+    with Cell() as cell:
+        for namespace in ('left', 'right'):
+            cell.start(namespace=f'/{namespace}', chain='ur10e', data_dir=str(data))
+        assert name in cell.call('load', node='/left/calibration_node').message
+        answer = cell.call('load', node='/right/calibration_node')
+        assert 'there is no saved calibration' in answer.message
 
 
 def test_the_list_of_folders_is_the_operators(cell):

@@ -278,6 +278,20 @@ def test_a_camera_info_that_cannot_be_used(change, said):
         lens_in(info)
 
 
+def test_an_image_of_another_size_than_its_camera_info_is_refused(shift, board):
+    (camera,) = cameras_of(sources(board, Image)).values()
+    come = messages(shift, Image, 1)
+    info, image = (next(e for _, e in come if isinstance(e, k)) for k in (CameraInfo, Image))
+    camera.learn(info)
+    assert not isinstance(camera.look(image), Refusal)
+    info.width, info.height = 640, 480
+    camera.learn(info)
+    assert not isinstance(camera.look(image), Refusal)
+    info.width, info.height = 1280, 960
+    camera.learn(info)
+    assert camera.look(image).reason.startswith('it and its CameraInfo are of 640 x 480 and 1280')
+
+
 @pytest.mark.parametrize(
     ('text', 'said'),
     [

@@ -138,7 +138,7 @@ def test_a_bag_without_named_sources_lists_the_bodies(tmp_path, rng, kind, stora
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
     assert 'hall to tool at 200 Hz' in str(caught.value)
-    assert f'--sources "{line(kind, "base")}"' in str(caught.value)
+    assert f'such as "{line(kind, "base")}"' in str(caught.value)
     with pytest.raises(InputError) as caught:
         session_of(path, sources=(line(kind, 'tol'),))
     assert 'nothing links frame "tol" to "hall" on /bodies' in str(caught.value)
@@ -152,7 +152,7 @@ def test_the_line_that_is_proposed_is_of_use_whatever_a_body_is_called(tmp_path,
     path = write(tmp_path / 'bag', standing(come, '/bodies'))
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
-    (proposed,) = re.findall('--sources (.*)$', str(caught.value))
+    (proposed,) = re.findall('such as (.*)$', str(caught.value))
     (text,) = shlex.split(proposed)
     session, _ = session_of(path, sources=(text,))
     assert {each.target for each in session.samples} == {"Rigid Body 1 of 'Tom'"}

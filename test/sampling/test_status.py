@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sessions import SIGMAS, UR5E, drive, samples, session, tracker
-from streams import joint_state, of_joints, take
+from streams import POSE, TRACKER, joint_state, of_joints, pose, take
 
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
@@ -108,10 +108,24 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
 )
 def test_the_status_tells_why_no_joint_state_is_used(stamp, value, cause):
     made = session()
-    take(made, *[of_joints(joint_state(stamp, UR5E.joint_names, [value] * 6))] * 50)
-    said = f'waiting for joint states; of those that came 50 x {cause}'
+    refused = of_joints(joint_state(stamp, UR5E.joint_names, [value] * 6))
+    said = f'nothing can be sampled: joint states are refused, {cause}'
+    take(made, *[refused] * 50)
     assert made.status().startswith(said)
     assert made.capture() == (0, said)
+    good = [joint_state(10**18 + k, UR5E.joint_names, [0.1] * 6) for k in range(3)]
+    take(made, refused, *map(of_joints, good))
+    assert 'refused' not in made.status()
+    take(made, refused)  # a driver may fail later
+    assert made.status().startswith(said)
+
+
+def test_the_status_tells_why_no_measurement_is_used():
+    made = session()
+    take(made, (TRACKER, POSE, pose(10**18, np.full(3, np.nan), np.eye(3))))
+    assert 'measurements are refused, NaN or infinite position' in made.status()
+    take(made, (TRACKER, POSE, pose(10**18, np.zeros(3), np.eye(3))))
+    assert 'refused' not in made.status()
 
 
 @pytest.mark.parametrize('where', [np.zeros(3), np.array([0.7, -0.1, 1.3])])

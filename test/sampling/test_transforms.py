@@ -212,7 +212,7 @@ def test_a_bag_without_named_sources_lists_the_frames(tmp_path, rng, storage):
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
     assert 'world to marker at 200 Hz' in str(caught.value)
-    assert '--sources "/tf parent=world child=marker"' in str(caught.value)
+    assert 'such as "/tf parent=world child=marker"' in str(caught.value)
     assert len(poses_of(path, '/tf parent=world child=marker')[0]) == 198
 
 

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Thousands of small least-squares problems at once, each with its own damping.
+
+Gauss-Newton steps; one that does not lower the cost is not taken, and tried again with more
+damping (Levenberg 1944, Marquardt 1963). Arrays are laid out (component, problem), as in
+`jacobian.py`. `leastsquares.minimise` solves one problem of many rows, whose cost may rise on the
+way through curved valleys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
+
+
+class Normal(NamedTuple):
+    """Normal matrices (n, n, B), slopes (n, B) downwards and costs (B,) of problems."""
+
+    matrix: FloatArray
+    slope: FloatArray
+    cost: FloatArray
+
+
+class Minimum(NamedTuple):
+    """What was found (..., B), its cost (B,), which have settled (B,), and the steps of all."""
+
+    x: FloatArray
+    cost: FloatArray
+    settled: NDArray[np.bool_]
+    iterations: int
+
+
+def minimise(
+    linearise: Callable[[FloatArray, NDArray[np.intp]], Normal],
+    start: FloatArray,
+    move: Callable[[FloatArray, FloatArray], FloatArray] = np.add,
+    fall: float = 0.0,
+    longest: float = np.inf,
+    enough: float | None = None,
+    rounds: int = ROUNDS,
+) -> Minimum:
+    """Return where the cost is least, from a start (..., B) for each problem.
+
+    `linearise` gives the normal equations at points (..., K) of the problems with numbers (K,),
+    `move` the points after steps (n, K). A problem settles when its step vanishes, or its cost
+    changes by a smaller share than `fall`; where a cost is `enough`, that settles it instead, and
+    damping is by the identity, for the shortest steps, from the first one on. It is given up when
+    no damping lowers its cost, x is longer than the `longest`, or after so many `rounds`.
+    """
+    x, active = start, np.arange(start.shape[-1])
+    found, settled = start.copy(), np.zeros(active.size, dtype=bool)
+    first, least = (1e-6, 1e-12) if enough else (0.0, 1e-3)
+    slack = 0.0 if enough else ROUNDING  # at the minimum costs tell half the digits of x only
+    damping, over = np.full(active.size, first), settled.copy()
+    now = linearise(x, active)
+    cost = now.cost.copy()
+    diagonal = np.diag_indices(len(now.slope))
+    iterations = 0
+    while iterations < rounds:
+        iterations += 1
+        matrix = now.matrix.copy()
+        matrix[diagonal] += damping * (1.0 if enough else matrix[diagonal])
+        step = solve_positive(matrix, now.slope)
+        tried = move(x, step)
+        small = ~over & (np.abs(step).max(axis=0) <= HALF_THE_DIGITS) & (enough is None)
+        far = np.zeros_like(over)
+        if longest < np.inf:
+            far = ~over & (np.linalg.norm(tried, axis=0) > longest)
+        found[..., active] = np.where(small | far, tried, x)
+        settled[active[small & ~far]] = True
+        going = np.flatnonzero(~(over | small | far))
+        active, damping = active[going], damping[going]
+        x, tried = x[..., going], tried[..., going]
+        if not going.size:
+            break
+        now = Normal._make(part[..., going] for part in now)
+        new = linearise(tried, active)
+        taken = new.cost < now.cost * (1.0 + slack)
+        still = np.abs(new.cost - now.cost) < fall * now.cost
+        x = np.where(taken, tried, x)
+        now = Normal._make(np.where(taken, *pair) for pair in zip(new, now, strict=True))
+        still |= now.cost <= (enough or 0.0)
+        settled[active[still]] = True
+        damping = np.where(taken, 0.1 * damping, np.maximum(10.0 * damping, least))
+        over = still | (damping > 1e3)
+        cost[active] = now.cost
+    found[..., active] = x
+    return Minimum(found, cost, settled, iterations)
+
+
+def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve positive definite systems (n, n, B) for right hand sides (n, B), by elimination."""
+    rows, x = matrix.copy(), right.copy()
+    for k in range(len(x) - 1):
+        factor = rows[k + 1 :, k] / rows[k, k]
+        rows[k + 1 :, k + 1 :] -= factor[:, np.newaxis] * rows[k, np.newaxis, k + 1 :]
+        x[k + 1 :] -= factor * x[k]
+    for k in reversed(range(len(x))):
+        x[k] -= np.einsum('jb,jb->b', rows[k, k + 1 :], x[k + 1 :])
+        x[k] /= rows[k, k]
+    return x
