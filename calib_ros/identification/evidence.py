@@ -66,6 +66,8 @@ SHOWN, REFUTED = 1.35, 3.0
 which those of usual size are refuted."""
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
+PRINTED = 5e-3
+"""The same of a printed board: often not in its true size, and hardly anything shows it."""
 MOST_SAMPLES = 2000
 """Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
@@ -206,7 +208,8 @@ def posterior_of(
     every = (*names, *more)
     beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
     whole, lengths = _lengths(chain, system) if more else (chain, {})
-    beside += [(lengths, SCALE)] if lengths else []
+    boards = all(samples.observations.pixels is not None for samples in system.sets)
+    beside += [(lengths, PRINTED if boards else SCALE)] if lengths else []
     told = _told(whole, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
     offsets = np.zeros(len(matrix))
