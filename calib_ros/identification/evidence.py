@@ -45,13 +45,8 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.shown import Shown
 
-TYPICAL = {
-    'length': 5e-4,
-    'angle': 1e-3,
-    'drive': 1e-4,
-    'coupling': 1e-3,
-    **dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4),
-}
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'coupling': 1e-3}
+TYPICAL |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
@@ -59,15 +54,14 @@ benchmarks/harm.py)."""
 TAILS = 3.0
 """Degrees of freedom of the prior (benchmarks/harm.py)."""
 CONSIDERED = ('eccentricity', 'gravity')
-"""Effects that any arm may have, whether they are fitted or not, beside couplings: one that its
-controller does not know hardly shows where joints move little, or one at a time."""
+"""Effects that any arm may have, fitted or not; couplings hardly show in moves of one joint."""
 SHOWN, REFUTED = 1.35, 3.0
 """Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
 which those of usual size are refuted."""
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
 PRINTED = 5e-3
-"""The same of a printed board: often not in its true size, and hardly anything shows it."""
+"""The same of a printed board."""
 MOST_SAMPLES = 2000
 """Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
@@ -207,9 +201,8 @@ def posterior_of(
     chain = chain.with_effects(more)
     every = (*names, *more)
     beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
-    whole, lengths = _lengths(chain, system) if more else (chain, {})
-    boards = all(samples.observations.pixels is not None for samples in system.sets)
-    beside += [(lengths, PRINTED if boards else SCALE)] if lengths else []
+    whole, lengths, scale = _lengths(chain, system) if more else (chain, {}, SCALE)
+    beside += [(lengths, scale)] if lengths else []
     told = _told(whole, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
     offsets = np.zeros(len(matrix))
@@ -231,20 +224,21 @@ def posterior_of(
     return Posterior(chain, every, offsets[arm], shift, root @ root.T, priors, sizes, doubted)
 
 
-def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float]]:
-    """Return all lengths [m] that positions are made of; none where no device has a scale.
+def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
+    """Return all lengths [m] that positions are made of, and how well their scale is known.
 
-    Balls in sockets and touched planes are where they are. The travel of a prismatic joint grows
-    by its ratio, which the chain returned has.
+    There are none by sockets and planes, which are where they are. The travel of a prismatic joint
+    grows by its ratio, which the chain returned has.
     """
     sets = [samples.observations for samples in system.sets]
     if any(each.socket or each.plane for each in sets):
-        return chain, {}
+        return chain, {}, SCALE
     travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
     chain = chain.with_effects(travels)
     names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
-    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}
+    scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
+    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 
 def _told(

@@ -252,8 +252,7 @@ def identify(
     """
     known = None if simpler is None else Simpler(simpler.chain, simpler.distances, simpler.noise)
     structural, start, fitted = fit(problem, known)
-    names = fitted.names
-    problem, robust, chain = fitted.problem, fitted.robust, fitted.chain
+    problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain
     progress(1 / 2)  # of many poses (benchmarks/end_to_end.py)
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > 4 * SOME:
