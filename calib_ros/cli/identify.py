@@ -61,7 +61,11 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))
     else:
-        show(found, screen, options.out, options.tolerance)
+        show(found, screen, options.tolerance)
+        if options.out is None:
+            screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
+        else:
+            screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 

@@ -189,6 +189,12 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Conte
         write_files(folder, contents)
 
 
+def written(out: Path, contents: Contents) -> str:
+    """Return where the files are that were written, and which of them to open."""
+    page = 'report.html'
+    return f'wrote {out}' + (f': open {out / page}' if page in contents else '')
+
+
 def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
     """Add the options by which a report says what it is of; `pdf` adds that for paper."""
     add = parser.add_argument_group('for the report').add_argument

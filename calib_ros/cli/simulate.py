@@ -44,11 +44,13 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         origin = given.origin_of(options, [bag], configuration)
         found = identified(loaded, settings, screen, origin)
         screen.say('4. writing the report')
-        write_files(folder, result_files(found, screen, options.out))
+        contents = result_files(found, screen, options.out)
+        write_files(folder, contents)
         against = words.against_truth(found.result, load_chain(truth))
     screen.say('identified offsets against the true ones [mm, mrad]:')
     screen.say(against)
-    show(found, screen, options.out)
+    show(found, screen)
+    screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 

@@ -21,7 +21,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import STATES, verification_report
+from calib_ros.report.verified import standing, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     with common.results(options, VERIFICATION_FILES) as contents:
         status = _verified(options, screen, contents)
     if options.out is not None:
-        screen.say(f'wrote {options.out}')
+        screen.say(common.written(options.out, contents))
     return status
 
 
@@ -63,7 +63,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     for warning in warnings:
         screen.warn(warning)
     show(found, screen)
-    status = 0 if found.verdict in ('PASS', 'JUDGED') else common.NOT_ACCEPTED
+    status = common.NOT_ACCEPTED if standing(found)[0].state in ('bad', 'open') else 0
     if options.out is None:
         return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))
@@ -87,7 +87,7 @@ def show(found: Verification, screen: Screen) -> None:
     tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    state = STATES[found.verdict]
+    state, steps = standing(found)
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     screen.table(
         (
@@ -107,6 +107,8 @@ def show(found: Verification, screen: Screen) -> None:
         screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
     for remark in remarks(found):
         screen.bullet(remark)
+    if state.state in ('bad', 'open'):
+        screen.bullet('what to do:', steps)
 
 
 def _sets(

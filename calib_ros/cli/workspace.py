@@ -32,7 +32,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     common.at_least(options, poses=100, cells=1, turns=1, seed=0)
     with common.results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
-    screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
+    screen.say(common.written(options.out, contents))
     return 0
 
 

@@ -18,7 +18,8 @@ from calib_ros.identification.reasons import Reason, Rule
 class Advice:
     """A refusal in plain words: heading, meaning, what to do, the refusal itself.
 
-    `again` tells on what to identify then. What follows from another refusal has no steps.
+    `again` tells on what to identify then. What follows from another refusal has no steps: its
+    `meaning` says so.
     """
 
     heading: str
@@ -33,6 +34,10 @@ RIGHT_CHAIN = (
     'Check the units: joint values in radians, positions in metres.',
     'Check that the joint values are in the order of the arm, from its foot to its tool.',
 )
+STOOD = (
+    'If the error is much larger, check that the arm stood still at each pose, that the target is '
+    'fixed to the flange, and the device to the floor.'
+)
 SPREAD = 'spread over the whole workspace, with every joint moved through most of its range'
 
 RULES: dict[Rule, Advice] = {
@@ -41,7 +46,7 @@ RULES: dict[Rule, Advice] = {
         'From one pose on, one joint reads differently than before. Earlier measurements no '
         'longer describe the arm.',
         (
-            'Check the mastering (zero position) of the joint named.',
+            'Check the mastering (zero position) of the joint named: did its encoder slip?',
             'Keep only the measurements after the slip, or measure again.',
         ),
         again='on what was measured after the slip',
@@ -52,7 +57,8 @@ RULES: dict[Rule, Advice] = {
         'device or the foot of the robot was bumped or moved.',
         (
             'Fasten the target, the device and the robot, then measure again.',
-            'Or keep the data: name two sessions, before and after, and fit both.',
+            'Or keep the data: name two sessions, before and after, in the column session of the '
+            'table or journal, and fit both (--session with both names).',
         ),
         again='on the new measurements alone, or on the two sessions',
     ),
@@ -118,8 +124,7 @@ RULES: dict[Rule, Advice] = {
         (
             'Compare the error before with the accuracy of the measuring device. If they '
             'are similar, stop: this device cannot measure any improvement.',
-            'If the error is much larger, check that the arm stood still at each pose, that the '
-            'target is fixed to the flange, and the device to the floor.',
+            STOOD,
             f'Measure more poses, {SPREAD}.',
             'Set model to auto: the error may come from gears or gravity.',
         ),
@@ -165,7 +170,7 @@ RULES: dict[Rule, Advice] = {
         ),
     ),
     Rule.ORIENTATION: Advice(
-        'The position gets better, the orientation worse',
+        'The correction makes the orientation worse',
         'On poses not used to compute it, the corrected arm points less precisely than before. '
         'Often the stated accuracy of the device is wrong.',
         (
@@ -236,8 +241,8 @@ GOOD_ARM = Advice(
 """In place of `Rule.GAIN`, where the error before is no larger than the noise."""
 
 WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
-"""Where the description does not fit the arm; the first of them that is there is the cause."""
-FOLLOWING = {
+"""Where the description does not fit the arm."""
+WRONG = {
     *WRONG_ARM,
     Rule.CONVERGENCE,
     Rule.DRIFT,
@@ -247,9 +252,10 @@ FOLLOWING = {
     Rule.SCALE,
 }
 """What a description that does not fit brings by itself."""
-
-
-FOLLOWS = 'This probably follows from a wrong description: mend that first.'
+BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
+    rule: {rule, Rule.OUTLIERS} for rule in (Rule.ENCODER, Rule.MOVED)
+}
+"""What each cause brings by itself; the first cause that is there counts."""
 
 NOISY = 10.0
 """Ratio of what is left to the stated noise that an arm's own errors rarely reach."""
@@ -263,25 +269,24 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
-    cause = next((rule for rule in WRONG_ARM if rule in found), None)
-    return tuple(
-        replace(
-            RULES[rule],
-            meaning=RULES[rule].meaning if keeps else FOLLOWS,
-            steps=(*_first(rule, left), *RULES[rule].steps) if keeps else (),
-            refusal='; '.join(texts),
-        )
-        for rule, texts in found.items()
-        for keeps in [cause in (None, rule) or rule not in FOLLOWING]
-    )
+    told = []
+    for rule, texts in found.items():
+        one = replace(RULES[rule], refusal='; '.join(texts))
+        causes = (each for each, brought in BRINGS.items() if each in found and rule in brought)
+        if (cause := next(causes, rule)) is not rule:
+            follows = f'This probably follows from "{RULES[cause].heading}": mend that first.'
+            one = replace(one, meaning=follows, steps=())
+        elif left >= NOISY and rule in {Rule.GAIN, Rule.REGION}:
+            steps = (each for each in one.steps if each is not STOOD)
+            one = replace(one, steps=(_coarse(left), *steps))
+        told.append(one)
+    return tuple(told)
 
 
-def _first(rule: Rule, left: float) -> tuple[str, ...]:
+def _coarse(left: float) -> str:
     """Return what to check before more is measured, where the measurements are far too coarse."""
-    if left < NOISY or rule not in {Rule.GAIN, Rule.REGION}:
-        return ()
     return (
         'Before you measure more, check that the target sits firmly, that the arm stood still, '
         'that the clocks of robot and device agree, and the units: the measurements scatter '
-        f'{left:.0f} times as much as stated for the device.',
+        f'{left:.0f} times as much as stated for the device.'
     )

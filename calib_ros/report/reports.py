@@ -33,6 +33,10 @@ from calib_ros.report.sections import (
     limits_of,
 )
 
+NOT_YET = (
+    'The robot itself is not changed yet: calib_ros export (~/export of the node) brings the '
+    'correction to its controller, calib_ros compensate to its programs'
+)
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -69,7 +73,7 @@ def identification_report(
         ),
         picture=distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
-        remarks=(*warnings, *words.remarks(result)),
+        remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
         identity=identity_of(
             result.chain,
             origin,
@@ -92,7 +96,8 @@ def _verdict(
         return _refused(result, reasons)
     how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
-    text = tuple(each for each in (how, where) if each)
+    doubts = (f'Check before you use it: {each}.' for each in result.remarks)
+    text = (*filter(None, (how, where)), *doubts, 'The robot itself is not changed yet.')
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
     heading = 'Accepted' + (f', {within}' if within else '')
@@ -184,11 +189,11 @@ def _steps(
         )
     elif tolerance is not None and limits[1] > tolerance:
         found.append(f'Measure more poses to decide about the tolerance, {SPREAD}.')
-    found.append('Bring the correction to the robot: calib_ros export, or ~/export of the node.')
-    found.append(
+    found += [
+        f'{NOT_YET}.',
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
-        'arm: calib_ros verify.'
-    )
+        'arm: calib_ros verify.',
+    ]
     if result.region is not None and not result.region.whole:
         found.append(
             'Use it near the measured poses. To use it elsewhere, measure poses there as well.'

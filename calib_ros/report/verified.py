@@ -27,6 +27,7 @@ STATES: dict[str, Verdict] = {
     'PASS': Verdict('good', 'PASS: the arm is within the tolerance'),
     'FAIL': Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
     'UNDECIDED': Verdict('open', 'UNDECIDED: too few measurements to tell'),
+    'LOST': Verdict('bad', 'the calibration does not hold any more'),
     'JUDGED': Verdict('info', 'no verdict: --tolerance MM gives PASS or FAIL'),
 }
 NEXT: dict[str, tuple[str, ...]] = {
@@ -38,8 +39,19 @@ NEXT: dict[str, tuple[str, ...]] = {
         'Calibrate again with new poses; try --model auto.',
     ),
     'UNDECIDED': (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
+    'LOST': (
+        'Check that the measuring device, the target and the robot stand as they did for the '
+        'calibration; if not, use --new-base or --new-tool.',
+        'Calibrate again with new poses, or with --previous by a few.',
+    ),
     'JUDGED': ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
 }
+
+
+def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict, and what to do next; without a tolerance it may be lost all the same."""
+    name = 'LOST' if found.verdict == 'JUDGED' and found.holds is False else found.verdict
+    return STATES[name], NEXT[name]
 
 
 def verification_report(
@@ -54,7 +66,7 @@ def verification_report(
     wanted: tuple[str, ...] = (
         () if found.tolerance is None else (f'Tolerance: {1e3 * found.tolerance:g} mm.',)
     )
-    state = STATES[found.verdict]
+    state, steps = standing(found)
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
@@ -65,7 +77,7 @@ def verification_report(
             found.comparison,
         ),
         picture=distribution(poses),
-        steps=NEXT[found.verdict],
+        steps=steps,
         remarks=(*warnings, *remarks(found)),
         identity=identity_of(
             chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)

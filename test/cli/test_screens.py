@@ -155,6 +155,8 @@ MORE = {
     'identify_refused': (3, 'identify', 'good_arm.csv', *UR5E),
     'identify_of_a_program': (1, 'identify', 'result/report.html', *UR5E),
     'verify_of_a_bag': (3, 'verify', 'bag', *UR5E, '--calibration', 'result', '--tolerance', '1'),
+    'identify_another_arm': (3, 'identify', 'measured.csv', '--chain', 'ur10'),
+    'verify_of_a_lost_calibration': (3, 'verify', 'bumped.csv', *UR5E, '--calibration', 'result'),
     'a_table_as_command': (2, 'measured.csv'),
     'a_bag_as_command': (2, 'bag'),
     'nothing_there': (1, 'identify', 'missing.csv', *UR5E),
