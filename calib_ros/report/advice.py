@@ -30,7 +30,7 @@ class Advice:
 
 
 RIGHT_CHAIN = (
-    'Check that the chain is that of the arm measured: type, size and generation.',
+    'Check that the chain is that of the arm measured (type, size and generation).',
     'Check the units: joint values in radians, positions in metres.',
     'Check that the joint values are in the order of the arm, from its foot to its tool.',
 )
@@ -46,7 +46,7 @@ RULES: dict[Rule, Advice] = {
         'From one pose on, one joint reads differently than before. Earlier measurements no '
         'longer describe the arm.',
         (
-            'Check the mastering (zero position) of the joint named: did its encoder slip?',
+            'Check the mastering (zero position) of the joint named. Did its encoder slip?',
             'Keep only the measurements after the slip, or measure again.',
         ),
         again='on what was measured after the slip',
@@ -67,7 +67,7 @@ RULES: dict[Rule, Advice] = {
         'Some poses did not fit and were set aside as faulty measurements. But they all depend '
         'on one joint: the cause is the arm, not the device.',
         (
-            'Set model to auto and run again: it looks for such effects.',
+            'Set model to auto, which looks for such effects, and run again.',
             'Or set loss to none, so that no pose is set aside.',
         ),
     ),
@@ -110,8 +110,8 @@ RULES: dict[Rule, Advice] = {
         'More than a third of the poses disagree with all the others. Then nobody can tell '
         'which ones are right.',
         (
-            'Check that joint values and measurements belong to the same moment: the arm '
-            'must stand still, and clocks must agree.',
+            'Check that joint values and measurements belong to the same moment (the arm must '
+            'stand still, and clocks must agree).',
             'Check that the target is fixed to the flange and the device to the floor.',
             *RIGHT_CHAIN,
         ),
@@ -123,7 +123,7 @@ RULES: dict[Rule, Advice] = {
         'good as it gets, or the device too coarse to show more.',
         (
             'Compare the error before with the accuracy of the measuring device. If they '
-            'are similar, stop: this device cannot measure any improvement.',
+            'are similar, stop, because this device cannot measure any improvement.',
             STOOD,
             f'Measure more poses, {SPREAD}.',
             'Set model to auto: the error may come from gears or gravity.',
@@ -193,7 +193,7 @@ RULES: dict[Rule, Advice] = {
         'The recording does not say how many messages it should hold. Those missing could be '
         'just the poses that matter.',
         (
-            'Repair the recording: `ros2 bag reindex`.',
+            'Repair the recording (`ros2 bag reindex`).',
             'If you know it is complete, run with --largest-loss 1.',
         ),
     ),
@@ -286,7 +286,7 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
 def _coarse(left: float) -> str:
     """Return what to check before more is measured, where the measurements are far too coarse."""
     return (
-        'Before you measure more, check that the target sits firmly, that the arm stood still, '
-        'that the clocks of robot and device agree, and the units: the measurements scatter '
-        f'{left:.0f} times as much as stated for the device.'
+        f'The measurements scatter {left:.0f} times as much as stated for the device: before you '
+        'measure more, check that the target sits firmly, that the arm stood still, that clocks '
+        'agree, and the units.'
     )

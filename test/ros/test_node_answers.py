@@ -14,7 +14,9 @@ from std_srvs.srv import SetBool
 
 from calib_ros.apply.simulation import measure
 from calib_ros.files.history import History
+from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.report.advice import RULES
 from calib_ros.ros.identifying import _without_middle
 
 
@@ -52,6 +54,16 @@ def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
     assert found.startswith(verdict[:25])
     assert found.endswith(advice[2:])
     assert ' ... ' in found
+
+
+@pytest.mark.parametrize('rule', Rule)
+def test_a_refusal_keeps_what_to_do_first(rule):
+    step = RULES[rule].steps[0]
+    found = _without_middle(
+        f'NOT accepted: {"no gain on held-out poses; " * 9}To do first: {step}', 260
+    )
+    assert found.startswith('NOT accepted: no gain')
+    assert found.endswith(step)
 
 
 def test_answers_are_in_the_log_as_well(cell, recording):
