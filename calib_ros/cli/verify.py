@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
 from calib_ros.cli import given, options as common
-from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -117,10 +116,10 @@ def _sets(
     """Return all that was measured, warnings, and whether stamps are the lines of a table."""
     settings = common.settings_of(options)
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
-        found = table(options, options.measured, nominal, settings, screen)
+        found = given.table(options, options.measured, nominal, settings, screen)
         return (*found.fitted, *found.held_out), found.warnings, found.by_line
 
-    session, read = replayed(options.measured, nominal, settings, screen)
+    session, read = given.replayed(options.measured, nominal, settings, screen)
     screen.say(f'{read}; {session.account()}')
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     fitted, held_out = collect(session.usable, sigmas)

@@ -92,8 +92,7 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
         far = [f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond]
         yield Reason(
             Rule.COMMON_SENSE,
-            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be: is it the '
-            'right chain file?',
+            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be',
         )
 
 
@@ -104,7 +103,7 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
         yield Reason(
             Rule.LARGEST_ERROR,
             f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
-            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?',
+            f'{1e3 * problem.largest_error:g} mm (largest_error)',
         )
     judged = validation.deciding
     gain, limit = log_gain(

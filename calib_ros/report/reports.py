@@ -37,6 +37,9 @@ NOT_YET = (
     'The robot itself is not changed yet: calib_ros export (~/export of the node) brings the '
     'correction to its controller, calib_ros compensate to its programs'
 )
+UNPROVEN = (
+    'These poses were all used to compute the correction: a small error "after" proves nothing.'
+)
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -61,7 +64,7 @@ def identification_report(
         accuracy=accuracy_section(
             f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
             (
-                *_unproven(result),
+                *(() if result.validation else (UNPROVEN,)),
                 f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
                 f'{result.validated_by}.',
                 'RMS (root mean square) is the usual size of the error; its interval is that over '
@@ -117,15 +120,6 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     return f'but perhaps not {wanted}'
 
 
-def _unproven(result: Identification) -> Iterator[str]:
-    """Yield that figures prove nothing where no pose was left out."""
-    if result.validation is None:
-        yield (
-            'These poses were all used to compute the correction: a small error "after" proves '
-            'nothing.'
-        )
-
-
 def reasons_of(result: Identification) -> tuple[Advice, ...]:
     """Return why a result was refused, in plain words, and what to do.
 
@@ -174,7 +168,7 @@ def _steps(
     if not result.accepted:
         return (
             'Follow the steps above, those of the first reason first.',
-            f'Then identify again, {reasons[0].again}.',
+            reasons[0].again,
         )
     found = []
     if tolerance is not None and limits[0] > tolerance:

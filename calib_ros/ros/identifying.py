@@ -161,4 +161,4 @@ def _page(given: Snapshot, result: Identification) -> str | None:
     files = inputs_of([Path(journal)] if journal else [])
     origin = Origin(files, serial=serial, settings=given.configuration)
     poses = poses_of(given.problem, result)
-    return render(identification_report(given.problem, result, poses, origin))
+    return render(identification_report(given.problem, result, poses, origin, given.warnings))

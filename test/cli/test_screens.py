@@ -26,7 +26,7 @@ from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.cli import screen
 from calib_ros.cli.command import TEXTS
-from calib_ros.cli.commands import COMMANDS
+from calib_ros.cli.commands import examples_of
 from calib_ros.cli.main import _parser, main
 from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
@@ -122,7 +122,7 @@ def test_the_help_of_a_command(shown, name):
 
 @pytest.mark.parametrize('name', TEXTS)
 def test_the_examples_of_a_help_are_right(name):
-    for example in COMMANDS[name].examples:
+    for example in examples_of(name):
         given = shlex.split(example)
         assert given[0] == name
         assert _parser(given).parse_args(given)
