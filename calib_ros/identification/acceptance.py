@@ -83,7 +83,7 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
     not_excited = [p.name for p in found.parameters if p.status == 'not excited']
     if not_excited:
         frames = dict.fromkeys(n.owner for n in not_excited if problem.model.owns_frame(n))
-        known = f' ({", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
+        known = f' (or {", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
         yield Reason(
             Rule.EXCITATION, f'the poses do not determine {", ".join(not_excited)}{known}'
         )
