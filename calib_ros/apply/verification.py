@@ -386,8 +386,8 @@ def remarks(found: Verification) -> list[str]:
         lines.append(f'{enough} poses with the same RMS error would decide')
     if found.tolerance is None and found.holds is False:
         lines.append(
-            'the calibration does not hold any more: the error is larger than it was then. Was '
-            'the tracker, the target or the robot moved?'
+            'the error is larger than it was when the calibration was made: was the tracker, the '
+            'target or the robot moved?'
         )
     if found.common < NEARER:
         lines.append(

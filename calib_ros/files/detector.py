@@ -90,6 +90,22 @@ def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
     return [np.asarray(draw(dictionary, k, size)) < 128 for k in range(count)]
 
 
+def black_of(board: Board) -> FloatArray:
+    """Return what is printed black as rectangles (K, 4) [m]: left, top, width, height."""
+    rows: list[tuple[float, float, float, float]] = []
+    if board.type == 'charuco':
+        x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
+        black = np.column_stack([x.ravel(), y.ravel()])[(x + y).ravel() % 2 == 0]
+        rows += [(board.square * i, board.square * j, *[board.square] * 2) for i, j in black]
+    for cells, (left, top) in zip(marker_cells(board), board.markers.tolist(), strict=True):
+        size = board.marker / len(cells)
+        for k, row in enumerate(cells):  # runs of black cells: no white lines between them
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], row, [0]])))
+            for first, last in edges.reshape(-1, 2).tolist():
+                rows.append((left + first * size, top + k * size, (last - first) * size, size))
+    return np.array(rows)
+
+
 class Detector:
     """Finds the corners of one board.
 
