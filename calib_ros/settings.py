@@ -70,8 +70,6 @@ class Limits:
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
     """Declare a setting with what a node parameter and a command line option need to know."""
-    if isinstance(default, tuple):
-        return field(default=default, metadata={'text': text})
     return field(default=default, metadata={'text': text, 'lower': lower})
 
 
@@ -179,7 +177,7 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            lower = item.metadata.get('lower')
+            lower = item.metadata['lower']
             value = getattr(self, item.name)
             if isinstance(item.default, tuple):
                 _check_list(item.name, value)
