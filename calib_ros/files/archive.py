@@ -13,7 +13,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from calib_ros.atomic import whole_folder, write_file, write_files, write_together
+from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
 from calib_ros.files.journal import Journal
 from calib_ros.files.tables import read_journal
@@ -35,7 +35,7 @@ class Archive:
         self.folder = folder
         self.error = ''
         """Why poses are in memory only; empty while all are in the journal."""
-        self._robot = re.sub(r'/+|[^\w.-]', '_', robot)
+        self._robot = short_name(re.sub(r'/+|[^\w.-]', '_', robot))
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None

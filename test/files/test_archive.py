@@ -44,6 +44,18 @@ def full_disk(limit):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+def test_robots_with_long_names_have_files_of_their_own(tmp_path):
+    robots = [f'arm/{"é" * 150}{k}' for k in range(2)]
+    for k, robot in enumerate(robots):
+        archive = open_archive(tmp_path, robot)
+        archive.add(sample(k))
+        archive.close()
+        assert not archive.error
+        archive.save('calibration', 'settings: none')
+        assert archive.note('identified') is not None
+    assert [stamps(tmp_path, robot) for robot in robots] == [[0], [1]]
+
+
 def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
     first = open_archive(tmp_path)
     first.add(sample(1))
