@@ -196,10 +196,6 @@ class Settings:
 
 def _check_list(name: str, entries: Sequence[str]) -> None:
     """Refuse lists that are too long to be meant: what is done with them may take for ever."""
-    if len(entries) > MOST_ENTRIES:
-        raise ConfigError(f'{name} has {len(entries)} entries, at most {MOST_ENTRIES} are taken')
-    longest = max(map(len, entries), default=0)
-    if longest > MOST_ENTRIES:
-        raise ConfigError(
-            f'{name} has an entry of {longest} characters, at most {MOST_ENTRIES} are taken'
-        )
+    for count, what in ((len(entries), 'entries'), *((len(e), 'characters') for e in entries)):
+        if count > MOST_ENTRIES:
+            raise ConfigError(f'{name} has {count} {what}, at most {MOST_ENTRIES} are taken')

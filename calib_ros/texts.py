@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -128,69 +127,43 @@ def _loader() -> Any:
     return Loader
 
 
-@dataclass
-class _Open:
-    """A list or mapping of which the end has not come yet."""
-
-    anchor: str | None
-    keyed: bool
-    nodes: int = 1
-    height: int = 0
-    keys: set[str] = field(default_factory=set)
-    ends: int = 0
-
-    def hold(self, nodes: int, height: int, key: str | None) -> str | None:
-        """Take in what ended; return the name of a key that comes twice."""
-        self.nodes += nodes
-        self.height = max(self.height, height + 1)
-        self.ends += 1
-        if not self.keyed or self.ends % 2 == 0 or key in (None, '<<'):
-            return None
-        again = key if key in self.keys else None
-        self.keys.add(str(key))
-        return again
-
-
 def _check(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
     """Refuse what would not fit into memory, or is not meant."""
-    above: list[_Open] = []
+    import yaml
+
     anchors: dict[str, tuple[int, int]] = {}
-    for event in events:
-        kind = type(event).__name__
-        size, anchor, key = (0, 0), None, None
-        if kind in ('SequenceStartEvent', 'MappingStartEvent'):
-            above.append(_Open(event.anchor, kind == 'MappingStartEvent'))
-        elif kind == 'ScalarEvent':
-            size, anchor, key = (1 + len(event.value) // 20, 0), event.anchor, event.value
-        elif kind == 'AliasEvent':
+
+    def weigh(event: Any, above: int) -> tuple[int, int]:
+        """Return how many values a node has with its aliases written out, and its levels."""
+        nodes, height, keys = 1, 0, set()
+        if isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
                 raise error(f'{where}: alias "{event.anchor}" stands for nothing before it')
-            size = anchors[event.anchor]
-        elif kind in ('SequenceEndEvent', 'MappingEndEvent'):
-            ended = above.pop()
-            size, anchor = (ended.nodes, ended.height), ended.anchor
+            nodes, height = anchors[event.anchor]
+        elif isinstance(event, yaml.ScalarEvent):
+            nodes += len(event.value) // 20
+        else:
+            height = 1
+            for k, inner in enumerate(events if above < DEEPEST else ()):
+                if isinstance(inner, yaml.CollectionEndEvent):
+                    break
+                key = inner.value if isinstance(inner, yaml.ScalarEvent) else '<<'
+                if isinstance(event, yaml.MappingStartEvent) and k % 2 == 0 and key != '<<':
+                    if key in keys:
+                        raise error(f'{where}: key "{key}" comes twice')
+                    keys.add(key)
+                more, levels = weigh(inner, above + 1)
+                nodes, height = nodes + more, max(height, levels + 1)
+                if nodes > MOST_NODES:
+                    raise error(f'{where} has more than {MOST_NODES} values')
+        if above + height > DEEPEST:
+            raise error(f'{where} is nested deeper than {DEEPEST} levels')
+        if event.anchor:
+            anchors[event.anchor] = nodes, height
+        return nodes, height
+
+    for event in events:
+        if isinstance(event, yaml.NodeEvent):
+            weigh(event, 0)
         else:
             anchors.clear()
-        if anchor:
-            anchors[anchor] = size
-        _take(above, size, key, where, error)
-
-
-def _take(
-    above: list[_Open],
-    size: tuple[int, int],
-    key: str | None,
-    where: str,
-    error: type[CalibrationError],
-) -> None:
-    """Let the innermost open list or mapping hold so many nodes, of such a height."""
-    nodes, height = size
-    if len(above) + height > DEEPEST:
-        raise error(f'{where} is nested deeper than {DEEPEST} levels')
-    if not nodes or not above:
-        return
-    again = above[-1].hold(nodes, height, key)
-    if above[-1].nodes > MOST_NODES:
-        raise error(f'{where} has more than {MOST_NODES} values')
-    if again is not None:
-        raise error(f'{where}: key "{again}" comes twice')

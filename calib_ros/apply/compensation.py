@@ -31,7 +31,7 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
-EXACT, COMPROMISE = 1e-6, 0.02
+EXACT, COMPROMISE = Limits.largest_position_error, 0.02
 """Orientation errors [rad] tolerated of arms that can reach every orientation, and of others.
 By the former [rad or m] a command may lie beyond a limit, or a correction change at any time."""
 
@@ -156,7 +156,11 @@ def compensate(
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))
     result = refused(result, _unreached(compensator, result))
-    return refused(result, _jumps(compensator, result))
+    moves, changes = (
+        np.abs(np.diff(each, axis=0)) for each in (result.command, result.correction)
+    )  # NaN beside refused samples
+    words = 'jumps by {:.4g} while the joints move by {:.4g} at most'
+    return refused(result, too_fast(compensator, changes, moves, words, first=1))
 
 
 def in_words(compensator: Compensator, result: Compensation) -> str:
@@ -243,29 +247,22 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     return found
 
 
-def _jumps(compensator: Compensator, result: Compensation) -> list[Refusal]:
-    """Return the samples whose correction jumps against that of the sample before."""
-    moves, changes = (
-        np.abs(np.diff(each, axis=0)) for each in (result.command, result.correction)
-    )  # NaN beside refused samples
-    return [
-        Refusal(
-            k + 1,
-            f'the correction of {compensator.nominal.joint_names[i]} jumps by {changes[k, i]:.4g} '
-            f'while the joints move by {moves[k].max():.4g} at most',
-        )
-        for k, i in too_fast(compensator, changes, moves)
-    ]
-
-
 def too_fast(
-    compensator: Compensator, changes: FloatArray, moves: FloatArray
-) -> list[tuple[int, int]]:
-    """Return sample and joint where a correction changes (N, n) too much for its moves (N, n)."""
+    compensator: Compensator, changes: FloatArray, moves: FloatArray, words: str, first: int = 0
+) -> list[Refusal]:
+    """Return the samples, the `first` of them and on, whose correction changes too much.
+
+    `changes` (N, n) of it are held against `moves` (N, n) of the joints, both positive; `words`
+    have places for the change and the move.
+    """
     shares = (changes - EXACT) / compensator.largest
     allowed = compensator.largest_change * (moves / compensator.largest).max(axis=1)
-    rows = np.flatnonzero(shares.max(axis=1) > allowed)
-    return [(k, int(shares[k].argmax())) for k in rows.tolist()]
+    names, found = compensator.nominal.joint_names, []
+    for k in np.flatnonzero(shares.max(axis=1) > allowed).tolist():
+        i = int(shares[k].argmax())
+        said = words.format(changes[k, i], moves[k].max())
+        found.append(Refusal(first + k, f'the correction of {names[i]} {said}'))
+    return found
 
 
 def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:

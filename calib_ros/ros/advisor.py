@@ -27,9 +27,9 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
+from calib_ros.apply.choice import choose
 from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.design import Design
-from calib_ros.apply.planning import next_pose
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError
@@ -144,11 +144,8 @@ class Guide:
         apart = np.abs(candidates[:, np.newaxis] - taken).max(axis=2).min(axis=1)
         candidates = candidates[apart > STILL]
         if len(candidates):
-            task = design.chain.random_joints(SOME_POSES, rng)
-            found = next_pose(design, candidates, task, self._session.settings.wanted_accuracy)
-            self._next_pose.publish(
-                to_ros.joints(self._session.joint_names, found.joints, self._now())
-            )
+            best = candidates[choose(design, candidates, 1)[0]]
+            self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
 
     def _show(self, calibration: Calibration) -> None:
         found = survey(calibration, CLOUD, np.random.default_rng(0))
