@@ -92,7 +92,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         filer = Filer(given.history, given.serial, chain)
         self._filer, self._status_text = filer, ''
         self.lost = ''
-        """Why samples were lost at the end; empty when none were."""
+        """What samples were not kept in data_dir at the end, and why; empty when all were."""
         if given.resume:
             self._resume()
         self._inputs = Inputs(self, self._streams(), self._boundary.guarded)
@@ -154,10 +154,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         ended.append(self._guide.join(JOIN_TIMEOUT))
         self._take_messages()
         self.session.finish()
-        self._archive.close()
-        self.lost = self._archive.error
+        self.lost = self._archive.close()
         if self.lost:
-            self.get_logger().error(f'poses are lost: {self.lost}')
+            self.get_logger().error(self.lost)
         self.destroy_node()
         return all(ended)
 
