@@ -31,9 +31,9 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
-EXACT, COMPROMISE = Limits.largest_position_error, 0.02
-"""Orientation errors [rad] tolerated of arms that can reach every orientation, and of others.
-By the former [rad or m] a command may lie beyond a limit, or a correction change at any time."""
+EXACT = Limits.largest_position_error
+"""By so much [rad or m] a command may lie beyond a limit, a correction change at any time, and the
+orientation be wrong of arms that can reach every one."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,13 +62,13 @@ class Compensator(Shown, Limits):
     def __post_init__(self) -> None:
         """Refuse chains that are not of one robot, and limits that are none."""
         ours, theirs = (
-            [(joint.name, joint.type) for joint in chain.joints]
+            ', '.join(f'{joint.name} ({joint.type})' for joint in chain.joints)
             for chain in (self.nominal, self.calibrated)
         )
         if ours != theirs:
             raise ConfigError(
                 'the nominal and the calibrated chain must have the same joints in one order, not '
-                f'{_listed(ours)} and {_listed(theirs)}'
+                f'{ours} and {theirs}'
             )
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():
             raise ConfigError(f'tool must be three finite numbers [m], not {self.tool}')
@@ -211,7 +211,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     follower, names = compensator.follower, compensator.nominal.joint_names
     tolerated = compensator.largest_orientation_error
     if tolerated is None:
-        tolerated = EXACT if follower.complete else COMPROMISE
+        tolerated = EXACT if follower.complete else 0.02  # as `Limits` promises
     command, correction = result.command, result.correction
     beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
@@ -273,7 +273,3 @@ def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     new = [refusal for refusal in more if refusal.sample not in known]
     refusals = sorted([*result.refusals, *new], key=lambda refusal: refusal.sample)
     return replace(result, joints=joints, refusals=tuple(refusals))
-
-
-def _listed(joints: Sequence[tuple[str, str]]) -> str:
-    return ', '.join(f'{name} ({kind})' for name, kind in joints)

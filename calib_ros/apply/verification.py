@@ -58,9 +58,6 @@ NEEDED = 1 + len(PLANE)
 poses of ISO 9283."""
 DECIDING = 10 * MOST_ENTRIES
 """Configurations up to which it is said how many would decide."""
-LOST = {'base': 2, 'tool': 1}
-"""Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
-three; the turn of a tool does not move the target."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +170,8 @@ def verify(
         Of the verdict.
     new_base, new_tool : bool
         The measuring device stands elsewhere than for the calibration; another target is on the
-        flange, or the same was mounted anew. Their frames are fitted, which costs freedom (LOST).
+        flange, or the same was mounted anew. Their frames are fitted, and each takes up
+        the errors of as many configurations, of three freedoms each, as it has freedoms.
     told : Told
         Of the share that is done.
     commanded : (M, n), optional
@@ -193,7 +191,8 @@ def verify(
     told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
-    lost = sum(LOST[frame] for frame in fitted)
+    in_base, in_tool = 6 // 3, 3 // 3  # freedoms; the turn of a tool does not move the target
+    lost = new_base * in_base + new_tool * in_tool
     rms = _rms(moments, lost)
     most = max(len(moments), DECIDING)
     numbers = np.unique(np.geomspace(len(moments), most, 200).astype(int))
@@ -202,7 +201,7 @@ def verify(
     verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
-        common = _rms(moments_of(left, group), LOST['base'], least=0) / rms
+        common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, arm.holds(rms), arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
