@@ -20,8 +20,7 @@ from contextlib import contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
 
-from calib_ros.errors import InputError
-from calib_ros.values import LONGEST_NAME
+from calib_ros.errors import LONGEST_NAME, InputError
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:

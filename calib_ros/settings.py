@@ -196,6 +196,9 @@ class Settings:
 
 def _check_list(name: str, entries: Sequence[str]) -> None:
     """Refuse lists that are too long to be meant: what is done with them may take for ever."""
-    for count, what in ((len(entries), 'entries'), *((len(e), 'characters') for e in entries)):
+    for count, what in (
+        (len(entries), 'entries'),
+        *((len(e), 'characters in an entry') for e in entries),
+    ):
         if count > MOST_ENTRIES:
             raise ConfigError(f'{name} has {count} {what}, at most {MOST_ENTRIES} are taken')

@@ -15,8 +15,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import MOST_ENTRIES, CalibrationError, ConfigError, InputError
-from calib_ros.values import LONGEST_NAME
+from calib_ros.errors import (
+    LONGEST_NAME,
+    MOST_ENTRIES,
+    CalibrationError,
+    ConfigError,
+    InputError,
+)
 
 LARGEST_TEXT = 10_000_000
 """Bytes of a chain file, calibration, URDF or YAML program."""

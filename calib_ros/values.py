@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError, UnknownNameError
+from calib_ros.errors import (
+    LONGEST_NAME as LONGEST_NAME,
+    MOST_ENTRIES,
+    CalibrationError,
+    ConfigError,
+    InputError,
+    UnknownNameError,
+)
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
@@ -25,10 +32,8 @@ LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
 LARGEST_SETTING = 2.0**31 - 1.0
 """Largest number that is set; ROS has integers of as many bits."""
-MOST_NAMES = 50
+MOST_NAMES = MOST_ENTRIES // 20
 """What a cell has of each kind: joints of a chain, frames, targets, sets of joint names."""
-LONGEST_NAME = LONGEST // 2
-"""Characters of a name, a number or an expression: a message has room for it and more."""
 
 
 def parse_number(

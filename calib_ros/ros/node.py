@@ -75,12 +75,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             **node_options,
         )
         given, names = declare_all(self)
-        home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
+        home = Path(os.environ.get('ROS_HOME', '~/.ros'))
         chain, urdf = load_robot(self, given)
         self._given = given
         self._boundary = Boundary(self.get_logger())
         self._archive = Archive(
-            given.data_dir or home / 'calib_ros',
+            Path(given.data_dir or home / 'calib_ros').expanduser(),
             f'{chain.name}/{given.serial or self.get_namespace()}'.rstrip('/'),
             len(chain.joints),
             self._configuration,
@@ -107,7 +107,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._diagnostics = Diagnostics(
             self, self.session, self._archive, self._inputs, self._boundary, given.serial
         )
-        candidates = read_joints(given.candidates, chain) if given.candidates else None
+        candidates = None
+        if given.candidates:
+            candidates = read_joints(Path(given.candidates).expanduser(), chain)
         self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
@@ -165,9 +167,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     def _configuration(self) -> str:
         """Return what this node is set to as a parameter file."""
         given = self._given
-        more = {name: str(link) for name, link in given.links.items() if link}
-        if given.serial:
-            more['serial'] = given.serial
+        named = ('base_link', 'tip_link', 'serial')
+        more = {name: getattr(given, name) for name in named if getattr(given, name)}
         return words.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:

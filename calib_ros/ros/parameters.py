@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -42,29 +42,29 @@ class Links(TypedDict):
     tip_link: str | None
 
 
-class FrameNames(NamedTuple):
-    """What the frames are called on /tf_static; nothing is published of one without a name."""
-
-    base: str
-    flange: str
-    target: str
-
-
 @dataclass(frozen=True)
 class Given:
-    """What a node was started with; what else may change is read where it is used."""
+    """Parameters that a node was started with; what may change is read where it is used."""
 
     chain: str
-    links: Links
+    base_link: str
+    tip_link: str
     serial: str
     history: str
-    data_dir: Path | None
-    allowed_folders: tuple[Path, ...]
+    data_dir: str
+    allowed_folders: tuple[str, ...]
     resume: bool
     autoload: bool
-    candidates: Path | None
-    frames: FrameNames
+    candidates: str
+    base_frame: str
+    flange_frame: str
+    target_frame: str
     settings: Settings
+
+    @property
+    def links(self) -> Links:
+        """Return the links that are given."""
+        return Links(base_link=self.base_link or None, tip_link=self.tip_link or None)
 
 
 def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
@@ -92,17 +92,8 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    plain = ('chain', 'serial', 'history', 'resume', 'autoload')
-    given = Given(
-        links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
-        data_dir=_path(own['data_dir']),
-        allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
-        candidates=_path(own['candidates']),
-        frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
-        settings=settings,
-        **{name: own[name] for name in plain},
-    )
-    return given, [*overrides]
+    known = own | {'settings': settings}
+    return Given(**{each.name: known[each.name] for each in fields(Given)}), [*overrides]
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
@@ -149,10 +140,6 @@ def refuse_unknown(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.
     for name in names:
         if name not in known and not name.startswith(later):
             raise UnknownNameError('parameter', name, known)
-
-
-def _path(name: str) -> Path | None:
-    return Path(name).expanduser() if name else None
 
 
 def _declare(node: Node, overrides: Mapping[str, Any], each: Parameter) -> Any:

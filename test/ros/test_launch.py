@@ -18,7 +18,6 @@ from calib_ros.ros.arguments import (
     launch_arguments,
     refuse_unknown,
     ros_arguments,
-    usage,
 )
 from calib_ros.sampling.sources import STANDARD
 
@@ -118,12 +117,6 @@ def test_ros_takes_text_for_text(text):
 def test_values_of_another_type_are_refused(name, text, expected):
     with pytest.raises(ConfigError, match=f'"{name}" must be {expected}'):
         ros_arguments({name: text})
-
-
-def test_the_help_tells_which_parameters_can_change():
-    lines = usage('calibration_node').format_help().splitlines()
-    for name, mark in (('folds', ' *'), ('mode', ''), ('socket', ' *'), ('chain', '')):
-        assert f'  {name}{mark}' in lines
 
 
 def test_a_parameter_file_that_is_not_there_is_refused(tmp_path):
