@@ -97,30 +97,22 @@ def whole_folder(
         _clean_up(place, new, old)
         _check_place(path, place, own, overwrite)
         try:
-            with _named(new, path):
-                yield new
-                _sync(new)
-                if place.exists():
-                    _carry_over(place, new, own or ())
-                    place.rename(old)
-                new.rename(place)
-                _sync(place.parent, deep=False)
+            yield new
+            _sync(new)
+            if place.exists():
+                _carry_over(place, new, own or ())
+                place.rename(old)
+            new.rename(place)
+            _sync(place.parent, deep=False)
+        except OSError as err:  # which names the folder to work in
+            name = str(err.filename or path).replace(str(new), str(path))
+            raise OSError(err.errno, err.strerror or str(err), name) from err
         finally:
             _clean_up(place, new, old)
     finally:
         with suppress(OSError):  # it holds what could neither be put back nor removed
             work.rmdir()
         os.close(claim)
-
-
-@contextmanager
-def _named(new: Path, path: Path) -> Iterator[None]:
-    """Let errors of the system name the folder that was asked for, not the one to work in."""
-    try:
-        yield
-    except OSError as err:
-        name = str(err.filename or path).replace(str(new), str(path))
-        raise OSError(err.errno, err.strerror or str(err), name) from err
 
 
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:

@@ -23,8 +23,8 @@ from calib_ros.errors import (
     InputError,
 )
 
-LARGEST_TEXT = 10_000_000
-"""Bytes of a chain file, calibration, URDF or YAML program."""
+LARGEST_TEXT = 10 * MOST_ENTRIES**2
+"""Bytes of a chain file, calibration, URDF or YAML program: ten lists as long as can be."""
 LARGEST_TABLE = 10 * LARGEST_TEXT
 """Bytes of a table."""
 MOST_ROWS = LARGEST_TABLE // 500
