@@ -212,19 +212,16 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
     ) -> Subscription:
         """Subscribe; a time that cannot be must not end the node."""
-        if topic == CLOCK_TOPIC:
-            callback = self._of_times(callback)
-        return super().create_subscription(msg_type, topic, callback, *args, **more)
 
-    def _of_times(self, callback: Callable[..., None]) -> Callable[..., None]:
-        def checked(message: Any) -> None:
-            if message.clock.sec < 0:
-                words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
-                self.get_logger().warning(words, once=True)
-            else:
+        def of_times(message: Any) -> None:
+            if message.clock.sec >= 0:
                 callback(message)
+                return
+            words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
+            self.get_logger().warning(words, once=True)
 
-        return checked
+        taken = of_times if topic == CLOCK_TOPIC else callback
+        return super().create_subscription(msg_type, topic, taken, *args, **more)
 
     def _take_messages(self) -> None:
         """Take what has come in the order in which it came."""
