@@ -35,6 +35,8 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
     """Write files that belong together as `write_file` does, all of them or none.
 
     None is put in place before all are on the disk. Where one cannot be, the others are put back.
+    A process that is killed meanwhile leaves the first, new or old, and none that does not belong
+    to it.
     """
     mark = secrets.token_hex(8)
     partials, earlier = (
@@ -53,10 +55,12 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
+        for k, path in enumerate(contents if overwrite and len(contents) > 1 else ()):
+            if path.is_file():
+                (os.replace if k else _link)(path, earlier[path])
+                placed.append(path)
         for path, partial in partials.items():
             if overwrite:
-                if len(contents) > 1 and path.is_file():
-                    _link(path, earlier[path])
                 partial.replace(path)
             else:
                 _rename_new(partial, path)

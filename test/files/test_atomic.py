@@ -249,6 +249,23 @@ def test_of_files_that_belong_together_none_is_replaced_alone(
     assert tree(tmp_path) == {'a': 'B', 'b': 'B', 'c': 'B'}
 
 
+def test_a_process_killed_meanwhile_leaves_no_files_of_two_sets(tmp_path):
+    names = [tmp_path / name for name in 'abc']
+
+    def write(text):
+        write_together(dict.fromkeys(names, text), overwrite=True)
+
+    def check():
+        found = {name: text for name, text in tree(tmp_path).items() if name[0] != '.'}
+        assert 'a' in found
+        assert len(set(found.values())) == 1
+        write('A')
+
+    write('A')
+    assert every_kill(tmp_path, lambda: write('B'), check) > 10
+    assert tree(tmp_path)['c'] == 'B'
+
+
 def test_a_name_may_be_as_long_as_the_disk_takes(tmp_path):
     write_file(tmp_path / ('x' * 255), 'A')
     assert tree(tmp_path) == {'x' * 255: 'A'}
