@@ -39,8 +39,6 @@ STARTUP = (
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
     """Declare a setting with what a node parameter and a command line option need to know."""
-    if isinstance(default, tuple):
-        return field(default=default, metadata={'text': text})
     return field(default=default, metadata={'text': text, 'lower': lower})
 
 
@@ -170,7 +168,7 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            lower = item.metadata.get('lower')
+            lower = item.metadata['lower']
             value = getattr(self, item.name)
             if isinstance(item.default, tuple):
                 _check_list(item.name, value)
@@ -189,10 +187,9 @@ class Settings:
 
 def _check_list(name: str, entries: Sequence[str]) -> None:
     """Refuse lists that are too long to be meant: what is done with them may take for ever."""
-    if len(entries) > MOST_ENTRIES:
-        raise ConfigError(f'{name} has {len(entries)} entries, at most {MOST_ENTRIES} are taken')
-    longest = max(map(len, entries), default=0)
-    if longest > MOST_ENTRIES:
-        raise ConfigError(
-            f'{name} has an entry of {longest} characters, at most {MOST_ENTRIES} are taken'
-        )
+    for count, what in (
+        (len(entries), 'entries'),
+        *((len(e), 'characters in an entry') for e in entries),
+    ):
+        if count > MOST_ENTRIES:
+            raise ConfigError(f'{name} has {count} {what}, at most {MOST_ENTRIES} are taken')
