@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from calib_ros.sampling.cdr import decode, trajectory_size
+from calib_ros.sampling.cdr import alike, trajectory_size
 from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Readings, reading, usable
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -13,6 +13,12 @@ TYPES = STORE.types
 NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 NUMBERS = st.floats(-1e6, 1e6)
 SECONDS, NANOSECONDS = st.integers(0, 2**31 - 1), st.integers(0, 999_999_999)
+
+
+def decode(kind, blobs):
+    """Return what messages of one layout say; None where they are of several or of none."""
+    found = alike(kind, blobs, {})
+    return found[0].of(0) if len(found) == 1 and len(found[0].which) == len(blobs) else None
 
 
 def header(seconds, nanoseconds, frame_id):
@@ -110,12 +116,17 @@ def joint_blob(names, positions, frame_id=''):
     return bytes(STORE.serialize_cdr(given_, JOINT_STATE))
 
 
-def test_messages_of_different_layout_are_left_to_others():
+def test_messages_of_one_length_are_told_apart_by_their_names():
     one, other = joint_blob(['a', 'b'], [1.0, 2.0]), joint_blob(['b', 'a'], [1.0, 2.0])
-    assert decode(JOINT_STATE, [one, one]) is not None
-    assert decode(JOINT_STATE, [one, other]) is None
-    assert decode(JOINT_STATE, [one, joint_blob(['a'], [1.0])]) is None
-    assert decode(JOINT_STATE, [one, joint_blob(['a', 'b'], [1.0, 2.0], 'x')]) is None
+    in_frame = joint_blob(['a', 'b'], [1.0, 2.0], 'x')
+    assert len(one) == len(other) == len(in_frame)
+    known = {}
+    for _ in range(2):
+        found = alike(JOINT_STATE, [one, other, one, in_frame], known)
+        assert [each.which.tolist() for each in found] == [[0, 2], [1], [3]]
+        strings = [('', 'a', 'b'), ('', 'b', 'a'), ('x', 'a', 'b')]
+        assert [each.of(0).strings for each in found] == strings
+    assert [len(each) for each in known.values()] == [3]
 
 
 @pytest.mark.parametrize('cut', [3, 9, 14, 30, -9, -1])

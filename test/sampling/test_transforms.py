@@ -22,7 +22,7 @@ from recorded import (
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import se3
-from calib_ros.sampling.cdr import transforms
+from calib_ros.sampling.cdr import alike
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
@@ -346,12 +346,12 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
     """Serialisers leave bytes of any kind where numbers are aligned."""
     message = tf(link('world', 'tool', 105 * MS, frame(rng)), link('a', 'bc', 7, frame(rng)))
     data = bytes(TYPESTORE.serialize_cdr(message, TRANSFORMS))
-    (alike,) = transforms([data], {})
-    assert alike.layout.links == (('world', 'tool'), ('a', 'bc'))
+    (one,) = alike(TRANSFORMS, [data], {})
+    assert tuple(item.strings for item in one.layout.items) == (('world', 'tool'), ('a', 'bc'))
     other = bytearray(data)
     gap = data.index(b'world\0') + 6
     other[gap : gap + 2] = b'\xff\xff'
-    (both,) = transforms([data, bytes(other)], {})
+    (both,) = alike(TRANSFORMS, [data, bytes(other)], {})
     assert both.which.tolist() == [0, 1]
     stamps, _, numbers = both.of(1)
     assert stamps.tolist() == [7, 7]
@@ -361,13 +361,13 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
 @pytest.mark.parametrize('cut', range(4, 130, 7))
 def test_messages_that_are_cut_off_are_not_read(rng, cut):
     data = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
-    assert transforms([data[:cut]], {}) == [] or cut >= len(data)
+    assert alike(TRANSFORMS, [data[:cut]], {}) == [] or cut >= len(data)
 
 
 def test_a_name_of_absurd_length_is_not_read():
     data = bytearray(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
     data[16:20] = b'\xff\xff\xff\xff'
-    assert transforms([bytes(data)], {}) == []
+    assert alike(TRANSFORMS, [bytes(data)], {}) == []
 
 
 @pytest.mark.parametrize(
