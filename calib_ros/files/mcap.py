@@ -14,6 +14,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+from calib_ros.errors import InputError
 from calib_ros.texts import LARGEST_TABLE
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -33,8 +34,22 @@ Content: TypeAlias = 'bytes | mmap'
 
 LARGEST_CHUNK = LARGEST_TABLE
 """Bytes of a chunk when it is unpacked; recorders make chunks of one to ten million."""
-LARGEST_RATIO = 1000
-"""How much larger than its file a recording can be when all of it is unpacked, chunks aside."""
+
+
+class Room:
+    """What may still be unpacked of a recording of some bytes: a chunk and 1,000 times its size.
+
+    No recorder packs tighter; beyond it is an InputError.
+    """
+
+    def __init__(self, packed: int) -> None:
+        self._left = LARGEST_CHUNK + 1000 * packed
+
+    def take(self, size: int) -> None:
+        """Let so many bytes be unpacked."""
+        self._left -= size
+        if self._left < 0:
+            raise InputError('it unpacks to 1000 times its size')
 
 
 def is_indexed(file: Path) -> bool:
@@ -58,10 +73,10 @@ def is_indexed(file: Path) -> bool:
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, content) of the records, those in chunks included.
 
-    One that is cut off is an EOFError, after what it holds; a chunk in another one, or more in
-    them than any recording holds, is a ValueError.
+    One that is cut off is an EOFError after what it holds, a chunk in another one a ValueError,
+    more in them than any recording holds an InputError.
     """
-    left = LARGEST_CHUNK + LARGEST_RATIO * len(content)
+    room = Room(len(content))
     while start < len(content):
         kind, size = _HEAD.unpack_from(content, start)
         start += _HEAD.size
@@ -70,9 +85,7 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
             if nested:
                 raise ValueError('a chunk is within a chunk')
             unpacked = _unpacked(record)
-            left -= len(unpacked)
-            if left < 0:
-                raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+            room.take(len(unpacked))
             yield from records(unpacked, nested=True)
         elif len(record) == size:
             yield kind, record

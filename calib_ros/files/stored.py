@@ -10,7 +10,7 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import MOST_ENTRIES
-from calib_ros.files.mcap import LARGEST_CHUNK, LARGEST_RATIO, logged, unpacked, unpacked_size
+from calib_ros.files.mcap import LARGEST_CHUNK, Room, logged, unpacked, unpacked_size
 from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
@@ -83,7 +83,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
             raise ValueError(whole.problem)
         return
     with storage.path.open('rb') as file:
-        left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
+        room = Room(storage.path.stat().st_size)
         problem: Exception | None = None
         for overlapping in _together(storage.chunks, channels):
             found: list[tuple[int, Stream, bytes]] = []
@@ -91,9 +91,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
                 file.seek(chunk.chunk_start_offset)
                 try:
                     data = file.read(chunk.chunk_length)
-                    left -= unpacked_size(data)
-                    if left < 0:
-                        raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+                    room.take(unpacked_size(data))
                     messages, wrong = logged(data, channels)
                 except Exception as err:  # see `replay`
                     messages, wrong = [], err

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ class Item(NamedTuple):
     stamp: int
     numbers: int
     kind: str
-    count: int
+    width: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +81,10 @@ class Alike:
 
     def of(self, k: int) -> Readings:
         """Return what each of them says of one thing."""
-        strings, stamp, begin, kind, count = self.layout.items[k]
-        times = _numbers(self.rows, stamp, '<u4', 2)
-        stamps = times[:, 0].view(np.int32).astype(np.int64) * 1_000_000_000 + times[:, 1]
-        return Readings(stamps, strings, _numbers(self.rows, begin, kind, count).astype(float))
+        strings, stamp, begin, kind, width = self.layout.items[k]
+        seconds = _numbers(self.rows, stamp, '<i4', 1)[:, 0].astype(np.int64)
+        stamps = seconds * 1_000_000_000 + _numbers(self.rows, stamp + 4, '<u4', 1)[:, 0]
+        return Readings(stamps, strings, _numbers(self.rows, begin, kind, width).astype(float))
 
     def span(self, k: int) -> tuple[int, int]:
         """Return the stamps of one thing in the first and the last of them."""
@@ -213,6 +213,6 @@ def _aligned(at: int, size: int) -> int:
     return at + (_HEAD - at) % size
 
 
-def _numbers(rows: NDArray[np.uint8], begin: int, kind: str, count: int) -> NDArray[np.generic]:
-    size = np.dtype(kind).itemsize * count
+def _numbers(rows: NDArray[np.uint8], begin: int, kind: str, width: int) -> NDArray[Any]:
+    size = np.dtype(kind).itemsize * width
     return np.ascontiguousarray(rows[:, begin : begin + size]).view(kind)

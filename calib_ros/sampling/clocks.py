@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.collector import ADVANCE_NS, Collector
+from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, STEP, Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
@@ -25,13 +25,7 @@ WATCH_NS = round(5e9 * LEAST_MOTION)
 """Time over which a watch looks."""
 DENSE_NS = round(0.8e9 * STEP)
 """Time between two samples that it keeps; nearer ones tell no more of speeds."""
-WATCHED = 5 * WATCH_NS // DENSE_NS
-"""Samples that it keeps at most, of several streams."""
-CLOCKS_MOVED = SMOOTHING
-"""Difference of two delays [s] from which a clock was moved; speeds tell none finer."""
-LOOK_AGAIN_NS = 4 * ADVANCE_NS
-"""Time between two looks for the delay."""
-EARLY = CLOCKS_MOVED / 2.0**0.5
+EARLY = SMOOTHING / 2.0**0.5
 """Time [s] by which measurements of a stop may be stamped too early: the accuracy of one delay. Of
 what then shows the arm leaving, most is left out as spikes; the rest moves the mean by less than
 the noise of a measurement."""
@@ -44,11 +38,11 @@ class Watch:
     they do, and are left out or refused. Without stops it is `sleepless`.
     """
 
-    def __init__(self, chain: Chain, sleepless: bool, max_gap: float) -> None:
+    def __init__(self, chain: Chain, sleepless: bool, settings: Settings) -> None:
         self._chain = chain
-        self._sleepless, self._max_gap = sleepless, max_gap
-        self._joints = Rows(len(chain.joints), WATCHED)
-        self._poses = Rows(7, WATCHED)
+        self._sleepless, self._max_gap = sleepless, settings.max_gap
+        self._joints = Rows(len(chain.joints), settings.pose_buffer)
+        self._poses = Rows(7, settings.pose_buffer)
         self._last_ns = [0, 0]
         self._unrest = 0
         self._taken = self._agreed = 0
@@ -107,7 +101,8 @@ class Watch:
             return
         known = self.delay
         every = (found.seconds, *found.rivals)
-        if known is None or min(abs(each - known.seconds) for each in every) > CLOCKS_MOVED:
+        # Speeds over SMOOTHING tell no finer difference.
+        if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
             if found.rivals:
                 self.unclear = found if known is None else None
                 return
@@ -125,7 +120,7 @@ class Clocks:
         self.settings = settings
         self._chain = chain
         self._continuous = settings.mode == 'continuous'
-        self.watch = Watch(chain, self._continuous, settings.max_gap)
+        self.watch = Watch(chain, self._continuous, settings)
         self._found: Delay | None = None  # in the motion that is sampled
         self._looked_ns = 0
 
@@ -162,7 +157,7 @@ class Clocks:
         """
         if not collector.holding:
             return
-        if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
+        if now_ns is not None and 0 <= now_ns - self._looked_ns < 1e9 * LEAST_MOTION:
             return
         self._looked_ns = now_ns or 0
         self._found = self._find(collector, now_ns)

@@ -20,7 +20,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
-from calib_ros.settings import Settings
+from calib_ros.settings import EXCEPTION, Settings
 
 SMOOTHING = 0.5 * Settings.max_gap
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
@@ -34,8 +34,6 @@ ALIKE_ENOUGH = float(np.sqrt(1.0 - MOST_OUTLIERS))
 """Least correlation: no more of the speeds' variance may be something else than of samples."""
 RISE = 0.02
 """Least rise of the correlation beyond a valley for another peak."""
-IN_MOTION = 0.1
-"""Share of the 95th percentile of the speed beyond which the arm counts as moving."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
 
@@ -86,7 +84,7 @@ def find_delay(
     poses = chain.forward(joints[nearest])
     first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
     by_joints = np.interp(grid, *first)
-    moving = heard & (by_joints > IN_MOTION * np.percentile(by_joints, 95))
+    moving = heard & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
     second = _speed(times, positions, rotations, rotations is not None)

@@ -33,8 +33,6 @@ Pair: TypeAlias = tuple[str, str]
 
 STATIC = '_static'
 """What the name of the topic of links that stand still ends with."""
-HELD = Settings.pose_buffer
-"""Transforms that wait for the frames between which they are."""
 
 
 class Route(NamedTuple):
@@ -126,7 +124,7 @@ class Links:
         if self._open:
             self._held.append((link, stamps, numbers))
             self._count += len(stamps)
-            while self._count > HELD:
+            while self._count > Settings.pose_buffer:
                 oldest, gone, _ = self._held.popleft()
                 self._count -= len(gone)
                 self._let_go[oldest] += len(gone)

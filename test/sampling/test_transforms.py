@@ -313,7 +313,7 @@ def session_fed(come, little_endian=True, at_once=True):
 
 
 def test_what_could_not_wait_for_its_frames_is_counted(monkeypatch, rng):
-    monkeypatch.setattr('calib_ros.sampling.transforms.HELD', 5)
+    monkeypatch.setattr(Settings, 'pose_buffer', 5)
     stamps = [100 + 5 * k for k in range(20)]
     come = [tf(link('tracker', 'tool', ms * MS, frame(rng))) for ms in stamps]
     come += [robot(300 * MS, rng), ('/tf_static', tf(link('world', 'tracker', 1, frame(rng))))]
