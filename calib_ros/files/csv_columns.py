@@ -19,13 +19,10 @@ from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
+from calib_ros.values import MOST_NAMES
 
 IRREGULAR = (b'"', b'\r', b'\0')
 """What cells are not cut at separators alone with."""
-BLOCK = 2**18
-"""Bytes that are looked at together: they stay in the cache (benchmarks/tables.py)."""
-WIDEST, FEW = 40, 100
-"""Characters of a text, and how many different ones, that are told apart all at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +61,7 @@ class TextColumns(Columns):
         longest = int((ends - starts).max(initial=0))
         if longest == 0:
             return np.zeros(len(starts), dtype=np.intp), ['']
-        if longest > WIDEST:
+        if longest > MOST_NAMES:
             return numbered(self.texts(name))
         place = starts[:, np.newaxis] + np.arange(longest, dtype=np.int32)
         beyond = place >= ends[:, np.newaxis]
@@ -75,7 +72,7 @@ class TextColumns(Columns):
         numbers = np.full(len(words), -1, dtype=np.intp)
         known: list[str] = []
         first = 0
-        while len(known) < FEW:
+        while len(known) < MOST_NAMES:
             word = words[first]
             numbers[words == word] = len(known)
             known.append(bytes(word).decode())
@@ -183,17 +180,11 @@ def regular(
 def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int32] | None:
     """Return where the cells of a text end, behind the end of what is before; None if ragged."""
     flat = np.frombuffer(data, dtype=np.uint8)
-    found = [np.array([begin - 1], dtype=np.int32)]
-    rows = 0
-    for start in range(begin, len(flat), BLOCK):
-        part = flat[start : start + BLOCK]
-        last = part == ord('\n')
-        rows += int(np.count_nonzero(last))
-        found.append((np.flatnonzero(last | (part == ord(separator))) + start).astype(np.int32))
-    ends = np.concatenate(found)
-    if len(ends) != 1 + width * rows or not (flat[ends[width::width]] == ord('\n')).all():
-        return None
-    return ends
+    last = flat[begin:] == ord('\n')
+    ends = np.flatnonzero(last | (flat[begin:] == ord(separator))) + begin
+    ends = np.append(begin - 1, ends).astype(np.int32)
+    whole = len(ends) == 1 + width * np.count_nonzero(last)
+    return ends if whole and (flat[ends[width::width]] == ord('\n')).all() else None
 
 
 def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
