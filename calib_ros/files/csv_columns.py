@@ -181,10 +181,11 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
     """Return where the cells of a text end, behind the end of what is before; None if ragged."""
     flat = np.frombuffer(data, dtype=np.uint8)
     last = flat[begin:] == ord('\n')
-    ends = np.flatnonzero(last | (flat[begin:] == ord(separator))) + begin
-    ends = np.append(begin - 1, ends).astype(np.int32)
-    whole = len(ends) == 1 + width * np.count_nonzero(last)
-    return ends if whole and (flat[ends[width::width]] == ord('\n')).all() else None
+    found = np.flatnonzero(last | (flat[begin:] == ord(separator))) + begin
+    if len(found) != width * np.count_nonzero(last):
+        return None
+    ends: NDArray[np.int32] = np.append(begin - 1, found).astype(np.int32)
+    return ends if (flat[ends[width::width]] == ord('\n')).all() else None
 
 
 def _irregular(path: Path, text: str, told: Told) -> MadeColumns:

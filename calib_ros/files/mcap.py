@@ -9,6 +9,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import cache
 from mmap import mmap
 from operator import itemgetter
 from pathlib import Path
@@ -163,6 +164,7 @@ def _unpack(data: bytes, name: str, most: int) -> bytes:
     return bytes(module.ZstdDecompressor().decompress(data, most))
 
 
+@cache  # looking for a module that is not there takes ten times as long as a message
 def _module(compression: str) -> Any:
     """Return what unpacks a compression: one of the modules that rosbags brings."""
     for name in MODULES.get(compression, ()):

@@ -69,7 +69,7 @@ def unpacked_files(path: Path) -> Iterator[Path]:
             text = read_text((path if path.is_dir() else path.parent) / 'metadata.yaml')
             text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
             (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
-        yield folder if path.is_dir() else folder / path.name
+        yield folder if path.is_dir() else folder / path.name.removesuffix('.zstd')
 
 
 def _log(file: Path) -> Path:

@@ -108,7 +108,7 @@ class Road:
                 self._newest[kind] = int(newest[-1])
                 if back := int((times < newest).sum()):  # nothing is lost by it
                     self.notes[f'{kind} with a stamp older than the one before'] += back
-        self.clocks.take(given)
+        self.clocks.watch.take(given.pieces)
         rounds = self.collector.take(given)
         if rounds:
             self.clocks.find(self.collector, rounds[-1])

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chunks of mcap files, made here byte by byte as the specification says."""
 
+import importlib
 import struct
 import sys
 import tracemalloc
@@ -14,7 +15,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
-from calib_ros.files.mcap import CHANNEL, CHUNK, LARGEST_CHUNK, MESSAGE, logged, records
+from calib_ros.files.mcap import CHANNEL, CHUNK, LARGEST_CHUNK, MESSAGE, _module, logged, records
 
 try:
     from rosbags.rosbag2.reader import zstd
@@ -98,6 +99,26 @@ def test_an_unknown_compression_is_named():
         logged(named, {1: 1})
 
 
+@pytest.fixture
+def unknown():
+    """Nobody has looked for what unpacks before, nor will know what was found."""
+    _module.cache_clear()
+    yield
+    _module.cache_clear()
+
+
+@pytest.mark.usefixtures('unknown')
+def test_what_unpacks_is_looked_for_once(monkeypatch):
+    """A module that is not there takes 0.15 ms to be missed: ten times as long as a message."""
+    sought, find = [], importlib.import_module
+    monkeypatch.setattr(importlib, 'import_module', lambda name: sought.append(name) or find(name))
+    for _ in range(3):
+        logged(chunk(CONTENT, 'zstd'), {3: 'c'})
+    assert sought
+    assert len(set(sought)) == len(sought)
+
+
+@pytest.mark.usefixtures('unknown')
 def test_the_zstd_of_older_rosbags_will_do(monkeypatch):
     class Decompressor:
         def stream_reader(self, data):

@@ -21,6 +21,15 @@ def decode(kind, blobs):
     return found[0].of(0) if len(found) == 1 and len(found[0].which) == len(blobs) else None
 
 
+def assert_decoded(kind, blobs):
+    """At once as one by one."""
+    found = decode(kind, blobs)
+    for k, blob in enumerate(blobs):
+        stamp_ns, strings, numbers = reading(kind, STORE.deserialize_cdr(blob, kind))
+        assert (stamp_ns, strings) == (found.stamps_ns[k], found.strings)
+        np.testing.assert_array_equal(numbers, found.numbers[k])
+
+
 def header(seconds, nanoseconds, frame_id):
     time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
     return TYPES['std_msgs/msg/Header'](time, frame_id)
@@ -70,22 +79,8 @@ def message(kind, head, child, numbers):
     ),
 )
 def test_measurements_are_decoded_as_by_rosbags(kind, frame_id, child, rows):
-    given_ = [message(kind, header(s, ns, frame_id), child, n) for s, ns, n in rows]
-    blobs = [bytes(STORE.serialize_cdr(each, kind)) for each in given_]
-    batch = decode(kind, blobs)
-    assert batch.strings[0] == frame_id
-    if len(batch.strings) > 1:
-        assert batch.strings[1] == child
-    for k, ((seconds, nanoseconds, numbers), stamp) in enumerate(
-        zip(rows, batch.stamps_ns, strict=True)
-    ):
-        assert stamp == seconds * 1_000_000_000 + nanoseconds
-        found = batch.numbers[k]
-        if kind.endswith('Range'):
-            numbers = np.float32(numbers[3:4])
-        np.testing.assert_array_equal(found[:7], numbers[: len(found)])
-        if len(found) == 43:
-            np.testing.assert_array_equal(found[7:], np.arange(36.0) + numbers[0])
+    made = [message(kind, header(s, ns, frame_id), child, n) for s, ns, n in rows]
+    assert_decoded(kind, [bytes(STORE.serialize_cdr(each, kind)) for each in made])
 
 
 @given(
@@ -101,13 +96,7 @@ def test_joint_states_are_decoded_as_by_rosbags(frame_id, names, rows):
         head = header(seconds, nanoseconds, frame_id)
         given_ = TYPES[JOINT_STATE](head, names, positions, positions, empty)
         blobs.append(bytes(STORE.serialize_cdr(given_, JOINT_STATE)))
-    batch = decode(JOINT_STATE, blobs)
-    assert batch.strings == (frame_id, *names)
-    for k, blob in enumerate(blobs):
-        expected = STORE.deserialize_cdr(blob, JOINT_STATE)
-        np.testing.assert_array_equal(batch.numbers[k], expected.position)
-        if rows[k][0] + rows[k][1]:
-            assert batch.stamps_ns[k] == reading(JOINT_STATE, expected)[0]
+    assert_decoded(JOINT_STATE, blobs)
 
 
 def joint_blob(names, positions, frame_id=''):
@@ -138,28 +127,6 @@ def test_broken_messages_are_left_to_others(cut):
 
 
 VALID = [1.0, -2.0, 0.5, 0.6, 0.0, -0.8, 0.0]
-
-
-def blob_of(kind, numbers, child='hand', seconds=5):
-    head = header(seconds, 7, 'tracker')
-    made = message(kind, head, child, numbers)
-    if hasattr(getattr(made, 'pose', None), 'covariance'):
-        made.pose.covariance[:] = np.diag(np.arange(1.0, 7.0)).ravel()
-    return bytes(STORE.serialize_cdr(made, kind))
-
-
-@pytest.mark.parametrize('kind', [*sorted(DECODERS), JOINT_STATE])
-def test_batches_are_read_as_single_messages_are(kind):
-    if kind == JOINT_STATE:
-        blobs = [joint_blob(['a', 'b'], [value, 2.0]) for value in (0.0, 1.0)]
-    else:
-        blobs = [blob_of(kind, VALID, seconds=s) for s in (5, 6, 7)]
-    batch = decode(kind, blobs)
-    assert usable(kind, batch)[0].all()
-    for k, blob in enumerate(blobs):
-        stamp_ns, strings, numbers = reading(kind, STORE.deserialize_cdr(blob, kind))
-        assert (stamp_ns, strings) == (batch.stamps_ns[k], batch.strings)
-        np.testing.assert_array_equal(numbers, batch.numbers[k])
 
 
 COVARIANCE = np.diag(np.arange(1.0, 7.0)).ravel()
