@@ -51,8 +51,18 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
         )
     found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
     if reader.compression_mode == 'message':
-        return ((stream, unpacked(data, 'zstd', largest(stream))) for stream, data in found)
+        return ((stream, _unpacked(data, largest(stream))) for stream, data in found)
     return found
+
+
+def _unpacked(data: bytes, most: int) -> bytes:
+    """Return a message, without any bytes where it cannot be unpacked: the next one may be."""
+    try:
+        return unpacked(data, 'zstd', most)
+    except OSError:  # nothing to unpack with
+        raise
+    except Exception:  # decompressors have errors of their own
+        return b''
 
 
 def _is_known(storage: Any) -> bool:

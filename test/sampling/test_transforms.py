@@ -27,6 +27,7 @@ from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source, parse_source, parse_sources
+from calib_ros.sampling.transforms import Links
 from calib_ros.settings import Settings
 
 storages = pytest.mark.parametrize('storage', sorted(STORAGES))
@@ -310,6 +311,20 @@ def session_fed(come, little_endian=True, at_once=True):
         assert feed(session, some, TYPESTORE.deserialize_cdr) == []
     session.finish()
     return session
+
+
+def test_frames_without_end_are_not_remembered(rng):
+    """As of a tracker that numbers its markers: the one that is wanted is told from them."""
+    come = [('/tf_static', tf(link('world', 'tracker', 1, frame(rng))))]
+    come += [tf(link('tracker', f'marker {k}', 101 * MS)) for k in range(1200)]
+    come += [tf(link('tracker', 'tool', ms * MS, frame(rng))) for ms in TIMES]
+    come += [tf(link('tracker', f'later {k}', 601 * MS)) for k in range(1200)]
+    session = session_fed([*come, tf(link('tracker', 'tool', 701 * MS, frame(rng)))])
+    assert session.account().samples == 5
+    links = Links('/tf')
+    for k in range(5000):
+        links.move(('tracker', f'marker {k}'), 1, k, k)
+    assert 'and 980 more' in str(links)
 
 
 def test_what_could_not_wait_for_its_frames_is_counted(monkeypatch, rng):
