@@ -122,21 +122,19 @@ def read_board(path: Path) -> Board:
     """Read the YAML of a board."""
     text = read_text(path, what='board ')
     content = parse_mapping(parse_yaml(text, str(path)), KEYS, str(path), KEYS[:-1])
-    counts = {}
     for key in ('columns', 'rows'):
         if type(content[key]) is not int:
             raise ConfigError(f'{path}: {key} must be a whole number, not {content[key]!r}')
-        counts[key] = int(content[key])
     if not isinstance(content.get('legacy', False), bool):
         raise ConfigError(f'{path}: legacy must be true or false, not {content["legacy"]!r}')
     return Board(
         str(content['type']),
-        counts['columns'],
-        counts['rows'],
+        content['columns'],
+        content['rows'],
         parse_number(content['square'], f'{path}: square'),
         parse_number(content['marker'], f'{path}: marker'),
         str(content['dictionary']),
-        bool(content.get('legacy', False)),
+        content.get('legacy', False),
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
+from calib_ros.files.columns import Codes, Columns, MadeColumns, Row, numbered, of_cells
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
@@ -191,8 +191,7 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
 def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
     """Return the columns of a text with quotes, or with rows that end early."""
     header: list[str] = []
-    rows: list[list[str]] = []
-    lines: list[int] = []
+    rows: list[Row] = []
     most = text.count('\n') + 1
     for line, row in csv_rows(path, text, strict=True):
         told(min(line / most, 1.0))
@@ -206,14 +205,11 @@ def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
             raise InputError(
                 f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
             )
-        rows.append([*row[: len(header)], *[''] * (len(header) - len(row))])
-        lines.append(line)
+        rows.append((line, row[: len(header)]))
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
-    cells = zip(*rows, strict=True) if rows else [()] * len(header)
-    words = dict(zip(header, cells, strict=True))
-    return MadeColumns(path, np.array(lines, dtype=np.intp), {}, words)
+    return of_cells(path, header, rows)
 
 
 def csv_rows(
