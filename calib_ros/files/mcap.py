@@ -33,10 +33,6 @@ Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
 
 
-LARGEST_CHUNK = LARGEST_TABLE
-"""Bytes of a chunk when it is unpacked; recorders make chunks of one to ten million."""
-
-
 class Room:
     """What may still be unpacked of a recording of some bytes: a chunk and 1,000 times its size.
 
@@ -44,7 +40,7 @@ class Room:
     """
 
     def __init__(self, packed: int) -> None:
-        self._left = LARGEST_CHUNK + 1000 * packed
+        self._left = LARGEST_TABLE + 1000 * packed
 
     def take(self, size: int) -> None:
         """Let so many bytes be unpacked."""
@@ -143,8 +139,8 @@ def unpacked(data: bytes, compression: str, largest: int) -> bytes:
 
 def _unpacked(chunk: bytes) -> bytes:
     size = _CHUNK.unpack_from(chunk)[2]
-    if size > LARGEST_CHUNK:
-        raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_CHUNK}')
+    if size > LARGEST_TABLE:
+        raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_TABLE}')
     compression = string(chunk, _CHUNK.size)
     return unpacked(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
 

@@ -10,7 +10,7 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import MOST_ENTRIES
-from calib_ros.files.mcap import LARGEST_CHUNK, Room, logged, unpacked, unpacked_size
+from calib_ros.files.mcap import Room, logged, unpacked, unpacked_size
 from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
@@ -126,7 +126,7 @@ def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator
         if counts and not any(counts.get(key) for key in channels):
             continue
         size += chunk.uncompressed_size
-        if together and (chunk.message_start_time >= end or size > LARGEST_CHUNK):
+        if together and (chunk.message_start_time >= end or size > LARGEST_TABLE):
             yield sorted(together, key=attrgetter('chunk_start_offset'))
             together, end, size = [], 0, chunk.uncompressed_size
         together.append(chunk)

@@ -15,7 +15,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
-from calib_ros.files.mcap import CHANNEL, CHUNK, LARGEST_CHUNK, MESSAGE, _module, logged, records
+from calib_ros.files.mcap import CHANNEL, CHUNK, MESSAGE, _module, logged, records
+from calib_ros.texts import LARGEST_TABLE
 
 try:
     from rosbags.rosbag2.reader import zstd
@@ -134,7 +135,7 @@ def test_the_zstd_of_older_rosbags_will_do(monkeypatch):
 @pytest.mark.parametrize('compression', ['lz4', 'zstd'])
 @pytest.mark.parametrize('said', [100, 1 << 40])
 def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_refused(compression, said):
-    bomb = bytearray(chunk(bytes(LARGEST_CHUNK + 1000), compression))
+    bomb = bytearray(chunk(bytes(LARGEST_TABLE + 1000), compression))
     bomb[25:33] = struct.pack('<Q', said)
     assert len(bomb) < 1_000_000
     tracemalloc.start()
@@ -142,7 +143,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_refused(compression
         logged(bytes(bomb), {1: 1})
     with pytest.raises(ValueError, match='more than'):
         list(records(bytes(bomb)))
-    assert tracemalloc.get_traced_memory()[1] < 2.5 * LARGEST_CHUNK
+    assert tracemalloc.get_traced_memory()[1] < 2.5 * LARGEST_TABLE
     tracemalloc.stop()
 
 
@@ -156,7 +157,7 @@ def test_chunks_within_chunks_are_refused():
 
 
 def test_many_chunks_are_not_more_than_any_recording_holds():
-    bomb = chunk(record(0x0A, bytes(LARGEST_CHUNK // 2)), 'zstd') * 3
+    bomb = chunk(record(0x0A, bytes(LARGEST_TABLE // 2)), 'zstd') * 3
     with pytest.raises(InputError, match='times its size'):
         list(records(bomb))
 
