@@ -153,7 +153,7 @@ def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
         if len(seen) > 1 and not name:
             notes.append(f'sheet "{sheet.title}" is read, the first of {len(seen)} (--sheet)')
         sheet.reset_dimensions()  # programs write smaller ones than there are rows
-        rows = []
+        rows: list[Row] = []
         for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
@@ -214,7 +214,7 @@ def _decimal(rows: Sequence[Row], separator: str, notes: list[str]) -> str:
 
 def _cells(path: Path, text: str, separator: str) -> list[Row]:
     """Return the cells of all lines that hold any, with the numbers of the lines."""
-    found = [
+    found: list[Row] = [
         (line, [' '.join(cell.split()) for cell in row])
         for line, row in csv_rows(path, text, separator)
         if any(cell.strip() for cell in row)

@@ -96,7 +96,8 @@ class Alike:
 def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:
     """Return messages of one type and length by their layouts; what has none is in none.
 
-    Layouts that are `known` by the length of messages need not be found again, and are added.
+    Layouts that are `known` by the length of messages need not be found again, and are added. Of
+    more than MOST_NAMES the others are in none.
     """
     length = len(blobs[0])
     if length < _HEAD or kind not in _FORMS:
@@ -107,7 +108,7 @@ def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> 
         known.clear()
     layouts = known.setdefault(length, [])
     untried, found = list(layouts), []
-    while len(rest):
+    while len(rest) and len(found) < MOST_NAMES:
         if untried:
             layout = untried.pop(0)
         else:
