@@ -107,7 +107,8 @@ def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> 
     if len(known) == MOST_NAMES:
         known.clear()
     layouts = known.setdefault(length, [])
-    untried, found = list(layouts), []
+    untried = list(layouts)
+    found: list[Alike] = []
     while len(rest) and len(found) < MOST_NAMES:
         if untried:
             layout = untried.pop(0)
