@@ -308,7 +308,7 @@ class Collector:
         stops = plan.stops
         if stops:
             spans = [(plan.begins[k], plan.ends[k]) for k in stops]
-            where = self.track.at(np.sum(spans, axis=1) // 2, standing=True).joints
+            where = self.track.where(np.sum(spans, axis=1) // 2)
             known = self._known.meets(spans, where, 2.0 * settings.still)
             for k in itertools.compress(stops, known):
                 plan.why[k] = SAMPLED

@@ -151,13 +151,22 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
 
     Of the latter only what lies between two numbers is known; -1 stands where that is too little.
     """
-    found = np.full(len(second) - len(first) + 1, -1.0)
-    least = np.finfo(float).eps * (first @ first) * (second @ second)
-    for lag in range(len(found)):
-        begin, end = (min(max(each - lag, 0), len(first)) for each in known)
-        if (end - begin) * STEP >= LEAST_MOTION:
-            one, other = first[begin:end], second[begin + lag : end + lag]
-            one, other = one - one.mean(), other - other.mean()
-            squares = (one @ one) * (other @ other)
-            found[lag] = one @ other / np.sqrt(squares) if squares > least else -1.0
-    return found
+    lags = np.arange(len(second) - len(first) + 1)
+    begin, end = (np.clip(each - lags, 0, len(first)) for each in known)
+    count = np.maximum(end - begin, 1)
+    one, other = first - first.mean(), np.zeros(len(second))
+    part = slice(*known)
+    other[part] = second[part] - second[part].mean()
+
+    def total(values: FloatArray, shift: NDArray[np.intp] | int = 0) -> FloatArray:
+        running = np.concatenate([[0.0], np.cumsum(values)])
+        return np.asarray(running[end + shift] - running[begin + shift])
+
+    means = total(one) / count, total(other, lags) / count
+    squares = (total(one**2) - count * means[0] ** 2) * (
+        total(other**2, lags) - count * means[1] ** 2
+    )
+    products = np.correlate(other, one, 'valid') - count * means[0] * means[1]
+    least = np.finfo(float).eps * (one @ one) * (other @ other)
+    good = (count * STEP >= LEAST_MOTION) & (squares > least)
+    return np.where(good, products / np.sqrt(np.where(good, squares, 1.0)), -1.0)

@@ -129,6 +129,16 @@ class Track:
                 whole[good] = part[why == 0]
         return Motion(joints, velocity, acceleration, approach, self.causes(stamps))
 
+    def where(self, stamps: Stamps) -> FloatArray:
+        """Return joint values (N, n) while the arm stands, after `sort`, without the approach."""
+        joints = np.zeros((len(stamps), len(self._revolute)))
+        for columns, rows in self._by_size():
+            index = list(columns)
+            why, first, last = self._brackets(rows.stamps, stamps)
+            found, *_ = interpolated(rows, stamps, first, last, self._revolute[index], True)
+            joints[np.ix_(why == 0, index)] = found[why == 0]
+        return joints
+
     def causes(self, stamps: Stamps) -> NDArray[np.intp]:
         """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
         cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
