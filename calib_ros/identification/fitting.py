@@ -16,7 +16,7 @@ import numpy as np
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import identifiability
-from calib_ros.identification.evidence import Posterior, posterior_of
+from calib_ros.identification.evidence import MOST_SAMPLES, Posterior, posterior_of
 from calib_ros.identification.leastsquares import (
     System,
     factor_of,
@@ -165,11 +165,11 @@ def _fit_all(
     few = problem.system([each.spread(SOME) for each in problem.sets])
     if few.count < sum(map(len, problem.sets)) // 2:
         rough = minimise(rough, names, few, tolerance=1e-2).chain
-    fitted = _fit(problem, rough, names, simpler)
+    fitted = _fit(*_some(problem, simpler), rough, names)
     guarded = _guarded(problem, names, fitted.factor, simpler)
     if guarded is not problem:  # without its outliers a session tells less
         problem = guarded
-        fitted = _fit(problem, rough, names, simpler)
+        fitted = _fit(*_some(problem, simpler), rough, names)
     size = _told_by(fitted.noise, simpler)
     told = fitted.posterior(size, judging=False)
     if not _matter(problem, names, told):
@@ -180,15 +180,25 @@ def _fit_all(
         if not problem.model.owns_frame(name)
     }
     problem = replace(problem, learned=Learned(priors, size))
-    again = _fit(problem, fitted.chain, names, simpler, again=True)
+    again = _fit(problem, simpler, fitted.chain, names, again=True)
     return replace(again, size=fitted.size)
+
+
+def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
+    """Return what tells the priors of a richer model, which is fitted again with them."""
+    share = -(-sum(map(len, problem.sets)) // MOST_SAMPLES)
+    if simpler is None or share < 2:
+        return problem, simpler
+    first, *more = (each.select(np.arange(0, len(each), share)) for each in problem.sets)
+    few = replace(problem, observations=first, more=more)
+    return few, replace(simpler, distances=tuple(each[::share] for each in simpler.distances))
 
 
 def _fit(
     problem: Problem,
+    simpler: Simpler | None,
     chain: Chain,
     names: tuple[str, ...],
-    simpler: Simpler | None,
     again: bool = False,
 ) -> Fitted:
     """Fit the named parameters from a chain that is near, or `again` from one that was fitted."""

@@ -37,6 +37,10 @@ from calib_ros.progress import Told, nobody, share_of
 
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
+SEVERAL = 3
+"""Harmonics that are added before all of them are tried at once (benchmarks/real_robots.py)."""
+SIZES = (1e-4, 2e-5)
+"""Sizes [rad] of which all harmonics together may be (benchmarks/real_robots.py)."""
 COMPARED = 3000
 """Samples by which effects are compared; of more, every so many are taken."""
 
@@ -98,19 +102,36 @@ def _chosen(
         best, group = min(paying, key=lambda pair: pair[0].rms_mm_after)
         verdicts[group] = best
         chosen += groups[group]
-    found = list(verdicts.values())
-    for _ in HARMONICS:
-        harmonic = model.strongest_harmonic(chosen, progress)
-        if harmonic is None:
-            break
-        verdict = model.judge(
-            chosen, harmonic, f'{harmonic[0].owner}, {harmonic[0].effect[1]} per turn'
-        )
-        found.append(verdict)
-        if not verdict.pays:
-            break
-        chosen += harmonic
-    return tuple(chosen), tuple(found)
+    return _with_harmonics(model, chosen, list(verdicts.values()), progress)
+
+
+def _with_harmonics(
+    model: _Linear, chosen: list[str], verdicts: list[Verdict], progress: Told
+) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
+    """Add the strongest harmonics one by one, or all of them where that predicts better."""
+
+    def added(verdict: Verdict, names: Sequence[str]) -> bool:
+        verdicts.append(verdict)
+        chosen.extend(name for name in names if verdict.pays and name not in chosen)
+        return verdict.pays
+
+    def strongest_added() -> bool:
+        found = model.strongest_harmonic(chosen, progress)
+        if found is None:
+            return False
+        what = f'{found[0].owner}, {found[0].effect[1]} per turn'
+        return added(model.judge(chosen, found, what), found)
+
+    one_by_one = 0
+    while one_by_one < SEVERAL and strongest_added():
+        one_by_one += 1
+    if model.equations > len(model.harmonics):
+        progress('effects: all harmonics')
+        if added(model.judge_all_harmonics(chosen), model.harmonics):
+            return tuple(chosen), tuple(verdicts)
+    while one_by_one >= SEVERAL and strongest_added():
+        pass
+    return tuple(chosen), tuple(verdicts)
 
 
 class _Linear:
@@ -159,11 +180,14 @@ class _Linear:
             if joint.type == 'revolute'
             for harmonic in HARMONICS
         ]
+        self.harmonics = [name for pair in self._pairs for name in pair]
+        self.equations = len(owner)
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
         self._errors: dict[tuple[int, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
+        self._told: dict[str, float] = {}
         self._seen: Columns | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -202,6 +226,17 @@ class _Linear:
         if pays and self._shifts is not None:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return Verdict(what, found[0], found[1], bool(pays))
+
+    def judge_all_harmonics(self, chosen: Sequence[str]) -> Verdict:
+        """Judge all harmonics together, of the usual size and else of a smaller one."""
+        new = [name for name in self.harmonics if name not in chosen]
+        for size in SIZES:
+            self._told = dict.fromkeys(new, size)
+            self._errors.clear()
+            verdict = self.judge(chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn')
+            if verdict.pays:
+                break
+        return verdict
 
     def strongest_harmonic(self, chosen: Sequence[str], progress: Told) -> list[Parameter] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
@@ -261,8 +296,7 @@ class _Linear:
             self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
             self._columns = np.concatenate([self._columns, added])
             size, count = len(self._columns), len(added)
-            masked = (self._inside[:, np.newaxis] * added).reshape(-1, added.shape[1])
-            new = (masked @ self._columns.T).reshape(-1, count, size)
+            new = np.array([added[:, part] @ self._columns[:, part].T for part in self._inside])
             known, self._products = self._products, np.zeros((len(new), size, size))
             self._products[:, :-count, :-count] = known
             self._products[:, :, -count:] = np.swapaxes(new, 1, 2)
@@ -317,7 +351,8 @@ class _Linear:
             size = sigmas.get(name, 0.0)
             if name not in self._names:
                 group = str(group_of(self._chain, name))
-                size = max(effects.expected(name), self._sizes.get(group, 0.0))
+                usual = max(effects.expected(name), self._sizes.get(group, 0.0))
+                size = self._told.get(name, usual)
             found[k] = self._noise / size if size else 0.0
         return found
 

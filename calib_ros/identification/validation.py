@@ -291,6 +291,8 @@ def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int
     The other parts must determine what is fitted, with some equations to spare. Where they do so
     by priors only, one configuration is left out at a time.
     """
+    known = dict(problem.model.effects)
+    names = [name for name in names if name not in known]  # which have priors
     folds = min(problem.folds, count)
     if folds > 1 and rows * (folds - 1) // folds >= len(names) + SPARE:
         return folds

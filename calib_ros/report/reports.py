@@ -17,6 +17,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
+from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, words
 from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
 from calib_ros.report.explorer import explorer
@@ -32,6 +33,7 @@ from calib_ros.report.sections import (
     identity_of,
     limits_of,
 )
+from calib_ros.shown import some
 
 SURVEYED = 4000
 """Random poses of the error map."""
@@ -341,16 +343,20 @@ def _determined(result: Identification) -> Section:
 def _correlations(result: Identification) -> Section:
     """Return which parameters were found together rather than each."""
     strong = [f'{a} and {b} ({value:+.2f})' for a, b, value in result.correlated()]
+    shown = [k for k, name in enumerate(result.names) if group_of(name) != 'gear']
     return Section(
         'correlations',
         'Which parameters stand in for each other',
         (
             'Two parameters of strong colour change together: the poses tell their '
             'combination better than each alone. Predictions of the arm are not harmed.',
-            f'Strongest: {", ".join(strong)}.' if strong else 'None is above 0.9.',
+            f'Strongest: {", ".join(some(strong))}.' if strong else 'None is above 0.9.',
+            *(('Harmonics of drives are not drawn.',) if len(shown) < result.rank else ()),
         ),
-        figures.correlations(result.names, result.covariance),
-        height=max(360, 140 + 15 * len(result.names)),
+        figures.correlations(
+            [result.names[k] for k in shown], result.covariance[np.ix_(shown, shown)]
+        ),
+        height=max(360, 140 + 15 * len(shown)),
     )
 
 
