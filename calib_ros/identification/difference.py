@@ -194,11 +194,12 @@ def _in_parameters_of(
     frames = [name for end in ('base', 'tool') for name in parameters_of(end)]
     every = [*first.names, *second.names, *effects]
     arm = [Parameter(n) for n in dict.fromkeys(every) if not chain.owns_frame(n)]
-    independent = structurally_independent(chain, [*frames, *arm])
+    nominal = first.before.with_effects(effects)  # corrected axes are never quite parallel
+    independent = structurally_independent(nominal, [*frames, *arm])
     names = tuple(Parameter(name) for name in independent if name in arm)
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     start = replace(chain, base=other.base, tool=other.tool)
-    fitted, left = likened(start, [*frames, *names], other, joints)
+    fitted, left = likened(start, independent, other, joints)
     return names, chain, np.array([fitted.offset(name, chain) for name in names]), left
 
 

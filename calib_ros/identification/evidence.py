@@ -5,8 +5,8 @@
 Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there,
 and the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm are taken
 to be normal about zero, with one size for each group of parameters: lengths, angles, what drives
-do to a joint value (`ratio`, `sin_1`, ...), and what bends or has play. The sizes s maximise the
-probability of the data, parameters integrated out (evidence; MacKay 1992):
+do to a joint value (`ratio`, `sin_1`, ...), couplings, and what bends or has play. The sizes s
+maximise the probability of the data, parameters integrated out (evidence; MacKay 1992):
 
     s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
 
@@ -45,8 +45,13 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.shown import Shown
 
-BENDING = ('gravity', 'compliance', 'backlash')
-TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, **dict.fromkeys(BENDING, 3e-4)}
+TYPICAL = {
+    'length': 5e-4,
+    'angle': 1e-3,
+    'drive': 1e-4,
+    'coupling': 1e-3,
+    **dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4),
+}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
@@ -54,12 +59,15 @@ benchmarks/harm.py)."""
 TAILS = 3.0
 """Degrees of freedom of the prior (benchmarks/harm.py)."""
 CONSIDERED = ('eccentricity', 'gravity')
-"""Effects that any arm may have, whether they are fitted or not."""
+"""Effects that any arm may have, whether they are fitted or not, beside couplings: one that its
+controller does not know hardly shows where joints move little, or one at a time."""
 SHOWN, REFUTED = 1.35, 3.0
 """Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
 which those of usual size are refuted."""
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
+PRINTED = 5e-3
+"""The same of a printed board: often not in its true size, and hardly anything shows it."""
 MOST_SAMPLES = 2000
 """Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02
@@ -78,7 +86,7 @@ def _group(name: str) -> str:
     if Parameter(name).of_dh:
         return 'length' if Parameter(name).is_length else 'angle'
     group = effects.group_of(name)
-    return group if group in BENDING else 'drive'
+    return group if group in TYPICAL else 'drive'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -156,6 +164,7 @@ class Posterior(Shown):
 def considered(chain: Chain, names: Sequence[str]) -> tuple[str, ...]:
     """Return the effects that an arm may have besides those among the names."""
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
+    every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
     return tuple(name for name in every if name not in names)
 
 
@@ -199,7 +208,8 @@ def posterior_of(
     every = (*names, *more)
     beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
     whole, lengths = _lengths(chain, system) if more else (chain, {})
-    beside += [(lengths, SCALE)] if lengths else []
+    boards = all(samples.observations.pixels is not None for samples in system.sets)
+    beside += [(lengths, PRINTED if boards else SCALE)] if lengths else []
     told = _told(whole, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
     matrix = told[:-1, :-1]
     offsets = np.zeros(len(matrix))

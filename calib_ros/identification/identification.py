@@ -113,6 +113,8 @@ class Identification(Shown):
         What moved while it was measured (`steps.py`).
     remarks : tuple of str
         What is suspicious though the figures are good, and what to do (`suspicions.py`).
+    coupled : bool
+        Whether couplings of the wrist that are not fitted explain most of what is left.
 
     """
 
@@ -141,6 +143,7 @@ class Identification(Shown):
     verdicts: tuple[effects.Verdict, ...] = ()
     step: Step | None = None
     remarks: tuple[str, ...] = ()
+    coupled: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -261,8 +264,8 @@ def identify(
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)
-    wrist, share = suspicions.lacking(problem, chain, names, fitted.noise.position)
-    more = (*considered(chain, names), *wrist)
+    share = suspicions.lacking(problem, chain, names, fitted.noise.position)
+    more = considered(chain, names)
     posterior = fitted.posterior(_size(fitted, share), more, rounding_errors(problem, coarse))
     found = _findings(fitted, before, posterior, validation, parameters, coarse)
     result = Identification(
@@ -290,6 +293,7 @@ def identify(
         weak=_weak(problem, parameters),
         step=found.step,
         remarks=remarks(problem, found.step, coarse),
+        coupled=share > 0.0,
     )
     named = mistakes.remarked(problem, result)
     return suspicions.remarked(problem, named, another=named is result)

@@ -30,7 +30,6 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms
 from calib_ros.identification.suspects import Sets, Suspect, suspects
-from calib_ros.identification.suspicions import coupled
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
@@ -84,7 +83,7 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
 
     Couplings may explain most of what is left, however small.
     """
-    if not result.refusals and coupled(result):
+    if not result.refusals and result.coupled:
         return True
     judged = result.validation or result.fitted
     for each in (judged.before, judged.after, result.fitted.before):

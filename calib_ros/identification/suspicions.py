@@ -187,29 +187,22 @@ def _gravity(problem: Problem, result: Identification) -> str:
     )
 
 
-def lacking(
-    problem: Problem, chain: Chain, names: Sequence[str], noise: float
-) -> tuple[tuple[str, ...], float]:
-    """Return the couplings of the wrist, and the share of what a fit has left that they explain.
+def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:
+    """Return the share of what a fit has left that couplings of the wrist explain.
 
-    None where that is not most of it. `noise` is the size of what is left [sigma given].
+    Zero where that is not most of it. `noise` is the size of what is left [sigma given].
     """
     known = [name for name, _ in chain.effects]
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
     if not added or noise < SUSPICIOUS:  # nothing is left to explain
-        return (), 0.0
+        return 0.0
     share = _explained(problem, chain.with_effects([*known, *added]), names, added)
-    return (added, share) if share >= EXPLAINED else ((), 0.0)
-
-
-def coupled(result: Identification) -> bool:
-    """Tell whether couplings of the wrist that are not fitted explain what is left."""
-    return any('.coupling_' in name for name in {*result.posterior.names} - {*result.names})
+    return share if share >= EXPLAINED else 0.0
 
 
 def _coupling(result: Identification) -> str:
     """Return in words that couplings of the wrist explain what is left."""
-    if not coupled(result):
+    if not result.coupled:
         return ''
     return (
         'couplings of the last joints explain most of the residuals: are the joint values those '

@@ -65,10 +65,9 @@ def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
     revolute = [joint.name for joint in chain.joints if joint.type == 'revolute']
     geared = [(joint.name, joint.gear_ratio) for joint in chain.joints if joint.gear_ratio]
     behind = {name: names[i:] for i, name in enumerate(names)}
-    pairs = [(name, other) for i, name in enumerate(wrist) for other in wrist[:i]]
     found: dict[str, list[Parameter]] = {
         'ratio': [Parameter(name, group) for name in names],
-        'coupling': [Parameter(name, f'coupling_{other}') for name, other in pairs],
+        'coupling': couplings(wrist),
         'eccentricity': [wave for name in revolute for k in (1, 2) for wave in waves(name, k)],
         'gear': [wave for name, gear in geared for k in (1, 2) for wave in waves(name, k * gear)],
         'gravity': [
@@ -80,6 +79,11 @@ def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
     if group not in found:
         raise UnknownNameError('group of effects', group, GROUPS)
     return tuple(found[group])
+
+
+def couplings(joints: Sequence[str]) -> list[Parameter]:
+    """Return the names of the couplings of joints with those before them."""
+    return [Parameter(name, f'coupling_{o}') for i, name in enumerate(joints) for o in joints[:i]]
 
 
 WAVES = ('sin', 'cos')

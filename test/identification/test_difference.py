@@ -16,7 +16,7 @@ from calib_ros.identification.changes import gauged
 from calib_ros.identification.difference import difference
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 
 UR = load_chain('ur10e')
@@ -149,3 +149,29 @@ def test_two_nights_of_a_measured_robot_are_not_known_well_enough_to_differ():
     assert found.limit > found.rms
     assert not found.changed
     assert 'bumped' not in found.in_words()
+
+
+SCARA = """
+name: scara
+convention: standard
+joints:
+- {name: arm, type: revolute, a: 0.35, alpha: 0.0, d: 0.4, theta: 0.0, lower: -2.3, upper: 2.3}
+- {name: elbow, type: revolute, a: 0.3, alpha: 3.141592653589793, d: 0.0, theta: 0.0,
+   lower: -2.4, upper: 2.4}
+- {name: quill, type: prismatic, a: 0.0, alpha: 0.0, d: 0.0, theta: 0.0, lower: 0.0, upper: 0.3}
+- {name: spindle, type: revolute, a: 0.0, alpha: 0.0, d: 0.05, theta: 0.0, lower: -2.5, upper: 2.5}
+"""
+
+
+def test_axes_that_are_all_nearly_parallel_are_the_same_on_another_night():
+    """Their tool's length trades against the base's height; once corrected, hardly any longer."""
+    scara = parse_chain(SCARA)
+    true = faulty(scara, Cell(), np.random.default_rng(3))
+    nights = []
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        seen = measure(true, scara.random_joints(60, rng), rng, *NOISE)
+        nights.append(Calibration.of(identify(Problem(scara, seen))))
+    found = difference(*nights)
+    assert found.same
+    assert found.limit < 1e-4

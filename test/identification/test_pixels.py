@@ -169,6 +169,14 @@ def test_a_lens_is_fitted_with_the_arm(on_flange):
     assert error(result.chain, true, seen) < error(given.chain, true, seen)
 
 
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_a_board_of_another_size_than_stated_does_not_make_the_arm_larger(on_flange):
+    _, seen = scene(4, on_flange, 15)
+    larger = replace(seen, points=1.01 * seen.points)
+    assert not identify(Problem(known(on_flange), larger, sigma_pixel=SIGMA)).accepted
+    assert identify(Problem(known(on_flange), seen, sigma_pixel=SIGMA)).accepted
+
+
 def test_a_prior_holds_a_lens():
     _, seen = scene(2, False, 12)
     wrong = replace(CAMERA.lens.moved({'fx': 8.0}), fixed=False)

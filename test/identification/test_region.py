@@ -82,6 +82,20 @@ def test_a_joint_that_hardly_moved_is_no_worse_where_it_may_be_used(reach, error
     assert rms(found.chain, true, used) < rms(found.before, true, used)
 
 
+@pytest.mark.parametrize('seed', [2, 4, 5])
+def test_a_coupling_that_hardly_shows_near_a_posture_is_not_fitted_for_elsewhere(seed):
+    """The joint values are those of motors: the sixth lacks a hundredth of the fifth's turn."""
+    name = 'wrist_3_joint.coupling_wrist_2_joint'
+    true = arm(seed, 0.1).with_effects([name]).with_offsets({name: -1e-2})
+    rng = np.random.default_rng(seed)
+    found = identified(true, rng.uniform(-1.5, 1.5, 6) + rng.uniform(-0.4, 0.4, (60, 6)))
+    assert found.accepted
+    other = np.random.default_rng(3).uniform(-2.5, 2.5, (2000, 6))
+    used = other[found.region.covers(other)]
+    assert len(used) > 200
+    assert rms(found.chain, true, used) < rms(found.before, true, used)
+
+
 def test_what_a_still_joint_leaves_open_is_not_covered(local):
     region, q = local.region, with_a_still_joint(0, 3e-4)
     assert not region.whole
