@@ -33,7 +33,7 @@ setup(
     maintainer='calib_ros maintainers',
     maintainer_email='maintainers@calib-ros.invalid',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed'], f'{NAME}.report': ['templates/*']},
+    package_data={NAME: ['py.typed', '__init__.pyi'], f'{NAME}.report': ['templates/*']},
     python_requires='>=3.10',
     # The lower bounds are those of Ubuntu 24.04; `make oldest` runs with exactly these.
     install_requires=[

@@ -37,6 +37,7 @@ from calib_ros.files.bags import replay
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -127,6 +128,7 @@ class Nobody:
     """Stands for a session that takes decoded messages and does nothing with them."""
 
     settings = Settings()
+    pictures = Pictures(lambda: Settings.sigma_pixel)
     warnings = ()
 
     def take(self, parts):

@@ -17,9 +17,10 @@ import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from hashlib import sha256
 from pathlib import Path
 
-from calib_ros.errors import InputError
+from calib_ros.errors import LONGEST_NAME, InputError
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
@@ -31,12 +32,21 @@ def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> 
 
 
 def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = False) -> None:
-    """Write files that belong together as `write_file` does, none before all are on the disk."""
-    name = f'{secrets.token_hex(8)}.partial'
-    partials = {path: path.with_name(f'.{path.name}.{name}') for path in contents}
+    """Write files that belong together as `write_file` does, all of them or none.
+
+    None is put in place before all are on the disk. Where one cannot be, the others are put back.
+    A process that is killed meanwhile leaves the first, new or old, and none that does not belong
+    to it.
+    """
+    mark = secrets.token_hex(8)
+    partials, earlier = (
+        {path: path.with_name(f'.{short_name(path.name)}.{mark}.{what}') for path in contents}
+        for what in ('partial', 'earlier')
+    )
     for path in contents:
         if path.exists() and not overwrite:
             raise _exists(path)
+    placed = []
     try:
         for path, content in contents.items():
             data = content.encode() if isinstance(content, str) else content
@@ -45,17 +55,24 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
                 file.write(data)
                 file.flush()
                 os.fsync(file.fileno())
+        for k, path in enumerate(contents if overwrite and len(contents) > 1 else ()):
+            if path.is_file():
+                (os.replace if k else _link)(path, earlier[path])
+                placed.append(path)
         for path, partial in partials.items():
             if overwrite:
                 partial.replace(path)
             else:
                 _rename_new(partial, path)
+            placed.append(path)
+        placed = []
     except OSError as err:
         raise OSError(err.errno, err.strerror, str(path)) from err
     finally:
+        _put_back({path: earlier[path] for path in placed})
         with suppress(OSError):  # a disk that cannot be written
-            for partial in partials.values():
-                partial.unlink(missing_ok=True)
+            for left in (*partials.values(), *earlier.values()):
+                left.unlink(missing_ok=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
@@ -84,30 +101,22 @@ def whole_folder(
         _clean_up(place, new, old)
         _check_place(path, place, own, overwrite)
         try:
-            with _named(new, path):
-                yield new
-                _sync(new)
-                if place.exists():
-                    _carry_over(place, new, own or ())
-                    place.rename(old)
-                new.rename(place)
-                _sync(place.parent, deep=False)
+            yield new
+            _sync(new)
+            if place.exists():
+                _carry_over(place, new, own or ())
+                place.rename(old)
+            new.rename(place)
+            _sync(place.parent, deep=False)
+        except OSError as err:  # which names the folder to work in
+            name = str(err.filename or path).replace(str(new), str(path))
+            raise OSError(err.errno, err.strerror or str(err), name) from err
         finally:
             _clean_up(place, new, old)
     finally:
         with suppress(OSError):  # it holds what could neither be put back nor removed
             work.rmdir()
         os.close(claim)
-
-
-@contextmanager
-def _named(new: Path, path: Path) -> Iterator[None]:
-    """Let errors of the system name the folder that was asked for, not the one to work in."""
-    try:
-        yield
-    except OSError as err:
-        name = str(err.filename or path).replace(str(new), str(path))
-        raise OSError(err.errno, err.strerror or str(err), name) from err
 
 
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
@@ -124,6 +133,27 @@ def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
     if not any(path.is_relative_to(place) for place in places):
         raise InputError(f'{name!r:.200} is outside the folders of the node: {allowed_by}')
     return path
+
+
+def short_name(name: str) -> str:
+    """Return a name with room for an ending [bytes]; the end of a long one becomes its hash."""
+    data = name.encode()
+    if len(data) <= LONGEST_NAME:
+        return name
+    return f'{data[: LONGEST_NAME - 17].decode(errors="ignore")}_{sha256(data).hexdigest()[:16]}'
+
+
+def _put_back(earlier: Mapping[Path, Path]) -> None:
+    """Make of files what they were earlier, or nothing where there was nothing."""
+    for path, before in earlier.items():
+        try:
+            if before.exists():
+                before.replace(path)
+            else:
+                path.unlink(missing_ok=True)
+        except OSError as err:
+            words = f'{path} is new, but files that belong to it are not: do not use it ({err})'
+            raise InputError(words) from err
 
 
 def _exists(path: Path) -> InputError:
@@ -222,17 +252,19 @@ def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
     def left_out(folder: str, names: list[str]) -> list[str]:
         return [name for name in names if Path(folder, name) in owned]
 
-    def link(first: str, second: str) -> None:
-        try:
-            os.link(first, second, follow_symlinks=False)
-        except FileExistsError:
-            pass
-        except OSError:  # no hard links here, or not to this file
-            shutil.copy2(first, second)
-
     shutil.copytree(
-        source, target, symlinks=True, ignore=left_out, copy_function=link, dirs_exist_ok=True
+        source, target, symlinks=True, ignore=left_out, copy_function=_link, dirs_exist_ok=True
     )
+
+
+def _link(first: str | Path, second: str | Path) -> None:
+    """Give a file another name, or copy it, unless there is one of that name."""
+    try:
+        os.link(first, second, follow_symlinks=False)
+    except FileExistsError:
+        pass
+    except OSError:  # no hard links here, or not to this file
+        shutil.copy2(first, second)
 
 
 def _matching(folder: Path, patterns: Sequence[str]) -> set[Path]:

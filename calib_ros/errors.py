@@ -9,6 +9,8 @@ from collections.abc import Iterable
 
 LONGEST = 400
 """Characters of a message; what is quoted from a file may be of any length."""
+LONGEST_NAME = LONGEST // 2
+"""Characters of a name, a number or an expression: a message has room for it and more."""
 MOST_ENTRIES = 1000
 """Of a list, of columns, and characters of an entry, that somebody may have written."""
 

@@ -37,42 +37,31 @@ STARTUP = (
 """Settings that a running node cannot change."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """How far a correction of joint commands may go.
-
-    Parameters
-    ----------
-    largest_turn, largest_shift : float
-        Largest correction of a revolute [rad] and of a prismatic joint [m].
-    largest_position_error : float
-        Position error [m] that may remain.
-    largest_orientation_error : float, optional
-        Orientation error [rad] that may remain; by default 1e-6, and 0.02 of arms that cannot
-        reach every orientation.
-    orientation_weight : float, optional
-        Metres of position error that a radian of orientation error counts for, where not both can
-        vanish. By default 0.3, and 0.001 of arms that cannot reach every orientation: position
-        first.
-    largest_change : float
-        Largest change of the correction between successive samples, relative to the move between
-        them. Beyond it the correction jumps.
-
-    """
-
-    largest_turn: float = 0.1
-    largest_shift: float = 0.05
-    largest_position_error: float = 1e-6
-    largest_orientation_error: float | None = None
-    orientation_weight: float | None = None
-    largest_change: float = 0.5
-
-
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
     """Declare a setting with what a node parameter and a command line option need to know."""
-    if isinstance(default, tuple):
-        return field(default=default, metadata={'text': text})
     return field(default=default, metadata={'text': text, 'lower': lower})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """How far a correction of joint commands may go."""
+
+    largest_turn: float = _setting(0.1, 'largest correction of a revolute joint [rad]')
+    largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]')
+    largest_position_error: float = _setting(1e-6, 'position error that may remain [m]')
+    largest_orientation_error: float | None = _setting(
+        None,
+        'orientation error that may remain [rad]; if not given 1e-6, or 0.02 for arms that cannot '
+        'reach every orientation',
+    )
+    orientation_weight: float | None = _setting(
+        None,
+        'position error that counts as much as one radian, where both cannot vanish [m/rad]; if '
+        'not given 0.3, or 0.001 for arms that cannot reach every orientation',
+    )
+    largest_change: float = _setting(
+        0.5, 'largest change of the correction between successive samples, relative to the move'
+    )
 
 
 @dataclass(frozen=True)
@@ -179,7 +168,7 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            lower = item.metadata.get('lower')
+            lower = item.metadata['lower']
             value = getattr(self, item.name)
             if isinstance(item.default, tuple):
                 _check_list(item.name, value)
@@ -198,10 +187,9 @@ class Settings:
 
 def _check_list(name: str, entries: Sequence[str]) -> None:
     """Refuse lists that are too long to be meant: what is done with them may take for ever."""
-    if len(entries) > MOST_ENTRIES:
-        raise ConfigError(f'{name} has {len(entries)} entries, at most {MOST_ENTRIES} are taken')
-    longest = max(map(len, entries), default=0)
-    if longest > MOST_ENTRIES:
-        raise ConfigError(
-            f'{name} has an entry of {longest} characters, at most {MOST_ENTRIES} are taken'
-        )
+    for count, what in (
+        (len(entries), 'entries'),
+        *((len(e), 'characters in an entry') for e in entries),
+    ):
+        if count > MOST_ENTRIES:
+            raise ConfigError(f'{name} has {count} {what}, at most {MOST_ENTRIES} are taken')

@@ -11,16 +11,20 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import MOST_ENTRIES, CalibrationError, ConfigError, InputError
-from calib_ros.values import LONGEST_NAME
+from calib_ros.errors import (
+    LONGEST_NAME,
+    MOST_ENTRIES,
+    CalibrationError,
+    ConfigError,
+    InputError,
+)
 
-LARGEST_TEXT = 10_000_000
-"""Bytes of a chain file, calibration, URDF or YAML program."""
+LARGEST_TEXT = 10 * MOST_ENTRIES**2
+"""Bytes of a chain file, calibration, URDF or YAML program: ten lists as long as can be."""
 LARGEST_TABLE = 10 * LARGEST_TEXT
 """Bytes of a table."""
 MOST_ROWS = LARGEST_TABLE // 500
@@ -98,7 +102,7 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     if len(text) > LARGEST_TEXT:
         raise error(f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right one?')
     try:
-        _check(yaml.parse(text, _loader()), where, error)
+        _Weigher(yaml.parse(text, _loader()), where, error).run()
         documents = [each for each in yaml.load_all(text, _loader()) if each is not None]
     except CalibrationError:
         raise
@@ -128,69 +132,56 @@ def _loader() -> Any:
     return Loader
 
 
-@dataclass
-class _Open:
-    """A list or mapping of which the end has not come yet."""
+class _Weigher:
+    """Refuses what would not fit into memory, or is not meant.
 
-    anchor: str | None
-    keyed: bool
-    nodes: int = 1
-    height: int = 0
-    keys: set[str] = field(default_factory=set)
-    ends: int = 0
+    Of the events of a document scalars have a value, lists and mappings a tag, and aliases only
+    an anchor, which ends have not.
+    """
 
-    def hold(self, nodes: int, height: int, key: str | None) -> str | None:
-        """Take in what ended; return the name of a key that comes twice."""
-        self.nodes += nodes
-        self.height = max(self.height, height + 1)
-        self.ends += 1
-        if not self.keyed or self.ends % 2 == 0 or key in (None, '<<'):
-            return None
-        again = key if key in self.keys else None
-        self.keys.add(str(key))
-        return again
+    def __init__(self, events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
+        self._events, self._where, self._error = events, where, error
+        self._anchors: dict[str, tuple[int, int]] = {}
 
+    def run(self) -> None:
+        """Weigh all documents."""
+        for event in self._events:
+            if hasattr(event, 'anchor'):
+                self._node(event, 0)
+            else:
+                self._anchors.clear()
 
-def _check(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
-    """Refuse what would not fit into memory, or is not meant."""
-    above: list[_Open] = []
-    anchors: dict[str, tuple[int, int]] = {}
-    for event in events:
-        kind = type(event).__name__
-        size, anchor, key = (0, 0), None, None
-        if kind in ('SequenceStartEvent', 'MappingStartEvent'):
-            above.append(_Open(event.anchor, kind == 'MappingStartEvent'))
-        elif kind == 'ScalarEvent':
-            size, anchor, key = (1 + len(event.value) // 20, 0), event.anchor, event.value
-        elif kind == 'AliasEvent':
-            if event.anchor not in anchors:
-                raise error(f'{where}: alias "{event.anchor}" stands for nothing before it')
-            size = anchors[event.anchor]
-        elif kind in ('SequenceEndEvent', 'MappingEndEvent'):
-            ended = above.pop()
-            size, anchor = (ended.nodes, ended.height), ended.anchor
+    def _node(self, event: Any, above: int) -> tuple[int, int]:
+        """Return how many values a node has with its aliases written out, and its levels."""
+        if hasattr(event, 'value'):
+            nodes, height = 1 + len(event.value) // 20, 0
+        elif hasattr(event, 'tag'):
+            nodes, height = self._collection(event, above)
+        elif event.anchor in self._anchors:
+            nodes, height = self._anchors[event.anchor]
         else:
-            anchors.clear()
-        if anchor:
-            anchors[anchor] = size
-        _take(above, size, key, where, error)
+            raise self._error(
+                f'{self._where}: alias "{event.anchor}" stands for nothing before it'
+            )
+        if above + height > DEEPEST:
+            raise self._error(f'{self._where} is nested deeper than {DEEPEST} levels')
+        if event.anchor:
+            self._anchors[event.anchor] = nodes, height
+        return nodes, height
 
-
-def _take(
-    above: list[_Open],
-    size: tuple[int, int],
-    key: str | None,
-    where: str,
-    error: type[CalibrationError],
-) -> None:
-    """Let the innermost open list or mapping hold so many nodes, of such a height."""
-    nodes, height = size
-    if len(above) + height > DEEPEST:
-        raise error(f'{where} is nested deeper than {DEEPEST} levels')
-    if not nodes or not above:
-        return
-    again = above[-1].hold(nodes, height, key)
-    if above[-1].nodes > MOST_NODES:
-        raise error(f'{where} has more than {MOST_NODES} values')
-    if again is not None:
-        raise error(f'{where}: key "{again}" comes twice')
+    def _collection(self, event: Any, above: int) -> tuple[int, int]:
+        nodes, height, keys = 1, 1, set()
+        keyed = type(event).__name__ == 'MappingStartEvent'
+        for k, inner in enumerate(self._events if above < DEEPEST else ()):
+            if not hasattr(inner, 'anchor'):
+                break
+            key = getattr(inner, 'value', '<<')
+            if keyed and k % 2 == 0 and key != '<<':
+                if key in keys:
+                    raise self._error(f'{self._where}: key "{key}" comes twice')
+                keys.add(key)
+            more, levels = self._node(inner, above + 1)
+            nodes, height = nodes + more, max(height, levels + 1)
+            if nodes > MOST_NODES:
+                raise self._error(f'{self._where} has more than {MOST_NODES} values')
+        return nodes, height

@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError, UnknownNameError
+from calib_ros.errors import (
+    LONGEST_NAME as LONGEST_NAME,
+    MOST_ENTRIES,
+    CalibrationError,
+    ConfigError,
+    InputError,
+    UnknownNameError,
+)
 
 QUATERNION_TOLERANCE = 1e-3
 """A quaternion whose length differs from 1 by more is refused as not being one."""
@@ -23,10 +30,10 @@ LARGEST = 1e6
 none."""
 LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
-MOST_NAMES = 50
+LARGEST_SETTING = 2.0**31 - 1.0
+"""Largest number that is set; ROS has integers of as many bits."""
+MOST_NAMES = MOST_ENTRIES // 20
 """What a cell has of each kind: joints of a chain, frames, targets, sets of joint names."""
-LONGEST_NAME = LONGEST // 2
-"""Characters of a name, a number or an expression: a message has room for it and more."""
 
 
 def parse_number(
@@ -45,6 +52,33 @@ def parse_number(
     if abs(number) > largest:
         raise error(f'{where} must be at most {largest:g}, not {number:g}')
     return number
+
+
+def parse_like(default: Any, value: object, where: str) -> Any:
+    """Return a value of the type of a default, as YAML, ROS or a command line give it.
+
+    A single text does for a list of texts (tuple), whose empty ones are left out. `where` names
+    the value in the ConfigError for others.
+    """
+    if isinstance(default, bool):
+        if isinstance(value, bool):
+            return value
+        wanted = 'true or false'
+    elif isinstance(default, int | float):
+        number = parse_number(value, where, largest=LARGEST_SETTING)
+        if isinstance(default, float) or number.is_integer():
+            return type(default)(number)
+        wanted = 'a whole number'
+    elif isinstance(default, str):
+        if isinstance(value, str):
+            return value
+        raise ConfigError(f'{where} must be text, not {value!r:.100}: write it in quotes')
+    else:
+        texts = value if isinstance(value, list | tuple) else (value,)
+        if all(isinstance(each, str) for each in texts):
+            return tuple(filter(None, texts))
+        wanted = "a list of texts such as ['a', 'b']"
+    raise ConfigError(f'{where} must be {wanted}, not {value!r:.100}')
 
 
 def parse_mapping(

@@ -18,7 +18,6 @@ to o5 say nothing while M is singular: there the choice by `d` is where exchange
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -32,11 +31,9 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import CRITERIA, Criterion
 
-Score: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
-"""Returns the worth (N,) of candidates from information (P, P) and their rows (N, m, P)."""
-
-Bound: TypeAlias = Callable[[FloatArray, Callable[[FloatArray], FloatArray]], FloatArray]
-"""Returns what no worth (N,) passes, from information and K -> tr A K A^T (N,), K symmetric."""
+INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
+Traces: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Returns tr A K A^T (N,) of all candidates with a symmetric matrix K (P, P)."""
 
 
 def choose(
@@ -61,17 +58,17 @@ def choose(
     if count < 1:
         raise ConfigError(f'at least one pose must be chosen, not {count}')
     space = Candidates(design, candidates)
-    score, bound = _score(space, criterion, task)
-    first = (score, bound) if criterion == 'task' else (_by_determinant, _determinant_at_most)
+    worth = _Worth(space, criterion, task)
+    first = worth if criterion == 'task' else _Worth(space, 'd')
     pick = _Pick(space, apart)
     told(f'{count} poses')
     for k in range(count):
-        pick.add(pick.best(*first) if start is None else int(start[k]))
+        pick.add(pick.best(first) if start is None else int(start[k]))
     rounds = 1
-    while exchanged and pick.exchange(score, bound):
+    while exchanged and pick.exchange(worth):
         rounds += 1
         told(f'{count} poses, exchange {rounds}')
-    return pick.in_order(first[0])
+    return pick.in_order(first)
 
 
 class _Pick:
@@ -90,7 +87,7 @@ class _Pick:
         self.information = self._start
         self.chosen: list[int] = []
 
-    def best(self, score: Score, bound: Bound) -> int:
+    def best(self, worth: _Worth) -> int:
         """Return the best candidate that is free to be chosen."""
         free = np.flatnonzero(self._blocked == 0)
         if not free.size:
@@ -98,12 +95,12 @@ class _Pick:
                 f'only {len(self.chosen)} of {len(self._rows)} candidates are {self._apart:g} '
                 'apart from each other: give more candidates, or plan fewer poses'
             )
-        most = bound(self.information, self._traces)[free]
+        most = worth.at_most(self.information, self._traces)[free]
         few = min(int(np.sqrt(free.size)), free.size - 1)
         likely = free[np.argpartition(-most, few)[: few + 1]]
-        least = score(self.information, self._rows[likely]).max()
+        least = worth.of(self.information, self._rows[likely]).max()
         promising = free[most >= least - HALF_THE_DIGITS * abs(least)]
-        return int(promising[score(self.information, self._rows[promising]).argmax()])
+        return int(promising[worth.of(self.information, self._rows[promising]).argmax()])
 
     def add(self, index: int, place: int | None = None) -> None:
         """Choose a candidate."""
@@ -114,7 +111,7 @@ class _Pick:
         self._blocked += near
         self.information = self.information + information_of(self._rows[index])
 
-    def exchange(self, score: Score, bound: Bound) -> bool:
+    def exchange(self, worth: _Worth) -> bool:
         """Exchange every chosen candidate for the best one; return whether any was changed."""
         rows = self._rows[self.chosen]
         self.information = self._start + information_of(rows)  # no rounding left
@@ -123,20 +120,20 @@ class _Pick:
             old = self.chosen.pop(place)
             self._blocked -= self._near.pop(place)
             self.information = self.information - information_of(self._rows[old])
-            new = self.best(score, bound)
-            worth = score(self.information, self._rows[[new, old]])
-            if worth[0] - worth[1] > HALF_THE_DIGITS * abs(worth[1]):
+            new = self.best(worth)
+            ours, theirs = worth.of(self.information, self._rows[[new, old]])
+            if ours - theirs > HALF_THE_DIGITS * abs(theirs):
                 changed = True
             else:
                 new = old
             self.add(new, place)
         return changed
 
-    def in_order(self, score: Score) -> NDArray[np.intp]:
+    def in_order(self, worth: _Worth) -> NDArray[np.intp]:
         """Return the chosen, the best first."""
         left, ordered, information = list(self.chosen), [], self._start
         while left:
-            best = left.pop(int(score(information, self._rows[left]).argmax()))
+            best = left.pop(int(worth.of(information, self._rows[left]).argmax()))
             information = information + information_of(self._rows[best])
             ordered.append(best)
         return np.array(ordered)
@@ -147,84 +144,63 @@ class _Pick:
         return np.asarray(self._each @ twice[self._upper])
 
 
-def _score(
-    space: Candidates, criterion: Criterion, task: FloatArray | None
-) -> tuple[Score, Bound]:
-    """Return the score of a criterion, and its bound."""
-    if criterion not in CRITERIA:
-        raise UnknownNameError('criterion', criterion, CRITERIA)
-    if criterion == 'd':
-        return _by_determinant, _determinant_at_most
-    if criterion != 'task':
-        return partial(_by_index, criterion=criterion, factor=space.factor), _unbounded
-    if task is None:
-        raise ConfigError('the criterion "task" needs the poses of a task')
-    wanted = space.of_task(task)
-    return partial(_by_task, wanted=wanted), partial(_task_at_most, wanted=wanted)
+class _Worth:
+    """What candidates are worth by a criterion."""
 
+    def __init__(
+        self, space: Candidates, criterion: Criterion, task: FloatArray | None = None
+    ) -> None:
+        if criterion not in CRITERIA:
+            raise UnknownNameError('criterion', criterion, CRITERIA)
+        if criterion == 'task' and task is None:
+            raise ConfigError('the criterion "task" needs the poses of a task')
+        self._criterion, self._factor = criterion, space.factor
+        self._wanted = None
+        if criterion == 'task' and task is not None:
+            self._wanted = space.of_task(task)
 
-def _by_determinant(information: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return ln det(I + A C A^T)."""
-    seen = times(rows, _root(information))
-    return np.asarray(np.linalg.slogdet(_with_unit(seen))[1])
+    def of(self, information: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the worth (N,) of candidates with rows (N, m, P) from information (P, P)."""
+        if self._criterion in INDICES:
+            return self._index(information, rows)
+        root = _root(information)
+        seen = times(rows, root)
+        turned = np.swapaxes(seen, 1, 2)
+        whole = np.eye(seen.shape[1]) + seen @ turned
+        if self._wanted is None:
+            return np.asarray(np.linalg.slogdet(whole)[1])
+        spread = times(seen, root.T @ self._wanted @ root) @ turned
+        return np.asarray(np.trace(np.linalg.solve(whole, spread), axis1=1, axis2=2))
 
+    def at_most(self, information: FloatArray, traces: Traces) -> FloatArray:
+        """Return what no worth (N,) passes: ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
+        if self._criterion in INDICES:  # every candidate is judged in full
+            return np.full_like(traces(information), np.inf)
+        root = _root(information)
+        inverse = root @ root.T
+        if self._wanted is None:
+            return np.asarray(6.0 * np.log1p(traces(inverse) / 6.0))
+        return traces(inverse @ self._wanted @ inverse)  # without (I + A C A^T)^-1
 
-def _determinant_at_most(
-    information: FloatArray, traces: Callable[[FloatArray], FloatArray]
-) -> FloatArray:
-    """Return a bound of `_by_determinant`: ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
-    root = _root(information)
-    return np.asarray(6.0 * np.log1p(traces(root @ root.T) / 6.0))
-
-
-def _task_at_most(
-    information: FloatArray, traces: Callable[[FloatArray], FloatArray], wanted: FloatArray
-) -> FloatArray:
-    """Return a bound of `_by_task`: without (I + A C A^T)^-1."""
-    root = _root(information)
-    inverse = root @ root.T
-    return traces(inverse @ wanted @ inverse)
-
-
-def _unbounded(information: FloatArray, traces: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Return no bound: every candidate is judged in full."""
-    return np.full_like(traces(information), np.inf)
-
-
-def _by_task(information: FloatArray, rows: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return tr (I + A C A^T)^-1 A C V C A^T."""
-    root = _root(information)
-    seen = times(rows, root)
-    spread = times(seen, root.T @ wanted @ root) @ np.swapaxes(seen, 1, 2)
-    return np.asarray(np.trace(np.linalg.solve(_with_unit(seen), spread), axis1=1, axis2=2))
-
-
-def _by_index(
-    information: FloatArray, rows: FloatArray, criterion: Criterion, factor: FloatArray
-) -> FloatArray:
-    """Return an observability index of M + A^T A, in sigma per metre or radian."""
-    back = times(rows, factor)
-    total = factor.T @ information @ factor + np.swapaxes(back, 1, 2) @ back
-    singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
-    smallest, largest = singular[:, 0], singular[:, -1]
-    found = {
-        'o2': smallest / largest,
-        'o3': smallest,
-        'o4': smallest**2 / largest,
-        'o5': 1.0 / np.sum(1.0 / singular, axis=1),
-    }
-    return np.asarray(found[criterion])
+    def _index(self, information: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return an observability index of M + A^T A, in sigma per metre or radian."""
+        back = times(rows, self._factor)
+        total = self._factor.T @ information @ self._factor + np.swapaxes(back, 1, 2) @ back
+        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
+        smallest, largest = singular[:, 0], singular[:, -1]
+        found = {
+            'o2': smallest / largest,
+            'o3': smallest,
+            'o4': smallest**2 / largest,
+            'o5': 1.0 / np.sum(1.0 / singular, axis=1),
+        }
+        return np.asarray(found[self._criterion])
 
 
 def _root(information: FloatArray) -> FloatArray:
     """Return L (P, P) with L L^T = M^-1."""
     lower = linalg.cholesky(information, lower=True)
     return np.asarray(linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
-
-
-def _with_unit(seen: FloatArray) -> FloatArray:
-    """Return I + Y Y^T (N, m, m) of (N, m, P)."""
-    return np.asarray(np.eye(seen.shape[1]) + seen @ np.swapaxes(seen, 1, 2))
 
 
 def efficiency(

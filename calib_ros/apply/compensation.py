@@ -31,9 +31,9 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
-EXACT, COMPROMISE = 1e-6, 0.02
-"""Orientation errors [rad] tolerated of arms that can reach every orientation, and of others.
-By the former [rad or m] a command may lie beyond a limit, or a correction change at any time."""
+EXACT = Limits.largest_position_error
+"""By so much [rad or m] a command may lie beyond a limit, a correction change at any time, and the
+orientation be wrong of arms that can reach every one."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,13 +62,13 @@ class Compensator(Shown, Limits):
     def __post_init__(self) -> None:
         """Refuse chains that are not of one robot, and limits that are none."""
         ours, theirs = (
-            [(joint.name, joint.type) for joint in chain.joints]
+            ', '.join(f'{joint.name} ({joint.type})' for joint in chain.joints)
             for chain in (self.nominal, self.calibrated)
         )
         if ours != theirs:
             raise ConfigError(
                 'the nominal and the calibrated chain must have the same joints in one order, not '
-                f'{_listed(ours)} and {_listed(theirs)}'
+                f'{ours} and {theirs}'
             )
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():
             raise ConfigError(f'tool must be three finite numbers [m], not {self.tool}')
@@ -156,7 +156,11 @@ def compensate(
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))
     result = refused(result, _unreached(compensator, result))
-    return refused(result, _jumps(compensator, result))
+    moves, changes = (
+        np.abs(np.diff(each, axis=0)) for each in (result.command, result.correction)
+    )  # NaN beside refused samples
+    words = 'jumps by {:.4g} while the joints move by {:.4g} at most'
+    return refused(result, too_fast(compensator, changes, moves, words, first=1))
 
 
 def in_words(compensator: Compensator, result: Compensation) -> str:
@@ -207,7 +211,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     follower, names = compensator.follower, compensator.nominal.joint_names
     tolerated = compensator.largest_orientation_error
     if tolerated is None:
-        tolerated = EXACT if follower.complete else COMPROMISE
+        tolerated = EXACT if follower.complete else 0.02  # as `Limits` promises
     command, correction = result.command, result.correction
     beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
@@ -243,29 +247,22 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     return found
 
 
-def _jumps(compensator: Compensator, result: Compensation) -> list[Refusal]:
-    """Return the samples whose correction jumps against that of the sample before."""
-    moves, changes = (
-        np.abs(np.diff(each, axis=0)) for each in (result.command, result.correction)
-    )  # NaN beside refused samples
-    return [
-        Refusal(
-            k + 1,
-            f'the correction of {compensator.nominal.joint_names[i]} jumps by {changes[k, i]:.4g} '
-            f'while the joints move by {moves[k].max():.4g} at most',
-        )
-        for k, i in too_fast(compensator, changes, moves)
-    ]
-
-
 def too_fast(
-    compensator: Compensator, changes: FloatArray, moves: FloatArray
-) -> list[tuple[int, int]]:
-    """Return sample and joint where a correction changes (N, n) too much for its moves (N, n)."""
+    compensator: Compensator, changes: FloatArray, moves: FloatArray, words: str, first: int = 0
+) -> list[Refusal]:
+    """Return the samples, the `first` of them and on, whose correction changes too much.
+
+    `changes` (N, n) of it are held against `moves` (N, n) of the joints, both positive; `words`
+    have places for the change and the move.
+    """
     shares = (changes - EXACT) / compensator.largest
     allowed = compensator.largest_change * (moves / compensator.largest).max(axis=1)
-    rows = np.flatnonzero(shares.max(axis=1) > allowed)
-    return [(k, int(shares[k].argmax())) for k in rows.tolist()]
+    names, found = compensator.nominal.joint_names, []
+    for k in np.flatnonzero(shares.max(axis=1) > allowed).tolist():
+        i = int(shares[k].argmax())
+        said = words.format(changes[k, i], moves[k].max())
+        found.append(Refusal(first + k, f'the correction of {names[i]} {said}'))
+    return found
 
 
 def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
@@ -276,7 +273,3 @@ def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
     new = [refusal for refusal in more if refusal.sample not in known]
     refusals = sorted([*result.refusals, *new], key=lambda refusal: refusal.sample)
     return replace(result, joints=joints, refusals=tuple(refusals))
-
-
-def _listed(joints: Sequence[tuple[str, str]]) -> str:
-    return ', '.join(f'{name} ({kind})' for name, kind in joints)

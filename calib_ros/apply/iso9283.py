@@ -24,8 +24,6 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.se3 import FloatArray
 
-FIRST_EDGE, GROWTHS = 0.02, 1.3**0.5 ** np.arange(5)
-"""Edge [m] of the first cube, and by how much it grows at a time, finer and finer."""
 CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 PLANE = [7, 5, 0, 2]
 """Corners of the plane x = z of the cube, round about."""
@@ -58,17 +56,17 @@ def iso_9283_poses(
     rng: np.random.Generator,
     visibility: Visibility | None = None,
     centres: int = 500,
+    edge: float = 0.02,
 ) -> TestPoses:
     """Return the test poses in the largest cube that the arm reaches, and the device sees.
 
-    Cubes are grown about so many reachable centres. An arm that keeps its orientation in none, as
-    with fewer than six joints, is refused.
+    Cubes are grown about so many reachable centres, from this `edge` [m] on. An arm that
+    keeps its orientation in none, as with fewer than six joints, is refused.
     """
     middle = draw_candidates(design, centres, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)
-    edge = FIRST_EDGE
     cubes = _at(design, visibility, _Cubes(design.targets(middle), middle, start), edge)
-    for factor in GROWTHS:
+    for factor in 1.3**0.5 ** np.arange(5):  # finer and finer
         while len((grown := _at(design, visibility, cubes, edge * factor)).centres):
             cubes, edge = grown, edge * factor
     if not len(cubes.centres):

@@ -77,7 +77,12 @@ def place(
     solved from so many `starts` out of random joint values `drawn`.
     """
     search = _Search(arm, task, aim, model, starts, drawn, told)
-    corners = search.within(region)
+    corners = search.reach if region is None else region
+    if not (corners[0] <= corners[1]).all():
+        raise InputError(
+            f'the region from {corners[0].tolist()} to {corners[1].tolist()} is empty: give the '
+            'lower corner first'
+        )
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
     angles = 2.0 * np.pi * np.arange(turns) / turns
     grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
@@ -93,21 +98,20 @@ def place(
     step = (corners[1] - corners[0]) / max(cells - 1, 1)
     for left in reversed(range(refinements)):
         step /= 2.0
-        near = _around(grid[np.nanargmin(errors)], step, corners)
+        best = grid[np.nanargmin(errors)]
+        near = np.tile(best, (len(STEPS), 1))
+        near[:, :3] = np.clip(best[:3] + step * STEPS, corners[0], corners[1])
         more = search.errors(near, left * len(STEPS))
         both = zip((grid, errors, joints), (near, *more), strict=True)
         grid, errors, joints = map(np.concatenate, both)
     return Placements(grid[:, :3], grid[:, 3], errors, joints, int(np.nanargmin(errors)), centre)
 
 
-def _around(best: FloatArray, step: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return the placements (26, 4) a step (3,) away from the best (4,), within corners (2, 3)."""
-    places = np.clip(best[:3] + step * STEPS, corners[0], corners[1])
-    return np.column_stack([places, np.full(len(places), best[3])])
-
-
 class _Search:
-    """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad]."""
+    """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad].
+
+    All that the arm reaches is within the corners (2, 3) of its `reach` [m].
+    """
 
     def __init__(
         self,
@@ -128,18 +132,7 @@ class _Search:
         self._known = self._chain.random_joints(drawn, np.random.default_rng(0))
         poses = in_base(self._chain, self._known)
         self._tree = cKDTree(_features(poses))
-        self._reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
-
-    def within(self, region: FloatArray | None) -> FloatArray:
-        """Return the corners (2, 3) [m] of the region, or of all that the arm reaches."""
-        if region is None:
-            return self._reach
-        if not (region[0] <= region[1]).all():
-            raise InputError(
-                f'the region from {region[0].tolist()} to {region[1].tolist()} is empty: give the '
-                'lower corner first'
-            )
-        return region
+        self.reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
 
     def errors(self, placements: FloatArray, later: int) -> tuple[FloatArray, FloatArray]:
         """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n).

@@ -21,35 +21,6 @@ from calib_ros.settings import Criterion
 from calib_ros.shown import Shown, as_frame
 
 
-@dataclass(frozen=True, eq=False)
-class Suggestion:
-    """The next pose to measure, joint values (n,) [rad or m], and what it brings.
-
-    `now` and `then` are the RMS position errors [m] predicted at the task poses without and with
-    it, infinite while parameters are not determined; `enough` tells that it is as small as wanted.
-    """
-
-    joints: FloatArray
-    now: float
-    then: float
-    enough: bool
-
-
-def next_pose(
-    design: Design,
-    candidates: FloatArray,
-    task: FloatArray,
-    wanted: float,
-) -> Suggestion:
-    """Return the next best pose of candidates (N, n), after those that the design knows.
-
-    `task` (T, n) are poses at which the RMS error of position is to be `wanted` [m].
-    """
-    index = choose(design, candidates, 1)
-    now, then = predicted(design, task), predicted(design.after(candidates[index]), task)
-    return Suggestion(candidates[index[0]], now, then, now <= wanted)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Shown):
     """Poses to measure, and what they promise.

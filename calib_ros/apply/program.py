@@ -81,7 +81,9 @@ def compensate_program(
     held = result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1)
     reason = 'a joint is held at its limit, where its velocity is not defined'
     result = refused(result, [Refusal(k, reason) for k in np.flatnonzero(held).tolist()])
-    result = refused(result, _swings(compensator, result, speeds, velocities - speeds))
+    swings = np.where(np.isnan(result.joints), 0.0, np.abs(velocities - speeds))
+    words = 'moves at {:.4g} while the joints move at {:.4g} a second at most'
+    result = refused(result, too_fast(compensator, swings, np.abs(speeds), words))
     gaps = np.where(np.isnan(result.joints), np.nan, 0.0)
     return (
         replace(
@@ -99,24 +101,6 @@ def approaches(positions: FloatArray) -> FloatArray:
     moves = np.sign(np.diff(positions, axis=0, prepend=positions[:1]))
     last = np.where(moves != 0.0, np.arange(len(moves))[:, np.newaxis], 0)
     return np.asarray(np.take_along_axis(moves, np.maximum.accumulate(last, axis=0), axis=0))
-
-
-def _swings(
-    compensator: Compensator, result: Compensation, speeds: FloatArray, changes: FloatArray
-) -> list[Refusal]:
-    """Return the samples whose correction changes (N, n) too fast for their speeds (N, n).
-
-    The limit is that of jumps, which samples far from each other do not show.
-    """
-    sizes, moves = np.where(np.isnan(result.joints), 0.0, np.abs(changes)), np.abs(speeds)
-    return [
-        Refusal(
-            k,
-            f'the correction of {compensator.nominal.joint_names[i]} moves at {sizes[k, i]:.4g} '
-            f'while the joints move at {moves[k].max():.4g} a second at most',
-        )
-        for k, i in too_fast(compensator, sizes, moves)
-    ]
 
 
 def _derivatives(

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,14 +79,13 @@ def measure(
     )
 
 
-LENS = Lens(1350.0, 1355.0, 795.0, 605.0, -0.12, 0.15, 0.001, -0.001, -0.05)
-
-
 @dataclass(frozen=True)
 class Camera:
     """A camera, and how boards are held before it, up to `tilt` from facing it: px, m, rad."""
 
-    lens: Lens = LENS
+    lens: Lens = field(
+        default=Lens(1350.0, 1355.0, 795.0, 605.0, -0.12, 0.15, 0.001, -0.001, -0.05)
+    )
     width: int = 1600
     height: int = 1200
     depth: float = 0.7

@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.apply.iso9283 import PLANE
-from calib_ros.errors import ConfigError, InputError
+from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import configurations
 from calib_ros.identification.fingerprint import reused_in_words
@@ -49,19 +49,15 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
+from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
 NEEDED = 1 + len(PLANE)
 """Configurations from which a verdict is given, those of a fitted frame not counted: the test
 poses of ISO 9283."""
-DECIDING = 10_000
+DECIDING = 10 * MOST_ENTRIES
 """Configurations up to which it is said how many would decide."""
-LOST = {'base': 2, 'tool': 1}
-"""Configurations whose errors a fitted frame takes up: a base has six freedoms, each configuration
-three; the turn of a tool does not move the target."""
-UNIT = (1e-3, 1e-3)
-"""Sigmas [m, rad] that weigh all samples alike."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +170,8 @@ def verify(
         Of the verdict.
     new_base, new_tool : bool
         The measuring device stands elsewhere than for the calibration; another target is on the
-        flange, or the same was mounted anew. Their frames are fitted, which costs freedom (LOST).
+        flange, or the same was mounted anew. Their frames are fitted, and each takes up
+        the errors of as many configurations, of three freedoms each, as it has freedoms.
     told : Told
         Of the share that is done.
     commanded : (M, n), optional
@@ -194,15 +191,17 @@ def verify(
     told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
-    lost = sum(LOST[frame] for frame in fitted)
+    in_base, in_tool = 6 // 3, 3 // 3  # freedoms; the turn of a tool does not move the target
+    lost = new_base * in_base + new_tool * in_tool
     rms = _rms(moments, lost)
-    numbers = np.unique(np.geomspace(len(moments), DECIDING, 200).astype(int))
+    most = max(len(moments), DECIDING)
+    numbers = np.unique(np.geomspace(len(moments), most, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
-        common = _rms(moments_of(left, group), LOST['base'], least=0) / rms
+        common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, arm.holds(rms), arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
@@ -303,10 +302,10 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
     names = [name for each in sets for name in parameters_of(each.tool)[:3]]
     if 'base' in fitted:
         names = [name for each in sets for name in parameters_of(each.base)] + names
-    none = [np.zeros(len(each), dtype=bool) for each in sets]
-    plain = [replace(s, oriented=n, covariance=None) for s, n in zip(sets, none, strict=True)]
-    system = System(tuple(Samples(each, *UNIT) for each in plain))
-    names = list(dict.fromkeys(names))
+    names = [*dict.fromkeys(names)]
+    plain = [replace(s, oriented=np.zeros_like(s.oriented), covariance=None) for s in sets]
+    sigmas = Settings.sigma_position, Settings.sigma_orientation  # alike for all
+    system = System(tuple(Samples(each, *sigmas) for each in plain))
     known = excited(triangular_factor(chain, names, system), names)
     chain = minimise(chain, known, system).chain
     for tool in dict.fromkeys(each.tool for each in sets):
@@ -386,8 +385,8 @@ def remarks(found: Verification) -> list[str]:
         lines.append(f'{enough} poses with the same RMS error would decide')
     if found.tolerance is None and found.holds is False:
         lines.append(
-            'the calibration does not hold any more: the error is larger than it was then. Was '
-            'the tracker, the target or the robot moved?'
+            'the error is larger than it was when the calibration was made: was the tracker, the '
+            'target or the robot moved?'
         )
     if found.common < NEARER:
         lines.append(

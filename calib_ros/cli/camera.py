@@ -7,15 +7,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 
-import numpy as np
-
 from calib_ros.atomic import write_file, write_together
 from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.detector import detect, marker_cells
+from calib_ros.files.detector import black_of, detect
 from calib_ros.files.images import SUFFIXES, Image, files_of, image_of, read_image
 from calib_ros.kinematics.chain_file import dump_yaml
 
@@ -26,17 +24,7 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     keys = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary')
     content = {key: getattr(options, key) for key in keys}
     board = Board(**content)
-    rows: list[tuple[float, float, float, float]] = []
-    if board.type == 'charuco':
-        x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
-        black = np.column_stack([x.ravel(), y.ravel()])[(x + y).ravel() % 2 == 0]
-        rows += [(board.square * i, board.square * j, *[board.square] * 2) for i, j in black]
-    for cells, (left, top) in zip(marker_cells(board), board.markers.tolist(), strict=True):
-        size = board.marker / len(cells)
-        for k, row in enumerate(cells):  # runs of black cells: no white lines between them
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], row, [0]])))
-            for first, last in edges.reshape(-1, 2).tolist():
-                rows.append((left + first * size, top + k * size, (last - first) * size, size))
+    black = black_of(board)
     if options.out.suffix.lower() != '.pdf':
         raise InputError(f'--out must end in .pdf, not {options.out.name}')
     width, height = (1e3 * side for side in board.size)
@@ -44,7 +32,7 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     words += f'{width:.2f} x {height:.2f} mm: print in true size (100 %)'
     described = options.out.with_suffix('.yaml')
     common.refuse_existing(options, options.out, described)
-    drawn = {options.out: board_pdf(np.array(rows), board.size, words)}
+    drawn = {options.out: board_pdf(black, board.size, words)}
     write_together({**drawn, described: dump_yaml(content)}, overwrite=options.force)
     printed = f'{width:.2f} x {height:.2f} mm'
     screen.say(f'wrote {options.out} and {described}: {printed}; measure the print')

@@ -16,13 +16,11 @@ if TYPE_CHECKING:
 class Command(NamedTuple):
     """How to `add` the options of a command to a parser, and its `home`: MODULE.FUNCTION.
 
-    `examples` are whole commands for the foot of its help, without "calib_ros". Neither options
-    nor help need what the command works with.
+    Neither options nor help need what the command works with.
     """
 
     add: Callable[[argparse.ArgumentParser], None]
     home: str
-    examples: tuple[str, ...]
 
     def run(self, options: Any, screen: Screen) -> int:
         """Run the command and return the exit status."""

@@ -5,17 +5,12 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
 
 from calib_ros.cli import options as common
 from calib_ros.cli.command import Command
-from calib_ros.settings import (
-    AIMS,
-    CRITERIA,
-    EXCEPTION,
-    MODELS,
-    Limits,
-)
+from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, Limits
 
 
 def _add_chain(parser: argparse.ArgumentParser) -> None:
@@ -148,11 +143,27 @@ def _add_identify(parser: argparse.ArgumentParser) -> None:
     common.add_history(group)
     group.add_argument('--json', action='store_true', help='print the result as JSON')
     group.add_argument('--tolerance', type=float, metavar='MM', help='wanted RMS position error')
-    common.add_detections(parser)
+    group = parser.add_argument_group('what a camera saw (docs/images.md)')
+    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
+    common.add_each(
+        group,
+        Path,
+        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
+        ('--board', 'FILE', None, 'YAML of that board'),
+        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
+        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
+    )
+    text = 'fit the intrinsics as well; else given'
+    group.add_argument('--lens', choices=('given', 'fitted'), help=text)
     common.add_settings(parser)
     common.add_layout(parser)
     common.add_identity(parser, pdf=True)
-    common.add_previous(parser)
+    group = parser.add_argument_group('an earlier calibration (docs/history.md)')
+    text = 'bring this one up to date by a few poses, and say what has changed since'
+    group.add_argument('--previous', type=Path, metavar='CALIBRATION', help=text)
+    text, growth = 'by which lengths wander in a year; angles by twice as many mrad', 1e3 * GROWTH
+    group.add_argument('--growth', type=float, default=growth, metavar='MM', help=text)
+    common.add_moved(group)
 
 
 def _add_verify(parser: argparse.ArgumentParser) -> None:
@@ -196,27 +207,11 @@ def _add_compensate(parser: argparse.ArgumentParser) -> None:
     common.add_chain(group)
     common.add_calibration(group)
     common.add_out(group, 'the corrected program', 'FILE', needed=True)
-    add = parser.add_argument_group('limits').add_argument
+    limits = parser.add_argument_group('limits')
     text, axes = 'point in the flange frame whose position counts [m]', ('X', 'Y', 'Z')
-    add('--tool', nargs=3, type=float, default=[0.0, 0.0, 0.0], metavar=axes, help=text)
-    for name, text in (
-        ('largest_turn', 'largest correction of a revolute joint [rad]'),
-        ('largest_shift', 'largest correction of a prismatic joint [m]'),
-        ('largest_position_error', 'position error that may remain [m]'),
-        (
-            'largest_orientation_error',
-            'orientation error that may remain [rad]; if not given 1e-6, or 0.02 for arms that '
-            'cannot reach every orientation',
-        ),
-        (
-            'orientation_weight',
-            'position error that counts as much as one radian, where both cannot vanish '
-            '[m/rad]; if not given 0.3, or 0.001 for arms that cannot reach every orientation',
-        ),
-        ('largest_change', 'largest change of the correction relative to the move'),
-    ):
-        option, default = f'--{name.replace("_", "-")}', getattr(Limits, name)
-        add(option, type=float, default=default, metavar='X', help=text)
+    none = [0.0, 0.0, 0.0]
+    limits.add_argument('--tool', nargs=3, type=float, default=none, metavar=axes, help=text)
+    common.add_fields(limits, fields(Limits))
 
 
 def _add_export(parser: argparse.ArgumentParser) -> None:
@@ -281,110 +276,65 @@ def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
     common.add_settings(parser, common.OF_BAGS)
 
 
+EXAMPLES = """
+robots
+chain ur10e
+chain robot.urdf --tip-link tool0 --out robot.yaml
+demo
+demo --chain franka_panda --out demo_panda/
+simulate cell_bag --chain kuka_iiwa14 --poses 60
+board charuco --columns 9 --rows 7 --square 0.03 --marker 0.022 --out board.pdf
+images photographs/ --board board.yaml --out corners.csv
+plan --chain ur10e --accuracy 0.1 --out plan.csv
+plan --chain ur10e --poses 40 --tracker 3 0 1 --cone 45 --out plan.csv
+plan --chain ur10e --iso9283 --out tests.csv
+fleet plant.yaml --history history/ --out report/
+fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786
+history history/ --robot 0042
+identify measured.csv --chain ur10e --out result/
+identify recording/ --chain robot.urdf --out result/ --model auto
+identify export.csv --chain ur10e --length mm --angle deg --euler ZYX
+identify measured.csv --chain ur10e --session monday --json
+verify new.csv --chain ur10e --calibration result/
+verify recording/ --chain ur10e --calibration result/ --tolerance 0.3
+verify new.csv --chain ur10e --calibration result/ --commanded tests.csv
+compare monday/ tuesday/
+compare before.yaml after.yaml --json
+compensate program.csv --chain ur10e --calibration result/ --out corrected.csv
+compensate path.yaml --chain ur10e --calibration result/ --out corrected.yaml
+export result/calibration.yaml --chain ur10e --out export/
+export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/
+workspace result/ --chain ur10e --out map/
+workspace result/ --chain ur10e --task task.csv --out map/ --aim worst
+bag2csv recording/ measured.csv --chain ur10e
+csv2bag measured.csv measured_bag --chain ur10e --session monday
+import export.csv --length mm --angle deg --euler ZYX --out measured.csv
+import export.csv --preset optitrack --joints log.csv --joints-preset kuka --out measured.csv
+"""
+"""For the foot of each help, without "calib_ros"."""
+
 COMMANDS = {
-    'robots': Command(lambda parser: None, 'robots._robots', ('robots',)),
-    'chain': Command(
-        _add_chain,
-        'robots._chain',
-        ('chain ur10e', 'chain robot.urdf --tip-link tool0 --out robot.yaml'),
-    ),
-    'demo': Command(
-        _add_demo, 'simulate._demo', ('demo', 'demo --chain franka_panda --out demo_panda/')
-    ),
-    'simulate': Command(
-        _add_simulate, 'simulate._run', ('simulate cell_bag --chain kuka_iiwa14 --poses 60',)
-    ),
-    'board': Command(
-        _add_board,
-        'camera._board',
-        ('board charuco --columns 9 --rows 7 --square 0.03 --marker 0.022 --out board.pdf',),
-    ),
-    'images': Command(
-        _add_images,
-        'camera._images',
-        ('images photographs/ --board board.yaml --out corners.csv',),
-    ),
-    'plan': Command(
-        _add_plan,
-        'plan._run',
-        (
-            'plan --chain ur10e --accuracy 0.1 --out plan.csv',
-            'plan --chain ur10e --poses 40 --tracker 3 0 1 --cone 45 --out plan.csv',
-            'plan --chain ur10e --iso9283 --out tests.csv',
-        ),
-    ),
-    'fleet': Command(
-        _add_fleet,
-        'fleet._run_fleet',
-        (
-            'fleet plant.yaml --history history/ --out report/',
-            'fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786',
-        ),
-    ),
-    'history': Command(_add_history, 'fleet._run_history', ('history history/ --robot 0042',)),
-    'identify': Command(
-        _add_identify,
-        'identify._run',
-        (
-            'identify measured.csv --chain ur10e --out result/',
-            'identify recording/ --chain robot.urdf --out result/ --model auto',
-            'identify export.csv --chain ur10e --length mm --angle deg --euler ZYX',
-            'identify measured.csv --chain ur10e --session monday --json',
-        ),
-    ),
-    'verify': Command(
-        _add_verify,
-        'verify._run',
-        (
-            'verify new.csv --chain ur10e --calibration result/',
-            'verify recording/ --chain ur10e --calibration result/ --tolerance 0.3',
-            'verify new.csv --chain ur10e --calibration result/ --commanded tests.csv',
-        ),
-    ),
-    'compare': Command(
-        _add_compare,
-        'compare._run',
-        ('compare monday/ tuesday/', 'compare before.yaml after.yaml --json'),
-    ),
-    'compensate': Command(
-        _add_compensate,
-        'compensate._run',
-        (
-            'compensate program.csv --chain ur10e --calibration result/ --out corrected.csv',
-            'compensate path.yaml --chain ur10e --calibration result/ --out corrected.yaml',
-        ),
-    ),
-    'export': Command(
-        _add_export,
-        'export._run',
-        (
-            'export result/calibration.yaml --chain ur10e --out export/',
-            'export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/',
-        ),
-    ),
-    'workspace': Command(
-        _add_workspace,
-        'workspace._run',
-        (
-            'workspace result/ --chain ur10e --out map/',
-            'workspace result/ --chain ur10e --task task.csv --out map/ --aim worst',
-        ),
-    ),
-    'bag2csv': Command(
-        _add_bag2csv, 'convert._bag2csv', ('bag2csv recording/ measured.csv --chain ur10e',)
-    ),
-    'csv2bag': Command(
-        _add_csv2bag,
-        'convert._csv2bag',
-        ('csv2bag measured.csv measured_bag --chain ur10e --session monday',),
-    ),
-    'import': Command(
-        _add_import,
-        'convert._convert',
-        (
-            'import export.csv --length mm --angle deg --euler ZYX --out measured.csv',
-            'import export.csv --preset optitrack --joints log.csv --joints-preset kuka '
-            '--out measured.csv',
-        ),
-    ),
+    'robots': Command(lambda parser: None, 'robots._robots'),
+    'chain': Command(_add_chain, 'robots._chain'),
+    'demo': Command(_add_demo, 'simulate._demo'),
+    'simulate': Command(_add_simulate, 'simulate._run'),
+    'board': Command(_add_board, 'camera._board'),
+    'images': Command(_add_images, 'camera._images'),
+    'plan': Command(_add_plan, 'plan._run'),
+    'fleet': Command(_add_fleet, 'fleet._run_fleet'),
+    'history': Command(_add_history, 'fleet._run_history'),
+    'identify': Command(_add_identify, 'identify._run'),
+    'verify': Command(_add_verify, 'verify._run'),
+    'compare': Command(_add_compare, 'compare._run'),
+    'compensate': Command(_add_compensate, 'compensate._run'),
+    'export': Command(_add_export, 'export._run'),
+    'workspace': Command(_add_workspace, 'workspace._run'),
+    'bag2csv': Command(_add_bag2csv, 'convert._bag2csv'),
+    'csv2bag': Command(_add_csv2bag, 'convert._csv2bag'),
+    'import': Command(_add_import, 'convert._convert'),
 }
+
+
+def examples_of(name: str) -> list[str]:
+    """Return whole commands of a name."""
+    return [line for line in EXAMPLES.splitlines() if line.split()[:1] == [name]]

@@ -10,7 +10,6 @@ import numpy as np
 
 from calib_ros.atomic import write_file
 from calib_ros.cli import given, options as common
-from calib_ros.cli.inputs import replayed
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -65,7 +64,7 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.bag, 'bag2csv', 'bag')
     common.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
-    session, read = replayed(options.bag, chain, common.settings_of(options), screen)
+    session, read = given.replayed(options.bag, chain, common.settings_of(options), screen)
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 
-from calib_ros.cli.inputs import table
+from calib_ros.cli.given import table
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.boards import (

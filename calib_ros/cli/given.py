@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the options given stand for: layouts, histories, reports."""
+"""What the options given stand for: bags, tables, layouts, histories, reports."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import LAYOUT, Contents, settings_of
+from calib_ros.cli.options import LAYOUT, Contents, sessions_of, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
+from calib_ros.files import loading
+from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
+from calib_ros.files.tables import Table
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
@@ -30,6 +33,8 @@ from calib_ros.report.page import (
     on_paper,
     render,
 )
+from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
 
 WRITTEN = 'give the folder that identify --out wrote'
 
@@ -109,3 +114,26 @@ def page_of(
         if found['report.pdf'] is None:
             screen.warn(MISSING_PDF, 'note')
     return {each: content for each, content in found.items() if content is not None}
+
+
+def replayed(
+    path: Path, chain: Chain, settings: Settings, screen: Screen
+) -> tuple[CalibrationSession, Replayed]:
+    """Return a session that has taken a bag."""
+    with screen.work(f'reading {path.name}') as work:
+        return loading.replayed(path, chain, settings, work)
+
+
+def table(
+    options: argparse.Namespace,
+    path: Path,
+    chain: Chain,
+    settings: Settings,
+    screen: Screen,
+    eye_in_hand: bool = False,
+) -> Table:
+    """Return a table of measurements, laid out as the options say."""
+    foreign = foreign_of(options, chain)
+    sessions = sessions_of(options)
+    with screen.work(f'reading {path.name}') as work:
+        return loading.table(path, chain, settings, sessions, eye_in_hand, foreign, work)

@@ -10,7 +10,6 @@ import math
 
 from calib_ros.cli import given, options as common
 from calib_ros.cli.detections import detected
-from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.recalibrate import recalibrated
 from calib_ros.cli.results import (
@@ -61,7 +60,11 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if options.json:
         screen.data(json.dumps(document(found, options.tolerance), indent=2))
     else:
-        show(found, screen, options.out, options.tolerance)
+        show(found, screen, options.tolerance)
+        if options.out is None:
+            screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
+        else:
+            screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 
@@ -89,11 +92,11 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
         loaded = detected(options, chain, settings, screen)
     elif source == 'table':
         touch = options.sigma_touch
-        given = {} if touch is None else {'sigma_touch': touch}
-        found = table(options, options.csv, chain, settings, screen, options.eye_in_hand)
-        loaded = of_table(found, chain, settings, **given)
+        touched = {} if touch is None else {'sigma_touch': touch}
+        found = given.table(options, options.csv, chain, settings, screen, options.eye_in_hand)
+        loaded = of_table(found, chain, settings, **touched)
     else:
-        bag = replayed(options.measured, chain, settings, screen)
+        bag = given.replayed(options.measured, chain, settings, screen)
         loaded = of_bag(*bag, options.largest_loss)
     return loaded, settings
 

@@ -89,7 +89,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; only the one given knows its options."""
-    from calib_ros.cli.commands import COMMANDS  # the overview does not need them
+    from calib_ros.cli.commands import COMMANDS, examples_of  # the overview does not need them
 
     parser = argparse.ArgumentParser(prog='calib_ros', add_help=False)
     names = parser.add_subparsers(required=True, metavar='COMMAND')
@@ -102,7 +102,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
             name,
             add_help=False,
             description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', help_width()),
-            epilog=_foot(command.examples),
+            epilog=_foot(examples_of(name)),
             formatter_class=_Help,
         )
         added.set_defaults(run=command.run)

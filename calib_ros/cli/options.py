@@ -5,15 +5,15 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.errors import InputError
-from calib_ros.settings import GROWTH, STORAGES, Settings
+from calib_ros.settings import STORAGES, Settings
 
 NOT_ACCEPTED, INCOMPLETE = 3, 4
 """Exit status when the input was used but what came out does not do; of a fleet, when measurements
@@ -79,17 +79,22 @@ def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> 
     for title, members in SETTINGS.items():
         wanted = [known[name] for name in members if not names or name in names]
         group = parser.add_argument_group(title) if wanted else parser
-        for item in wanted:
-            many = isinstance(item.default, tuple)
-            kind = str if many else type(item.default)
-            group.add_argument(
-                f'--{item.name.replace("_", "-")}',
-                type=kind,
-                action='append' if many else 'store',
-                default=[] if many else item.default,
-                metavar={float: 'X', int: 'N'}.get(kind, 'NAME'),
-                help=item.metadata['text'],
-            )
+        add_fields(group, wanted)
+
+
+def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
+    """Add an option for each field of a dataclass that has a text; None stands for a number."""
+    for item in items:
+        many = isinstance(item.default, tuple)
+        kind = str if many else float if item.default is None else type(item.default)
+        group.add_argument(
+            f'--{item.name.replace("_", "-")}',
+            type=kind,
+            action='append' if many else 'store',
+            default=[] if many else item.default,
+            metavar={float: 'X', int: 'N'}.get(kind, 'NAME'),
+            help=item.metadata['text'],
+        )
 
 
 def add_calibration(parser: Group) -> None:
@@ -189,6 +194,12 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Conte
         write_files(folder, contents)
 
 
+def written(out: Path, contents: Contents) -> str:
+    """Return where the files are that were written, and which of them to open."""
+    page = 'report.html'
+    return f'wrote {out}' + (f': open {out / page}' if page in contents else '')
+
+
 def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
     """Add the options by which a report says what it is of; `pdf` adds that for paper."""
     add = parser.add_argument_group('for the report').add_argument
@@ -200,34 +211,6 @@ def add_identity(parser: argparse.ArgumentParser, pdf: bool = False) -> None:
         add(f'--{name}', default='', metavar='NAME', help=text)
     if pdf:
         add('--pdf', action='store_true', help='report.pdf as well, with a certificate first')
-
-
-def add_detections(parser: argparse.ArgumentParser) -> None:
-    """Add the options of what a camera saw."""
-    group = parser.add_argument_group('what a camera saw (docs/images.md)')
-    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
-    add_each(
-        group,
-        Path,
-        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
-        ('--board', 'FILE', None, 'YAML of that board'),
-        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
-        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
-    )
-    group.add_argument(
-        '--lens', choices=('given', 'fitted'), help='fit the intrinsics as well; else given'
-    )
-
-
-def add_previous(parser: argparse.ArgumentParser) -> None:
-    """Add the options of an earlier calibration."""
-    group = parser.add_argument_group('an earlier calibration (docs/history.md)')
-    add = group.add_argument
-    text = 'bring this one up to date by a few poses, and say what has changed since'
-    add('--previous', type=Path, metavar='CALIBRATION', help=text)
-    text = 'by which lengths wander in a year; angles by twice as many mrad'
-    add('--growth', type=float, default=1e3 * GROWTH, metavar='MM', help=text)
-    add_moved(group)
 
 
 def add_moved(parser: Group) -> None:

@@ -26,6 +26,11 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told
 from calib_ros.report.maps import plan_report
 
+TESTS = (
+    'P1 to P5 of ISO 9283 in a cube of {:.3f} m, one orientation: go to them in turn, 30 times, '
+    'and measure. Collisions are not checked'
+)
+
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     _check(options)
@@ -41,9 +46,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         np.radians(options.cone),
         options.world,
     )
-    planned = _tests if options.iso9283 else _measurement
     with screen.work('choosing poses') as work:
-        joints, words, plan = planned(options, design, visibility, rng, work)
+        if options.iso9283:
+            tests = iso_9283_poses(design, rng, visibility)
+            joints, words, plan = tests.joints, TESTS.format(tests.edge), None
+        else:
+            joints, words, plan = _measurement(options, design, visibility, rng, work)
     screen.say(words)
     if chain.tool is None:
         x, y, z = ASSUMED_TOOL
@@ -71,7 +79,7 @@ def _measurement(
     visibility: Visibility,
     rng: np.random.Generator,
     told: Told,
-) -> tuple[FloatArray, str, Plan | None]:
+) -> tuple[FloatArray, str, Plan]:
     """Return the poses to measure in the order of visit, what they promise, and the plan."""
     size = len(design.chain.joints)
     if len(options.velocity) not in (1, size):
@@ -101,22 +109,6 @@ def _measurement(
     plan = planning.plan(design, candidates, task, count, **choice)
     words = planning.in_words(plan, len(candidates), options.accuracy, needed)
     return plan.joints[plan.visit], words, plan
-
-
-def _tests(
-    options: argparse.Namespace,
-    design: Design,
-    visibility: Visibility,
-    rng: np.random.Generator,
-    told: Told,
-) -> tuple[FloatArray, str, Plan | None]:
-    """Return the test poses of ISO 9283, and what to do with them; there is no plan."""
-    found = iso_9283_poses(design, rng, visibility)
-    words = (
-        f'P1 to P5 of ISO 9283 in a cube of {found.edge:.3f} m, one orientation: go to them in '
-        'turn, 30 times, and measure. Collisions are not checked'
-    )
-    return found.joints, words, None
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -31,6 +31,8 @@ def recalibrated(options: argparse.Namespace, loaded: Callable[[], Loaded], scre
         screen.data(_document(found))
     else:
         screen.title(found.in_words(), found.accepted)
+        if options.out is not None:
+            screen.say(common.written(options.out, contents))
     return 0 if found.accepted else common.NOT_ACCEPTED
 
 

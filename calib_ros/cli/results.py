@@ -20,7 +20,7 @@ from calib_ros.report.advice import WRONG_ARM
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_of
-from calib_ros.report.reports import identification_report, reasons_of, within_tolerance
+from calib_ros.report.reports import NOT_YET, identification_report, reasons_of, within_tolerance
 from calib_ros.settings import Settings
 
 RESULT_FILES = (
@@ -49,9 +49,7 @@ def identified(loaded: Loaded, settings: Settings, screen: Screen, origin: Origi
         return Identified(loaded, loaded.identified(settings.model, work), origin)
 
 
-def show(
-    found: Identified, screen: Screen, out: Path | None = None, tolerance: float | None = None
-) -> None:
+def show(found: Identified, screen: Screen, tolerance: float | None = None) -> None:
     """Print a result: the verdict, six rows, and each reason or note once.
 
     `tolerance` is the wanted error [mm].
@@ -69,9 +67,9 @@ def show(
         screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
     screen.table(_rows(result))
     for each in reasons_of(result):
-        screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
+        screen.bullet(f'{each.heading}: {each.refusal}', each.steps or (each.meaning,))
     if result.accepted:
-        for note in words.notes(result):
+        for note in (*words.notes(result), NOT_YET):
             screen.bullet(note)
     elif (
         result.noise.position > 1.0
@@ -81,10 +79,6 @@ def show(
         screen.bullet(words.scatter_in_words(result.noise))
     for line in words.cameras_in_words(result):
         screen.bullet(line)
-    if out is None:
-        screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
-    else:
-        screen.say(f'wrote {out}: open {out / "report.html"}')
 
 
 def _in_metres(tolerance: float | None) -> float | None:

@@ -12,7 +12,6 @@ import numpy as np
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import given, options as common
-from calib_ros.cli.inputs import replayed
 from calib_ros.cli.results import RESULT_FILES, identified, result_files, show
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import of_bag
@@ -38,17 +37,19 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading that recording as one of a real cell')
-        loaded = of_bag(*replayed(bag, chain, settings, screen))
+        loaded = of_bag(*given.replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors from it')
         configuration = words.configuration_yaml(options.chain, settings)
         origin = given.origin_of(options, [bag], configuration)
         found = identified(loaded, settings, screen, origin)
         screen.say('4. writing the report')
-        write_files(folder, result_files(found, screen, options.out))
+        contents = result_files(found, screen, options.out)
+        write_files(folder, contents)
         against = words.against_truth(found.result, load_chain(truth))
     screen.say('identified offsets against the true ones [mm, mrad]:')
     screen.say(against)
-    show(found, screen, options.out)
+    show(found, screen)
+    screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.NOT_ACCEPTED
 
 

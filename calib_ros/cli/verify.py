@@ -9,7 +9,6 @@ from collections.abc import Sequence
 
 from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
 from calib_ros.cli import given, options as common
-from calib_ros.cli.inputs import replayed, table
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -21,7 +20,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import STATES, verification_report
+from calib_ros.report.verified import standing, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
@@ -31,7 +30,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     with common.results(options, VERIFICATION_FILES) as contents:
         status = _verified(options, screen, contents)
     if options.out is not None:
-        screen.say(f'wrote {options.out}')
+        screen.say(common.written(options.out, contents))
     return status
 
 
@@ -63,7 +62,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     for warning in warnings:
         screen.warn(warning)
     show(found, screen)
-    status = 0 if found.verdict in ('PASS', 'JUDGED') else common.NOT_ACCEPTED
+    status = common.NOT_ACCEPTED if standing(found)[0].state in ('bad', 'open') else 0
     if options.out is None:
         return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))
@@ -87,7 +86,7 @@ def show(found: Verification, screen: Screen) -> None:
     tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    state = STATES[found.verdict]
+    state, steps = standing(found)
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     screen.table(
         (
@@ -107,6 +106,8 @@ def show(found: Verification, screen: Screen) -> None:
         screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
     for remark in remarks(found):
         screen.bullet(remark)
+    if state.state in ('bad', 'open'):
+        screen.bullet('what to do:', steps)
 
 
 def _sets(
@@ -115,10 +116,10 @@ def _sets(
     """Return all that was measured, warnings, and whether stamps are the lines of a table."""
     settings = common.settings_of(options)
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
-        found = table(options, options.measured, nominal, settings, screen)
+        found = given.table(options, options.measured, nominal, settings, screen)
         return (*found.fitted, *found.held_out), found.warnings, found.by_line
 
-    session, read = replayed(options.measured, nominal, settings, screen)
+    session, read = given.replayed(options.measured, nominal, settings, screen)
     screen.say(f'{read}; {session.account()}')
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     fitted, held_out = collect(session.usable, sigmas)

@@ -15,10 +15,7 @@ from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
-from calib_ros.identification.calibration import (
-    Calibration,
-    calibration_file,
-)
+from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.maps import workspace_report
@@ -32,7 +29,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     common.at_least(options, poses=100, cells=1, turns=1, seed=0)
     with common.results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
-    screen.say(f'wrote {options.out}: open {options.out / "report.html"}')
+    screen.say(common.written(options.out, contents))
     return 0
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, mkdtemp
 
-from calib_ros.atomic import whole_folder, write_file, write_files, write_together
+from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
 from calib_ros.files.journal import Journal
 from calib_ros.files.tables import read_journal
@@ -35,7 +36,7 @@ class Archive:
         self.folder = folder
         self.error = ''
         """Why poses are in memory only; empty while all are in the journal."""
-        self._robot = re.sub(r'/+|[^\w.-]', '_', robot)
+        self._robot = short_name(re.sub(r'/+|[^\w.-]', '_', robot))
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None
@@ -97,7 +98,7 @@ class Archive:
 
     def _begin(self, content: bytes = b'') -> None:
         """Begin the journal, with what was in one before."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
         write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
         if content:
             write_file(self._path, content, overwrite=True)
@@ -168,12 +169,22 @@ class Archive:
             return None
         return path
 
-    def close(self) -> None:
-        """Write what can be written, and close the journal."""
+    def close(self) -> str:
+        """Close the journal; return in words what could not be written to it, and where it is."""
         self.write()
+        words = ''
+        if self._waiting:
+            why = self.error
+            with suppress(OSError):
+                self._path = Path(mkdtemp(prefix='calib_ros_')) / self._path.name
+                self._begin(b'' if self._journal is None else self._journal.content)
+                self.write()
+            where = 'are lost' if self._waiting else f'are in {self._path}, not in {self.folder}'
+            words = f'poses {where}: {why}'
         if self._journal is not None:
             self._journal.close()
             self._journal = None
+        return words
 
     def _new_path(self, ending: str) -> Path:
         moment = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')

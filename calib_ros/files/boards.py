@@ -81,24 +81,25 @@ class Board:
     def corners(self) -> FloatArray:
         """Return the corners (M, 3) [m] by their numbers."""
         if self.type == 'charuco':
-            x, y = np.meshgrid(np.arange(1, self.columns), np.arange(1, self.rows))
-            flat = self.square * np.column_stack([x.ravel(), y.ravel()])
+            flat = self.square * (_grid(self.columns - 1, self.rows - 1) + 1)
         else:
-            x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-            first = self.square * np.column_stack([x.ravel(), y.ravel()])
-            around = self.marker * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-            flat = (first[:, np.newaxis] + around).reshape(-1, 2)
+            flat = self.around_markers.reshape(-1, 2)
         return np.column_stack([flat, np.zeros(len(flat))])
 
     @property
     def markers(self) -> FloatArray:
         """Return the upper left corners (K, 2) [m] of the markers by their numbers."""
-        x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        place = np.column_stack([x.ravel(), y.ravel()])
+        place = _grid(self.columns, self.rows)
         if self.type == 'markers':
             return np.asarray(self.square * place)
         white = place[place.sum(axis=1) % 2 == (0 if self.legacy_pattern else 1)]
         return np.asarray(self.square * white + 0.5 * (self.square - self.marker))
+
+    @property
+    def around_markers(self) -> FloatArray:
+        """Return the corners (K, 4, 2) [m] of the markers, clockwise from the upper left."""
+        around = self.marker * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        return np.asarray(self.markers[:, np.newaxis] + around)
 
     @property
     def legacy_pattern(self) -> bool:
@@ -112,25 +113,28 @@ class Board:
         return self.columns * self.square - less, self.rows * self.square - less
 
 
+def _grid(columns: int, rows: int) -> NDArray[np.intp]:
+    """Return the places (columns * rows, 2) on a board, row by row."""
+    return np.column_stack([each.ravel() for each in np.meshgrid(range(columns), range(rows))])
+
+
 def read_board(path: Path) -> Board:
     """Read the YAML of a board."""
     text = read_text(path, what='board ')
     content = parse_mapping(parse_yaml(text, str(path)), KEYS, str(path), KEYS[:-1])
-    counts = {}
     for key in ('columns', 'rows'):
         if type(content[key]) is not int:
             raise ConfigError(f'{path}: {key} must be a whole number, not {content[key]!r}')
-        counts[key] = int(content[key])
     if not isinstance(content.get('legacy', False), bool):
         raise ConfigError(f'{path}: legacy must be true or false, not {content["legacy"]!r}')
     return Board(
         str(content['type']),
-        counts['columns'],
-        counts['rows'],
+        content['columns'],
+        content['rows'],
         parse_number(content['square'], f'{path}: square'),
         parse_number(content['marker'], f'{path}: marker'),
         str(content['dictionary']),
-        bool(content.get('legacy', False)),
+        content.get('legacy', False),
     )
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
 from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, parse_number
 
+Row = tuple[int, Sequence[str]]
+"""A line of a file, and the cells in it."""
 Lines = NDArray[np.intp]
 Codes = tuple[NDArray[np.intp], list[str]]
 """The number (N,) of each row's text, and the texts in order of appearance."""
@@ -177,6 +180,13 @@ class MadeColumns(Columns):
             if not (np.isfinite(found[:, k]) | self.blank(name)).all():
                 return None
         return found
+
+
+def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColumns:
+    """Return columns of rows that may end early, each with its line."""
+    cells = zip_longest(header, *(row for _, row in rows), fillvalue='')
+    words = {name: column for name, *column in cells}
+    return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)
 
 
 def numbered(texts: Sequence[str]) -> Codes:

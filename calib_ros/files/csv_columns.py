@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import Codes, Columns, MadeColumns, numbered
+from calib_ros.files.columns import Codes, Columns, MadeColumns, Row, numbered, of_cells
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
+from calib_ros.values import MOST_NAMES
 
 IRREGULAR = (b'"', b'\r', b'\0')
 """What cells are not cut at separators alone with."""
-BLOCK = 2**18
-"""Bytes that are looked at together: they stay in the cache (benchmarks/tables.py)."""
-WIDEST, FEW = 40, 100
-"""Characters of a text, and how many different ones, that are told apart all at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +61,7 @@ class TextColumns(Columns):
         longest = int((ends - starts).max(initial=0))
         if longest == 0:
             return np.zeros(len(starts), dtype=np.intp), ['']
-        if longest > WIDEST:
+        if longest > MOST_NAMES:
             return numbered(self.texts(name))
         place = starts[:, np.newaxis] + np.arange(longest, dtype=np.int32)
         beyond = place >= ends[:, np.newaxis]
@@ -75,7 +72,7 @@ class TextColumns(Columns):
         numbers = np.full(len(words), -1, dtype=np.intp)
         known: list[str] = []
         first = 0
-        while len(known) < FEW:
+        while len(known) < MOST_NAMES:
             word = words[first]
             numbers[words == word] = len(known)
             known.append(bytes(word).decode())
@@ -183,24 +180,18 @@ def regular(
 def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int32] | None:
     """Return where the cells of a text end, behind the end of what is before; None if ragged."""
     flat = np.frombuffer(data, dtype=np.uint8)
-    found = [np.array([begin - 1], dtype=np.int32)]
-    rows = 0
-    for start in range(begin, len(flat), BLOCK):
-        part = flat[start : start + BLOCK]
-        last = part == ord('\n')
-        rows += int(np.count_nonzero(last))
-        found.append((np.flatnonzero(last | (part == ord(separator))) + start).astype(np.int32))
-    ends = np.concatenate(found)
-    if len(ends) != 1 + width * rows or not (flat[ends[width::width]] == ord('\n')).all():
+    last = flat[begin:] == ord('\n')
+    found = np.flatnonzero(last | (flat[begin:] == ord(separator))) + begin
+    if len(found) != width * np.count_nonzero(last):
         return None
-    return ends
+    ends: NDArray[np.int32] = np.append(begin - 1, found).astype(np.int32)
+    return ends if (flat[ends[width::width]] == ord('\n')).all() else None
 
 
 def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
     """Return the columns of a text with quotes, or with rows that end early."""
     header: list[str] = []
-    rows: list[list[str]] = []
-    lines: list[int] = []
+    rows: list[Row] = []
     most = text.count('\n') + 1
     for line, row in csv_rows(path, text, strict=True):
         told(min(line / most, 1.0))
@@ -214,14 +205,11 @@ def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
             raise InputError(
                 f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
             )
-        rows.append([*row[: len(header)], *[''] * (len(header) - len(row))])
-        lines.append(line)
+        rows.append((line, row[: len(header)]))
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
-    cells = zip(*rows, strict=True) if rows else [()] * len(header)
-    words = dict(zip(header, cells, strict=True))
-    return MadeColumns(path, np.array(lines, dtype=np.intp), {}, words)
+    return of_cells(path, header, rows)
 
 
 def csv_rows(

@@ -21,6 +21,7 @@ from calib_ros.files.images import Image, opencv
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
+from calib_ros.settings import EXCEPTION
 
 Corners = tuple[NDArray[np.intp], FloatArray]
 """Numbers (K,) and pixels (K, 2) of a board's corners."""
@@ -38,26 +39,14 @@ WIDEST = 10
 """Half of the widest such window [px]."""
 COARSE = 700
 """Longer side [px] of the smallest image in which markers are sought."""
-BENT = 5.0
-"""Distance [px] from where the other corners say up to which lens and board may bend a board."""
-BENT_SHARE = 0.1
-"""The same as a share of the distance between corners."""
-
-
-@dataclass(frozen=True)
-class Refused:
-    """An image that is not used, and why."""
-
-    name: str
-    reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was found in images, and the images that are not used."""
+    """What was found in images, and which others are not used and why."""
 
     detections: Detections
-    refused: tuple[Refused, ...]
+    refused: tuple[tuple[str, str], ...]
 
 
 def dictionaries() -> tuple[str, ...]:
@@ -88,6 +77,22 @@ def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
     size = dictionary.markerSize + 2
     draw = getattr(aruco, 'generateImageMarker', None) or aruco.drawMarker
     return [np.asarray(draw(dictionary, k, size)) < 128 for k in range(count)]
+
+
+def black_of(board: Board) -> FloatArray:
+    """Return what is printed black as rectangles (K, 4) [m]: left, top, width, height."""
+    rows: list[tuple[float, float, float, float]] = []
+    if board.type == 'charuco':
+        x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
+        black = np.column_stack([x.ravel(), y.ravel()])[(x + y).ravel() % 2 == 0]
+        rows += [(board.square * i, board.square * j, *[board.square] * 2) for i, j in black]
+    for cells, (left, top) in zip(marker_cells(board), board.markers.tolist(), strict=True):
+        size = board.marker / len(cells)
+        for k, row in enumerate(cells):  # runs of black cells: no white lines between them
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], row, [0]])))
+            for first, last in edges.reshape(-1, 2).tolist():
+                rows.append((left + first * size, top + k * size, (last - first) * size, size))
+    return np.array(rows)
 
 
 class Detector:
@@ -172,18 +177,13 @@ class Detector:
 
         By the plane of those that were found.
         """
-        around = self._board.marker * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-        points = self._board.markers[:, np.newaxis] + around
+        points = self._board.around_markers
         others = np.setdiff1d(np.arange(self._count), ids)
-        matrix = None
+        placed = None
         if len(ids) and len(others):
-            matrix, _ = self._cv2.findHomography(
-                points[ids].reshape(-1, 2), corners.reshape(-1, 2)
-            )
-        if matrix is None:
+            placed = self._placed(points[ids], corners, points[others])
+        if placed is None:
             return others, np.zeros(2, np.intp), size
-        placed = self._cv2.perspectiveTransform(points[others].reshape(1, -1, 2), matrix)
-        placed = placed.reshape(-1, 4, 2)
         inside = ((placed >= 0.0) & (placed <= size - 1)).all(axis=(1, 2))
         if not inside.any():
             return others[inside], np.zeros(2, np.intp), size
@@ -205,19 +205,27 @@ class Detector:
                 f'{len(ids)} markers: is it a part of the board only, or another board?',
             )
         points = self._board.corners[number, :2]
-        matrix, _ = self._cv2.findHomography(points, pixels)
-        apart = np.inf
-        if matrix is not None:
-            placed = self._cv2.perspectiveTransform(points[np.newaxis], matrix)[0]
-            apart = float(np.linalg.norm(placed - pixels, axis=1).max())
+        placed = self._placed(points, pixels, points)
+        apart = np.inf if placed is None else np.linalg.norm(placed - pixels, axis=1).max()
         spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
-        if apart > max(BENT, BENT_SHARE * spacing):
+        # Lens and board may bend a board by half of what a corner is refined in, or 10 %.
+        if apart > max(0.5 * WIDEST, EXCEPTION * spacing):
             return Refusal(
                 'whose corners do not fit the board',
                 f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, square'
                 ' and marker those of this board, and is it flat?',
             )
         return number, pixels
+
+    def _placed(
+        self, points: FloatArray, pixels: FloatArray, others: FloatArray
+    ) -> FloatArray | None:
+        """Return where other points of the plane (..., 2) are by those at some pixels (..., 2)."""
+        matrix, _ = self._cv2.findHomography(points.reshape(-1, 2), pixels.reshape(-1, 2))
+        if matrix is None:
+            return None
+        flat = self._cv2.perspectiveTransform(others.reshape(1, -1, 2), matrix)
+        return np.asarray(flat).reshape(others.shape)
 
     def _charuco(self) -> Callable[[Image, FloatArray, NDArray[np.intp]], Corners]:
         """Return what finds the corners between markers."""
@@ -313,31 +321,27 @@ def detect(
 ) -> Found:
     """Return the corners of a board in named images."""
     detector = Detector(board, fewest)
-    names: list[str] = []
-    image, corner, pixels, refused = [], [], [], []
+    used: list[tuple[str, Corners]] = []
+    refused: list[tuple[str, str]] = []
     for name, picture in images:
         found = detector.of(picture)
         if isinstance(found, Refusal):
-            refused.append(Refused(name, found.reason))
+            refused.append((name, found.reason))
             heard(f'{name}: not used, {found.reason}')
             continue
         heard(f'{name}: {len(found[0])} corners')
-        image.append(np.full(len(found[0]), len(names)))
-        names.append(name)
-        corner.append(found[0])
-        pixels.append(found[1])
-    if not names:
-        first = refused[0] if refused else Refused('', 'there is none')
-        raise InputError(f'no image can be used; {first.name}: {first.reason}')
-    detections = Detections(
-        tuple(names), np.concatenate(image), np.concatenate(corner), np.concatenate(pixels)
-    )
-    return Found(detections, tuple(refused))
+        used.append((name, found))
+    if not used:
+        name, reason = next(iter(refused), ('', 'there is none'))
+        raise InputError(f'no image can be used; {name}: {reason}')
+    names, found_in = zip(*used, strict=True)
+    image = np.repeat(np.arange(len(used)), [len(number) for number, _ in found_in])
+    corner, pixels = map(np.concatenate, zip(*found_in, strict=True))
+    return Found(Detections(names, image, corner, pixels), tuple(refused))
 
 
 def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:
     """Return the corners of markers as those of the board."""
-    del image
     order = np.argsort(ids)
     number = (4 * ids[order, np.newaxis] + np.arange(4)).ravel()
     return number, corners[order].reshape(-1, 2)

@@ -22,7 +22,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,7 +31,7 @@ from calib_ros.errors import CalibrationError
 from calib_ros.escapes import from_cell, to_cell
 from calib_ros.identification.start import likened
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame, Joint, JointType
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, dump_yaml, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
@@ -78,7 +78,7 @@ def exports(
     lost = _distance(chain.forward(q), wanted) if chain.effects else 0.0
     digest = table_hash(chain)
     found = []
-    for convention in ('standard', 'modified'):
+    for convention in get_args(Convention):
         form = converted(arm, convention)
         what = f'{convention} Denavit-Hartenberg table'
         text = _csv(form, what, lost, digest)
@@ -106,7 +106,7 @@ def anywhere(chain: Chain) -> FloatArray:
     return chain.random_joints(1000, np.random.default_rng(0))
 
 
-def converted(chain: Chain, convention: str) -> Chain:
+def converted(chain: Chain, convention: Convention) -> Chain:
     """Return the same arm by another convention; what is cut off goes into base and tool."""
     if chain.convention == convention:
         return chain
@@ -122,15 +122,8 @@ def converted(chain: Chain, convention: str) -> Chain:
         replace(joint, a=a, alpha=alpha, beta=beta)
         for joint, (a, alpha, beta) in zip(chain.joints, tails, strict=True)
     )
-    return Chain(
-        name=chain.name,
-        convention='modified' if convention == 'modified' else 'standard',
-        joints=joints,
-        base=base,
-        tool=tool,
-        effects=chain.effects,
-        gravity=chain.gravity,
-    )
+    frames: dict[str, Any] = {'base': base, 'tool': tool, 'frames': ()}
+    return replace(chain, convention=convention, joints=joints, parallel=None, **frames)
 
 
 def _tail(a: float, alpha: float, beta: float) -> FloatArray:

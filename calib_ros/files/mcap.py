@@ -9,11 +9,13 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import cache
 from mmap import mmap
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
+from calib_ros.errors import InputError
 from calib_ros.texts import LARGEST_TABLE
 
 MAGIC = b'\x89MCAP0\r\n'
@@ -31,10 +33,20 @@ Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
 
 
-LARGEST_CHUNK = LARGEST_TABLE
-"""Bytes of a chunk when it is unpacked; recorders make chunks of one to ten million."""
-LARGEST_RATIO = 1000
-"""How much larger than its file a recording can be when all of it is unpacked, chunks aside."""
+class Room:
+    """What may still be unpacked of a recording of some bytes: a chunk and 1,000 times its size.
+
+    No recorder packs tighter; beyond it is an InputError.
+    """
+
+    def __init__(self, packed: int) -> None:
+        self._left = LARGEST_TABLE + 1000 * packed
+
+    def take(self, size: int) -> None:
+        """Let so many bytes be unpacked."""
+        self._left -= size
+        if self._left < 0:
+            raise InputError('it unpacks to 1000 times its size')
 
 
 def is_indexed(file: Path) -> bool:
@@ -58,10 +70,10 @@ def is_indexed(file: Path) -> bool:
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
     """Yield (kind, content) of the records, those in chunks included.
 
-    One that is cut off is an EOFError, after what it holds; a chunk in another one, or more in
-    them than any recording holds, is a ValueError.
+    One that is cut off is an EOFError after what it holds, a chunk in another one a ValueError,
+    more in them than any recording holds an InputError.
     """
-    left = LARGEST_CHUNK + LARGEST_RATIO * len(content)
+    room = Room(len(content))
     while start < len(content):
         kind, size = _HEAD.unpack_from(content, start)
         start += _HEAD.size
@@ -70,9 +82,7 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
             if nested:
                 raise ValueError('a chunk is within a chunk')
             unpacked = _unpacked(record)
-            left -= len(unpacked)
-            if left < 0:
-                raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+            room.take(len(unpacked))
             yield from records(unpacked, nested=True)
         elif len(record) == size:
             yield kind, record
@@ -129,8 +139,8 @@ def unpacked(data: bytes, compression: str, largest: int) -> bytes:
 
 def _unpacked(chunk: bytes) -> bytes:
     size = _CHUNK.unpack_from(chunk)[2]
-    if size > LARGEST_CHUNK:
-        raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_CHUNK}')
+    if size > LARGEST_TABLE:
+        raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_TABLE}')
     compression = string(chunk, _CHUNK.size)
     return unpacked(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
 
@@ -150,6 +160,7 @@ def _unpack(data: bytes, name: str, most: int) -> bytes:
     return bytes(module.ZstdDecompressor().decompress(data, most))
 
 
+@cache  # looking for a module that is not there takes ten times as long as a message
 def _module(compression: str) -> Any:
     """Return what unpacks a compression: one of the modules that rosbags brings."""
     for name in MODULES.get(compression, ()):

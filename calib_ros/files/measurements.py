@@ -24,6 +24,7 @@ from calib_ros.files.columns import (
 )
 from calib_ros.files.csv_columns import refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
+from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.sample import socket_place
@@ -80,6 +81,31 @@ class Measurements:
             elif isinstance(value, tuple):
                 found[item.name] = (value[0][rows], value[1])
         return replace(self, **found)  # type: ignore[arg-type]
+
+    def observations(self) -> Observations:
+        """Return rows of one kind and between the same frames as observations."""
+
+        def optional(values: FloatArray | None, nothing: float) -> FloatArray | None:
+            if values is None or np.isnan(values).all():
+                return None
+            return np.where(np.isnan(values), nothing, values)
+
+        kind = self.kind[0]
+        return Observations(
+            self.stamps_ns,
+            self.joints,
+            self.position if kind == POSE else np.zeros_like(self.position),
+            self.rotation,
+            self.oriented,
+            optional(self.covariance, np.nan),
+            optional(self.approach, 0.0),
+            self.distance if kind in (DISTANCE, PLANE) else None,
+            optional(self.velocity, 0.0),
+            optional(self.acceleration, 0.0),
+            self.delay,
+            socket=bool(kind == SOCKET),
+            plane=bool(kind == PLANE),
+        )
 
     @cached_property
     def codes(self) -> NDArray[np.intp]:

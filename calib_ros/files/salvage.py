@@ -25,8 +25,6 @@ from calib_ros.files import mcap
 from calib_ros.texts import parse_yaml, read_text
 
 NOT_CLOSED = 'the recording was not closed'
-WAL_HEAD = 32
-"""Bytes at the beginning of a write-ahead log of SQLite, before its pages."""
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
     'messages': 'SELECT id FROM messages NOT INDEXED',
@@ -71,7 +69,7 @@ def unpacked_files(path: Path) -> Iterator[Path]:
             text = read_text((path if path.is_dir() else path.parent) / 'metadata.yaml')
             text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
             (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
-        yield folder if path.is_dir() else folder / path.name
+        yield folder if path.is_dir() else folder / path.name.removesuffix('.zstd')
 
 
 def _log(file: Path) -> Path:
@@ -93,7 +91,7 @@ def _with_log(file: Path, target: Path) -> None:
         raise InputError(f'{_log(file)} cannot be applied to a copy of {file}: {err}') from err
     except sqlite3.DatabaseError:  # no database; what is missing will be told
         return
-    if pages == 0 and _log(file).stat().st_size > WAL_HEAD:
+    if pages == 0 and _log(file).stat().st_size > 32:  # its head, before any page
         raise InputError(
             f'{_log(file)} is damaged, what was recorded last cannot be read: copy it again, or '
             'move it away to use the rest'
@@ -102,15 +100,15 @@ def _with_log(file: Path, target: Path) -> None:
 
 def _unpack_file(file: Path, target: Path) -> None:
     """Unpack a file, as far as it is whole."""
-    left = mcap.LARGEST_CHUNK + mcap.LARGEST_RATIO * file.stat().st_size
+    room = mcap.Room(file.stat().st_size)
     try:
         with target.open('wb') as out, mcap.open_zstd(file) as packed:
             while part := packed.read(1 << 20):
-                left -= len(part)
-                if left < 0:
-                    raise InputError(f'{file} unpacks to {mcap.LARGEST_RATIO} times its size')
+                room.take(len(part))
                 out.write(part)
-    except (InputError, OSError):  # the latter of a full disk
+    except InputError as err:
+        raise InputError(f'{file} is too large: {err}') from err
+    except OSError:  # of a full disk
         raise
     except Exception:  # decompressors have errors of their own; what is missing will be told
         return

@@ -11,13 +11,10 @@ import re
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 
-import numpy as np
-
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import Columns, MadeColumns, lines_in_words
+from calib_ros.files.columns import Columns, Row, lines_in_words, of_cells
 from calib_ros.files.csv_columns import csv_rows, regular
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.shown import some
@@ -100,7 +97,9 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
             rows = _cells(path, text, separator)
             first = next(k for k, (line, _) in enumerate(rows) if line >= start)
     if columns is None:
-        columns = _ragged(path, rows[first:], len(header), decimal)
+        rows = [(n, _dotted(cells) if decimal == ',' else cells) for n, cells in rows[first:]]
+        width = max(len(header), *(len(cells) for _, cells in rows))
+        columns = of_cells(path, [f'#{k + 1}' for k in range(width)], rows)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
 
@@ -132,7 +131,7 @@ def _text(path: Path) -> tuple[str, str]:
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is no UTF-8'
 
 
-def _workbook(path: Path, name: str, notes: list[str]) -> list[tuple[int, list[str]]]:
+def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
     """Return the rows of a sheet with their numbers, by default of the first not hidden."""
     try:
         import openpyxl
@@ -154,7 +153,7 @@ def _workbook(path: Path, name: str, notes: list[str]) -> list[tuple[int, list[s
         if len(seen) > 1 and not name:
             notes.append(f'sheet "{sheet.title}" is read, the first of {len(seen)} (--sheet)')
         sheet.reset_dimensions()  # programs write smaller ones than there are rows
-        rows = []
+        rows: list[Row] = []
         for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
@@ -203,7 +202,7 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
     return best
 
 
-def _decimal(rows: Sequence[tuple[int, Sequence[str]]], separator: str, notes: list[str]) -> str:
+def _decimal(rows: Sequence[Row], separator: str, notes: list[str]) -> str:
     """Return the decimal sign of the numbers."""
     if separator == ',':
         return '.'
@@ -213,9 +212,9 @@ def _decimal(rows: Sequence[tuple[int, Sequence[str]]], separator: str, notes: l
     return '.'
 
 
-def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]:
+def _cells(path: Path, text: str, separator: str) -> list[Row]:
     """Return the cells of all lines that hold any, with the numbers of the lines."""
-    found = [
+    found: list[Row] = [
         (line, [' '.join(cell.split()) for cell in row])
         for line, row in csv_rows(path, text, separator)
         if any(cell.strip() for cell in row)
@@ -227,7 +226,7 @@ def _cells(path: Path, text: str, separator: str) -> list[tuple[int, list[str]]]
 
 def _header(
     path: Path,
-    rows: Sequence[tuple[int, Sequence[str]]],
+    rows: Sequence[Row],
     names: Sequence[str],
     known: Sequence[str],
 ) -> tuple[int, tuple[str, ...]]:
@@ -255,7 +254,7 @@ def _header(
 
 def _first(
     path: Path,
-    rows: Sequence[tuple[int, Sequence[str]]],
+    rows: Sequence[Row],
     at: int,
     used: Sequence[int],
     decimal: str,
@@ -273,21 +272,13 @@ def _first(
     raise InputError(f'{path} has no rows of numbers in the columns that are named')
 
 
+def _dotted(cells: Sequence[str]) -> list[str]:
+    return [cell.replace(',', '.') for cell in cells]
+
+
 def _is_number(cell: str, decimal: str) -> bool:
     try:
         float(cell.replace(',', '.') if decimal == ',' else cell)
     except ValueError:
         return False
     return True
-
-
-def _ragged(
-    path: Path, rows: Sequence[tuple[int, Sequence[str]]], width: int, decimal: str
-) -> MadeColumns:
-    """Return the columns of rows that may end early or have cells in quotes."""
-    cells = zip_longest(*(row for _, row in rows), [''] * width, fillvalue='')
-    words = {
-        f'#{k}': [cell.replace(',', '.') if decimal == ',' else cell for cell in column[:-1]]
-        for k, column in enumerate(cells, start=1)
-    }
-    return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)

@@ -10,7 +10,7 @@ from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import MOST_ENTRIES
-from calib_ros.files.mcap import LARGEST_CHUNK, LARGEST_RATIO, logged, unpacked, unpacked_size
+from calib_ros.files.mcap import Room, logged, unpacked, unpacked_size
 from calib_ros.files.salvage import Salvage
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
@@ -51,8 +51,18 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
         )
     found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
     if reader.compression_mode == 'message':
-        return ((stream, unpacked(data, 'zstd', largest(stream))) for stream, data in found)
+        return ((stream, _unpacked(data, largest(stream))) for stream, data in found)
     return found
+
+
+def _unpacked(data: bytes, most: int) -> bytes:
+    """Return a message, without any bytes where it cannot be unpacked: the next one may be."""
+    try:
+        return unpacked(data, 'zstd', most)
+    except OSError:  # nothing to unpack with
+        raise
+    except Exception:  # decompressors have errors of their own
+        return b''
 
 
 def _is_known(storage: Any) -> bool:
@@ -83,7 +93,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
             raise ValueError(whole.problem)
         return
     with storage.path.open('rb') as file:
-        left = LARGEST_CHUNK + LARGEST_RATIO * storage.path.stat().st_size
+        room = Room(storage.path.stat().st_size)
         problem: Exception | None = None
         for overlapping in _together(storage.chunks, channels):
             found: list[tuple[int, Stream, bytes]] = []
@@ -91,9 +101,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
                 file.seek(chunk.chunk_start_offset)
                 try:
                     data = file.read(chunk.chunk_length)
-                    left -= unpacked_size(data)
-                    if left < 0:
-                        raise ValueError(f'it unpacks to {LARGEST_RATIO} times its size')
+                    room.take(unpacked_size(data))
                     messages, wrong = logged(data, channels)
                 except Exception as err:  # see `replay`
                     messages, wrong = [], err
@@ -118,7 +126,7 @@ def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator
         if counts and not any(counts.get(key) for key in channels):
             continue
         size += chunk.uncompressed_size
-        if together and (chunk.message_start_time >= end or size > LARGEST_CHUNK):
+        if together and (chunk.message_start_time >= end or size > LARGEST_TABLE):
             yield sorted(together, key=attrgetter('chunk_start_offset'))
             together, end, size = [], 0, chunk.uncompressed_size
         together.append(chunk)

@@ -41,7 +41,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.problems import Measured
-from calib_ros.sampling.sample import Frames, Sample, collect, lenses, socket_pairs
+from calib_ros.sampling.sample import Frames, Sample, collect, lenses, sets_of, socket_pairs
 from calib_ros.texts import LARGEST_TABLE, csv_text, read_bytes
 
 Sets = tuple[Observations, ...]
@@ -144,45 +144,20 @@ def _sets(
             session=made.session[1][session],
             device=made.device[1][device],
             target=made.target[1][target],
+            distance=0.0 if kind == DISTANCE else None,
             eye_in_hand=bool(eye),
             socket=kind == SOCKET,
             plane=kind == PLANE,
+            validation=bool(test),
         )
-        for session, device, target, eye, kind, _ in kinds.tolist()
+        for session, device, target, eye, kind, test in kinds.tolist()
     ]
-    groups: dict[tuple[object, ...], list[int]] = {}
-    for k, example in enumerate(examples):
-        groups.setdefault((*frames.of(example), *kinds[k, 3:].tolist()), []).append(k)
-    found: tuple[list[Observations], list[Observations]] = ([], [])
-    for (base, tool, eye, kind, test), members in groups.items():
-        rows = np.flatnonzero(np.isin(number, members))
-        part = made if len(rows) == len(number) else made.select(rows)
-        covariance = part.covariance
-        known = covariance is not None and not np.isnan(covariance).all()
-        observations = Observations(
-            part.stamps_ns,
-            part.joints,
-            part.position if kind == POSE else np.zeros((len(rows), 3)),
-            part.rotation,
-            part.oriented,
-            covariance if known else None,
-            _rates(part.approach),
-            part.distance if kind in (DISTANCE, PLANE) else None,
-            _rates(part.velocity),
-            _rates(part.acceleration),
-            part.delay,
-            base=str(base),
-            tool=str(tool),
-            socket=kind == SOCKET,
-            plane=kind == PLANE,
-        )
-        found[bool(test)].append(observations.inverted(sigmas) if eye else observations)
-    return tuple(found[0]), tuple(found[1]), tuple(socket_pairs(examples, frames))
 
+    def observed(members: Sequence[int]) -> Observations:
+        rows = np.isin(number, members)
+        return (made if rows.all() else made.select(rows)).observations()
 
-def _rates(values: FloatArray | None) -> FloatArray | None:
-    """Return values (N, n), zeros where there is none; None where all are none."""
-    return None if values is None or np.isnan(values).all() else np.nan_to_num(values)
+    return *sets_of(examples, observed, sigmas, frames), tuple(socket_pairs(examples, frames))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:

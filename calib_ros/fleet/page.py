@@ -12,12 +12,13 @@ from urllib.parse import quote
 
 import calib_ros
 from calib_ros.atomic import write_file
+from calib_ros.errors import MOST_ENTRIES
 from calib_ros.fleet.run import Run, page_path
 from calib_ros.fleet.standing import MEANING, Standing, State, counts
 from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MARKS, MISSING, State as Mark, filled, plotly_script
 
-MOST_ROBOTS, MOST_NIGHTS = 1000, 100
+MOST_ROBOTS, MOST_NIGHTS = MOST_ENTRIES, MOST_ENTRIES // 10
 """Robots, the worst ones, and nights of each, that the page shows; the history has all."""
 LOOKS: dict[State, Mark] = {
     'changed': 'bad',

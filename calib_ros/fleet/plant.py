@@ -17,7 +17,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import parse_mapping, parse_number
+from calib_ros.values import parse_like, parse_mapping, parse_number
 
 COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
 """What a group says for its robots, and a robot for itself."""
@@ -169,21 +169,10 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
 
 def _settings(given: Mapping[str, Any], where: str) -> Settings:
     """Return settings by their names, the others by default."""
-    values: dict[str, Any] = {}
-    for name, value in given.items():
-        default, place = getattr(Settings, name), f'{where}: {name}'
-        if isinstance(default, int | float):
-            number = parse_number(value, place)
-            if isinstance(default, int) and number % 1.0:
-                raise ConfigError(f'{place} must be a whole number, not {number:g}')
-            values[name] = type(default)(number)
-            continue
-        many = isinstance(default, tuple)
-        entries = value if many and isinstance(value, list) else [value]
-        if not all(isinstance(entry, str) for entry in entries):
-            kind = 'a list of texts' if many else 'text'
-            raise ConfigError(f'{place} must be {kind}, not {value!r:.100}')
-        values[name] = tuple(entries) if many else value
+    values = {
+        name: parse_like(getattr(Settings, name), value, f'{where}: {name}')
+        for name, value in given.items()
+    }
     try:
         return Settings(**values)
     except ConfigError as err:

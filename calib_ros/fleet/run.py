@@ -29,8 +29,6 @@ from calib_ros.fleet.work import Outcome, Task, sources, work
 from calib_ros.progress import Told, nobody
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
-SPAN = 2.0
-"""Time [s] that a piece of several tasks takes: much to dask's 4 ms for it, little to lose."""
 ANSWER_S = 60.0
 """Time [s] for a scheduler and its first worker to answer."""
 DASK = {
@@ -210,9 +208,15 @@ def _version() -> str:
 
 
 def _done(
-    client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
+    client: Any,
+    tasks: Sequence[Task],
+    work: Callable[[Task], Outcome] = work,
+    span: float = 2.0,
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks with what became of them, as they are done: some at once, for dask's sake."""
+    """Yield tasks with what became of them, as they are done.
+
+    Several make a piece that takes a `span` [s]: much to dask's 4 ms for it, little to lose.
+    """
     from distributed import as_completed
 
     workers = max(1, len(client.nthreads()))
@@ -224,7 +228,7 @@ def _done(
         chosen: list[tuple[Task, ...]] = []
         while (waiting or alone) and len(running) + len(chosen) < 3 * workers:  # none waits
             fair = len(waiting) // (2 * workers)
-            fit = SPAN * count / max(seconds, 1e-9)
+            fit = span * count / max(seconds, 1e-9)
             most = 1 if alone else max(1, int(min(fair, fit)))
             source = alone or waiting
             chosen.append(tuple(source.popleft() for _ in range(most)))

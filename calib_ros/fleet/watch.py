@@ -119,7 +119,8 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
         lag = int(tests.chances[:, k].min(axis=1).argmin())
         first, known_up_to = k + 1 - LAGS[lag], k + 1
         columns = Columns(alike[k].corrected(), data.names)
-        found = explanations(data.told(tests, lag, k), columns, float(data.freedom[k]))
+        told = Told(data.names, tests.weight[lag, k], tests.pull[lag, k])
+        found = explanations(told, columns, float(data.freedom[k]))
         changes.append(Change(alike[first].time, alike[k].time, likely(found)))
     nights = tuple(
         Night(row, dict(zip(data.joints, values, strict=True)))
@@ -202,10 +203,6 @@ class _Data:
         if not scatter.size:
             return 1.0
         return float(_clearly(np.median(scatter), len(self.names) * scatter.size))
-
-    def told(self, tests: _Tests, lag: int, k: int) -> Told:
-        """Return what a lag at a night tells about the change."""
-        return Told(self.names, tests.weight[lag, k], tests.pull[lag, k])
 
 
 def _clearly(ratio: FloatArray | np.floating[Any], freedom: int) -> FloatArray:

@@ -94,10 +94,9 @@ def work(task: Task) -> Outcome:
     begin = time.monotonic()
     try:
         outcome = _outcome(task)
-    except (CalibrationError, OSError) as err:
-        outcome = Outcome(error=shortened(str(err)))
     except Exception as err:  # a fault of ours, or of a file system: it costs this source only
-        outcome = Outcome(error=shortened(f'{type(err).__name__}: {err}'))
+        kind = '' if isinstance(err, CalibrationError | OSError) else f'{type(err).__name__}: '
+        outcome = Outcome(error=shortened(f'{kind}{err}'))
     return outcome._replace(seconds=time.monotonic() - begin)
 
 

@@ -83,19 +83,16 @@ def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
     not_excited = [p.name for p in found.parameters if p.status == 'not excited']
     if not_excited:
         frames = dict.fromkeys(n.owner for n in not_excited if problem.model.owns_frame(n))
-        known = f' ({", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
+        known = f' (or {", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
         yield Reason(
-            Rule.EXCITATION,
-            f'the poses do not determine {", ".join(not_excited)}: move the joints further and '
-            f'in more combinations, or fix these parameters{known}',
+            Rule.EXCITATION, f'the poses do not determine {", ".join(not_excited)}{known}'
         )
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in found.parameters if p.beyond(*limits)]:
         far = [f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond]
         yield Reason(
             Rule.COMMON_SENSE,
-            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be: is it the '
-            'right chain file?',
+            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be',
         )
 
 
@@ -106,7 +103,7 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
         yield Reason(
             Rule.LARGEST_ERROR,
             f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
-            f'{1e3 * problem.largest_error:g} mm (largest_error): is it the right chain file?',
+            f'{1e3 * problem.largest_error:g} mm (largest_error)',
         )
     judged = validation.deciding
     gain, limit = log_gain(
@@ -125,21 +122,17 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
             Rule.DRIFT,
             'drift of the measuring device alone could explain the improvement: time-shifted '
             f'residuals are explained just as well in {100.0 * found.chance:.0f} % of cases '
-            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %); measure the poses in random order, '
-            'further apart, or more of them',
+            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif found.region is None:
-        more = 'more poses, spread further'
-        if not found.sized:
-            more = (
-                'what tells how large the arm is: positions, or two sockets a known distance apart'
-            )
-        yield Reason(
-            Rule.REGION,
+        text = (
             'too little is known of the arm for the correction to help: what it removes is not '
-            'larger than its own uncertainty, even at the poses measured; measure '
-            f'{more}',
+            'larger than its own uncertainty, even at the poses measured'
         )
+        if not found.sized:
+            text += '; measure what tells how large the arm is: positions, or two sockets a known '
+            text += 'distance apart'
+        yield Reason(Rule.REGION, text)
 
 
 def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
@@ -158,8 +151,7 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
     if found.may_be_rounding:
         yield Reason(
             Rule.ROUNDING,
-            'the improvement may only come from rounded joint values, alike in many poses: record '
-            'them with more digits',
+            'the improvement may only come from rounded joint values, alike in many poses',
         )
     before, after = validation.figures
     if after.rms_mrad is not None:

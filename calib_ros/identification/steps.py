@@ -79,7 +79,7 @@ class Step:
         return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
 
     def __str__(self) -> str:
-        """Return what moved and what to do about it."""
+        """Return what moved, and when."""
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         line, fraction = divmod(self.stamp_ns, 10**9)
         if line < 10**6 and not fraction:  # no clock, the numbers of rows
@@ -88,19 +88,12 @@ class Step:
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':
-            return (
-                f'{text}the zero of {self.what} ({size}). Did its encoder slip? Only what was '
-                'measured since tells of the arm as it is: leave out the rest, or measure again'
-            )
+            return f'{text}the zero of {self.what} ({size})'
         thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
         text += f'{thing} ({self.what}, {size})'
         if self.outside:
             text += '; what was measured on one side of it carries no weight'
-        return (
-            f'{text}. Fasten it and measure again, or fit what was measured before and after as '
-            'two sessions: two names in the column session of the table or journal, and --session '
-            'with both'
-        )
+        return text
 
 
 def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:

@@ -127,10 +127,14 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
         return '', False
     certain = abs(scale) - limit > LARGEST_SCALE
     growth = f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by '
-    growth += f'{1e6 * abs(scale):.0f} ppm (sigma {1e6 * std:.0f} ppm): '
+    growth += f'{_percent(abs(scale))} (sigma {_percent(std)}): '
     if certain:
-        return f'{growth}no arm does, check the scale of the measuring device', True
+        return f'{growth}no arm does', True
     return f'{growth}check the scale of the measuring device, and the temperature', False
+
+
+def _percent(share: float) -> str:
+    return f'{np.format_float_positional(100.0 * share, 2, fractional=False, trim="-")} %'
 
 
 def _sister(problem: Problem, result: Identification) -> str:

@@ -124,8 +124,7 @@ def plan_report(
         coverage(chain, joints, 'How far each joint will move'),
         _listed(chain, joints),
     ]
-    text: tuple[str, ...] = (f'{len(joints)} poses.',)
-    verdict = Verdict('info', 'Poses to go', text)
+    verdict = Verdict('info', 'Poses to go', (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
         'Go to P1 to P5 in turn, 30 times, and measure each time.',
         'Then judge: calib_ros verify.',
@@ -136,11 +135,11 @@ def plan_report(
         sections.insert(0, Section('promise', 'What the poses promise', (about,), curve))
         known = bool(np.isfinite(found.accuracy[-1]))
         if known:
-            text += (f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.',)
-        verdict = replace(verdict, text=text)
+            predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
+            verdict = replace(verdict, text=(*verdict.text, predicted))
         if found.lacking or not known:
             heading = 'Too little: these poses do not determine all parameters'
-            verdict = Verdict('open', heading, text)
+            verdict = replace(verdict, state='open', heading=heading)
         steps = (
             'Drive to each pose, wait until the arm stands still, and measure.',
             'Keep a few poses apart that are not fitted: they judge the result.',

@@ -26,7 +26,7 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
-"""Roles: fitted only; in the figures; in the figures at a fitted configuration."""
+"""Roles: fitted; left out to judge; left out at a fitted configuration."""
 WHEN = ('before', 'after')
 
 
@@ -59,8 +59,12 @@ class Poses:
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Return (N,) which poses the figures are about: judged ones without the outliers."""
-        return np.asarray((self.role != FITTED) & ~self.outlier)
+        """Return (N,) which poses the figures are about, without the outliers.
+
+        They are those left out to judge, or all where none was.
+        """
+        chosen = self.role != FITTED
+        return np.asarray((chosen | ~chosen.any()) & ~self.outlier)
 
     @property
     def oriented(self) -> bool:
@@ -160,7 +164,7 @@ def poses_of(problem: Problem, result: Identification, lines: bool = False) -> P
     sizes = np.concatenate(result.distances)
     fitted, judged = result.fitted, result.validation
     if judged is None or judged.repeated is not None:
-        role = np.full(len(sizes), JUDGED if judged is None else FITTED)
+        role = np.full(len(sizes), FITTED)
         parts = [*_parts(*known, problem.sets, fitted, role, sizes)]
     else:  # each was left out once
         parts = [*_parts(*known, problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]

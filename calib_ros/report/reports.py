@@ -35,6 +35,13 @@ from calib_ros.report.sections import (
 )
 from calib_ros.shown import some
 
+NOT_YET = (
+    'The robot itself is not changed yet: calib_ros export (~/export of the node) brings the '
+    'correction to its controller, calib_ros compensate to its programs'
+)
+UNPROVEN = (
+    'These poses were all used to compute the correction: a small error "after" proves nothing.'
+)
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -59,7 +66,7 @@ def identification_report(
         accuracy=accuracy_section(
             f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
             (
-                *_unproven(result),
+                *(() if result.validation else (UNPROVEN,)),
                 f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
                 f'{result.validated_by}.',
                 'RMS (root mean square) is the usual size of the error; its interval is that over '
@@ -71,7 +78,7 @@ def identification_report(
         ),
         picture=distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
-        remarks=(*warnings, *words.remarks(result)),
+        remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
         identity=identity_of(
             result.chain,
             origin,
@@ -94,7 +101,8 @@ def _verdict(
         return _refused(result, reasons)
     how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
-    text = tuple(each for each in (how, where) if each)
+    doubts = (f'Check before you use it: {each}.' for each in result.remarks)
+    text = (*filter(None, (how, where)), *doubts, 'The robot itself is not changed yet.')
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
     heading = 'Accepted' + (f', {within}' if within else '')
@@ -112,15 +120,6 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     if lower > tolerance:
         return f'but not {wanted}'
     return f'but perhaps not {wanted}'
-
-
-def _unproven(result: Identification) -> Iterator[str]:
-    """Yield that figures prove nothing where no pose was left out."""
-    if result.validation is None:
-        yield (
-            'These poses were all used to compute the correction: a small error "after" proves '
-            'nothing.'
-        )
 
 
 def reasons_of(result: Identification) -> tuple[Advice, ...]:
@@ -171,7 +170,7 @@ def _steps(
     if not result.accepted:
         return (
             'Follow the steps above, those of the first reason first.',
-            f'Then identify again, {reasons[0].again}.',
+            reasons[0].again,
         )
     found = []
     if tolerance is not None and limits[0] > tolerance:
@@ -186,11 +185,11 @@ def _steps(
         )
     elif tolerance is not None and limits[1] > tolerance:
         found.append(f'Measure more poses to decide about the tolerance, {SPREAD}.')
-    found.append('Bring the correction to the robot: calib_ros export, or ~/export of the node.')
-    found.append(
+    found += [
+        f'{NOT_YET}.',
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
-        'arm: calib_ros verify.'
-    )
+        'arm: calib_ros verify.',
+    ]
     if result.region is not None and not result.region.whole:
         found.append(
             'Use it near the measured poses. To use it elsewhere, measure poses there as well.'

@@ -23,23 +23,42 @@ from calib_ros.report.sections import (
     identity_of,
 )
 
-STATES: dict[str, Verdict] = {
-    'PASS': Verdict('good', 'PASS: the arm is within the tolerance'),
-    'FAIL': Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
-    'UNDECIDED': Verdict('open', 'UNDECIDED: too few measurements to tell'),
-    'JUDGED': Verdict('info', 'no verdict: --tolerance MM gives PASS or FAIL'),
-}
-NEXT: dict[str, tuple[str, ...]] = {
-    'PASS': ('Keep this page with the calibration. Verify again after a collision or repair.',),
-    'FAIL': (
-        'Check that the measuring device, the target and the robot stand as they did for the '
-        'calibration; if not, use --new-base or --new-tool.',
-        'Check that the correction is active in the controller (--commanded tells).',
-        'Calibrate again with new poses; try --model auto.',
+MOVED = (
+    'Check that the measuring device, the target and the robot stand as they did for the '
+    'calibration; if not, use --new-base or --new-tool.'
+)
+STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
+    'PASS': (
+        Verdict('good', 'PASS: the arm is within the tolerance'),
+        ('Keep this page with the calibration. Verify again after a collision or repair.',),
     ),
-    'UNDECIDED': (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
-    'JUDGED': ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
+    'FAIL': (
+        Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
+        (
+            MOVED,
+            'Check that the correction is active in the controller (--commanded tells).',
+            'Calibrate again with new poses; try --model auto.',
+        ),
+    ),
+    'UNDECIDED': (
+        Verdict('open', 'UNDECIDED: too few measurements to tell'),
+        (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
+    ),
+    'LOST': (
+        Verdict('bad', 'The calibration does not hold any more'),
+        (MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
+    ),
+    'JUDGED': (
+        Verdict('info', 'No verdict: --tolerance MM gives PASS or FAIL'),
+        ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
+    ),
 }
+"""Verdicts, and what to do next."""
+
+
+def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict, and what to do; without a tolerance a calibration may be lost too."""
+    return STANDINGS['LOST' if found.tolerance is None and found.holds is False else found.verdict]
 
 
 def verification_report(
@@ -47,25 +66,24 @@ def verification_report(
 ) -> Report:
     """Return the report of a verification of a calibrated chain."""
     share = f'{100.0 * found.confidence:g} %'
-    limits = (
+    text = [
         f'The RMS position error over poses like these is between {1e3 * found.lower:.3f} mm and '
         f'{1e3 * found.upper:.3f} mm; each limit holds with {share} confidence.'
-    )
-    wanted: tuple[str, ...] = (
-        () if found.tolerance is None else (f'Tolerance: {1e3 * found.tolerance:g} mm.',)
-    )
-    state = STATES[found.verdict]
+    ]
+    if found.tolerance is not None:
+        text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
+    state, steps = standing(found)
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
-        verdict=replace(state, text=(limits, *wanted), gain=gain(found.comparison)),
+        verdict=replace(state, text=tuple(text), gain=gain(found.comparison)),
         accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
             found.comparison,
         ),
         picture=distribution(poses),
-        steps=NEXT[found.verdict],
+        steps=steps,
         remarks=(*warnings, *remarks(found)),
         identity=identity_of(
             chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)

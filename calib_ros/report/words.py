@@ -35,11 +35,12 @@ def summary(
     result: Identification,
     numbers: Mapping[Outlier, int] | None = None,
     warnings: Sequence[str] = (),
+    first: str = '',
 ) -> str:
     """Return the one line that an operator reads.
 
     With the `numbers` of the samples that are outliers these are named; `warnings` are of the
-    measurements.
+    measurements. `first` is what to do first about a refusal.
     """
     before, after = (result.validation or result.fitted).figures
     text = f'{len(result.fitted.judged)} poses, RMS {before.rms_mm:.3f} -> '
@@ -58,7 +59,8 @@ def summary(
         text += f'; note: {"; ".join(more)}'
     if result.accepted:
         return f'accepted: {text}'
-    return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {text}'
+    todo = f'To do first: {first} ' if first else ''
+    return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {todo}{text}'
 
 
 def remarks(result: Identification) -> list[str]:

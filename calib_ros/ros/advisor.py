@@ -17,6 +17,7 @@ import copy
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,9 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
+from calib_ros.apply.choice import choose
 from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.design import Design
-from calib_ros.apply.planning import next_pose
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError
@@ -38,6 +39,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import STILL
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros
 from calib_ros.sampling.cdr import trajectory_size
@@ -47,7 +49,7 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 
-CLOUD = 10_000
+CLOUD = 10 * MOST_ENTRIES
 """Points of the cloud of errors (60 ms)."""
 MOST_POINTS = Settings.pose_buffer
 """Points of a trajectory; a longer one is refused."""
@@ -78,7 +80,6 @@ class Guide:
         self._lock = threading.Lock()
         self._advised: tuple[Sample, ...] = ()
         self._advising: Future[None] | None = None
-        self._compensator: tuple[Calibration, Compensator] | None = None
         self._last_trajectory = ''
         self._next_pose = node.create_publisher(JointState, '~/next_pose', to_ros.LATCHED)
         self._errors = node.create_publisher(PointCloud2, '~/workspace_error', to_ros.LATCHED)
@@ -144,11 +145,8 @@ class Guide:
         apart = np.abs(candidates[:, np.newaxis] - taken).max(axis=2).min(axis=1)
         candidates = candidates[apart > STILL]
         if len(candidates):
-            task = design.chain.random_joints(SOME_POSES, rng)
-            found = next_pose(design, candidates, task, self._session.settings.wanted_accuracy)
-            self._next_pose.publish(
-                to_ros.joints(self._session.joint_names, found.joints, self._now())
-            )
+            best = candidates[choose(design, candidates, 1)[0]]
+            self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
 
     def _show(self, calibration: Calibration) -> None:
         found = survey(calibration, CLOUD, np.random.default_rng(0))
@@ -188,7 +186,7 @@ class Guide:
             raise InputError(
                 'there is no accepted calibration to correct it by: call ~/identify or ~/load'
             )
-        compensator = self._compensator_of(calibration)
+        compensator = _compensator(self._session.chain, calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
         program = trajectory_program(
             [robot.get(name, name) for name in message.joint_names],
@@ -212,15 +210,13 @@ class Guide:
                     setattr(point, key, row)
         return answer, words
 
-    def _compensator_of(self, calibration: Calibration) -> Compensator:
-        """Return the compensator of a calibration, made anew for a new one."""
-        if self._compensator is None or self._compensator[0] is not calibration:
-            made = Compensator(self._session.chain, calibration.chain, region=calibration.region)
-            self._compensator = (calibration, made)
-        return self._compensator[1]
-
     def _now(self) -> Any:
         return self._node.get_clock().now().to_msg()
+
+
+@lru_cache(maxsize=1)
+def _compensator(nominal: Chain, calibration: Calibration) -> Compensator:
+    return Compensator(nominal, calibration.chain, region=calibration.region)
 
 
 def _too_large(data: bytes) -> str:

@@ -12,24 +12,27 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.settings import Settings
+from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.settings import STARTUP, Settings
+from calib_ros.values import parse_like
 
 NODE = 'calibration_node'
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the node: its default, what it is for, whether it can change."""
+    """A parameter: its default, what it is for, whether it can change, its smallest value."""
 
     name: str
     default: Any
     text: str
     fixed: bool = True
+    lower: float | None = None
 
 
 BESIDE_SETTINGS = (
@@ -97,7 +100,10 @@ PARAMETERS = {
     each.name: each
     for each in (
         *BESIDE_SETTINGS,
-        *(Parameter(item.name, item.default, item.metadata['text']) for item in fields(Settings)),
+        *(
+            Parameter(each.name, each.default, fixed=each.name in STARTUP, **each.metadata)
+            for each in fields(Settings)
+        ),
         Parameter('use_sim_time', False, 'time is that of /clock', False),
     )
 }
@@ -211,10 +217,7 @@ def switched(given: Mapping[str, str], name: str) -> bool:
     """Return the value of a launch argument that switches something on or off."""
     import yaml
 
-    value = yaml.safe_load(given[name])
-    if not isinstance(value, bool):
-        raise ConfigError(f'launch argument "{name}" must be true or false, not "{given[name]}"')
-    return value
+    return bool(parse_like(False, yaml.safe_load(given[name]), f'launch argument "{name}"'))
 
 
 def rviz_config(text: str, namespace: str, fixed_frame: str = '') -> str:
@@ -247,27 +250,15 @@ def _as_yaml(parameter: Parameter, text: str) -> str:
     """Return the text of a launch argument as YAML of the type of its parameter."""
     import yaml
 
-    default = parameter.default
-    if isinstance(default, str):
-        return _quoted(text)
-    if isinstance(default, bool):
-        return str(switched({parameter.name: text}, parameter.name)).lower()
-    if isinstance(default, tuple):
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:  # such as *.a=0.001, an alias without an anchor
-            value = text
-        names = value if isinstance(value, list) else [text]
-        if all(isinstance(name, str) for name in names):
-            return f'[{", ".join(_quoted(name) for name in names)}]'
-        expected = "a list of texts such as ['*.a=0.001', '*.alpha=0.001']"
-    else:
-        whole = isinstance(default, int)
-        try:
-            return str(int(text) if whole else float(text))
-        except ValueError:
-            expected = 'a whole number' if whole else 'a number'
-    raise ConfigError(f'launch argument "{parameter.name}" must be {expected}, not "{text}"')
+    given: object = text
+    with suppress(yaml.YAMLError):  # such as *.a=0.001, an alias without an anchor
+        loaded = yaml.safe_load(text)
+        given = loaded if isinstance(loaded, bool | list) else text
+    given = text if isinstance(parameter.default, str) else given
+    value = parse_like(parameter.default, given, f'launch argument "{parameter.name}"')
+    if isinstance(value, tuple):
+        return f'[{", ".join(map(_quoted, value))}]'
+    return _quoted(value) if isinstance(value, str) else str(value).lower()
 
 
 def _quoted(text: str) -> str:

@@ -14,7 +14,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros import to_ros
-from calib_ros.ros.parameters import FrameNames, Links
+from calib_ros.ros.parameters import Given
 
 
 class Broadcast:
@@ -25,12 +25,10 @@ class Broadcast:
     flange (`in_hand`) the base leads to the target that stands, and the tool to the camera.
     """
 
-    def __init__(
-        self, node: Node, names: FrameNames, in_hand: bool, urdf: str, links: Links
-    ) -> None:
-        self._node, self._names, self._in_hand = node, names, in_hand
+    def __init__(self, node: Node, given: Given, in_hand: bool, urdf: str) -> None:
+        self._node, self._given, self._in_hand = node, given, in_hand
         self._publisher = None
-        if not any(names[:2]):
+        if not given.base_frame and not given.flange_frame:
             return
         try:
             from tf2_msgs.msg import TFMessage
@@ -43,7 +41,7 @@ class Broadcast:
         self._publisher = node.create_publisher(TFMessage, '/tf_static', to_ros.LATCHED)
         self._base = self._tool = np.eye(4)
         if urdf:
-            described = chain_from_urdf(urdf, **links)
+            described = chain_from_urdf(urdf, **given.links)
             self._base = described.frame('base').matrix
             self._tool = described.frame('tool').matrix
 
@@ -51,16 +49,17 @@ class Broadcast:
         """Publish the frames of a calibrated chain whose measurements are in a frame `world`."""
         if self._publisher is None:
             return
-        names, transforms = self._names, []
-        stands, moves = (names.target, world) if self._in_hand else (world, names.target)
+        given, transforms = self._given, []
+        target = given.target_frame
+        stands, moves = (target, world) if self._in_hand else (world, target)
         if not world:
             self._node.get_logger().warning('the measurements name no frame: /tf_static lacks it')
-        if names.base and stands:
+        if given.base_frame and stands:
             base = chain.frame('base').matrix @ se3.invert(self._base)
-            transforms.append(self._transform(stands, names.base, base))
-        if names.flange and moves:
+            transforms.append(self._transform(stands, given.base_frame, base))
+        if given.flange_frame and moves:
             tool = se3.invert(self._tool) @ chain.frame('tool').matrix
-            transforms.append(self._transform(names.flange, moves, tool))
+            transforms.append(self._transform(given.flange_frame, moves, tool))
         self._publisher.publish(self._type(transforms=transforms))
 
     def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:

@@ -7,11 +7,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from calib_ros.files.archive import Archive
-from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Boundary
 from calib_ros.ros.inputs import Inputs
 from calib_ros.sampling.account import Account
@@ -55,10 +54,14 @@ class Diagnostics:
             level = DiagnosticStatus.ERROR
             words = ''.join(f'{text}; ' for text in failed.values()) + words
             failed.clear()
-        name = f'{self._node.get_fully_qualified_name().lstrip("/")}: calibration'
-        message = DiagnosticArray(
-            status=[to_ros.status(name, self._serial, level, f'{words}{status}', figures)]
+        line = DiagnosticStatus(
+            name=f'{self._node.get_fully_qualified_name().lstrip("/")}: calibration',
+            hardware_id=self._serial,
+            level=level,
+            message=f'{words}{status}',
+            values=[KeyValue(key=key, value=str(value)) for key, value in figures.items()],
         )
+        message = DiagnosticArray(status=[line])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.history import History
 from calib_ros.files.rows import (
@@ -38,32 +40,31 @@ class Filer:
 
     def identified(self, problem: Problem, result: Identification, settings: Settings) -> str:
         """File an identification; return in words why that was not possible."""
-        if self._history is None:
-            return ''
-        return self._file(identified(result, self._about(problem, settings)))
+        return self._file(lambda: identified(result, self._about(problem, settings)))
 
     def validated(
         self, session: CalibrationSession, figures: tuple[ErrorFigures, ErrorFigures], holds: bool
     ) -> str:
         """File how a session's calibration does on its samples, as `identified` does."""
         calibration = session.calibration
-        if self._history is None or calibration is None:
-            return ''
-        now, nominal = figures
-        about = self._about(session.problem(), session.settings, table_hash(calibration.chain))
-        verdict = 'holds' if holds else 'does not hold'
-        return self._file(judged(calibration.chain, nominal, now, verdict, about))
+        assert calibration is not None  # else there were no figures
+        chain, verdict = calibration.chain, 'holds' if holds else 'does not hold'
+
+        def row() -> Row:
+            about = self._about(session.problem(), session.settings, table_hash(chain))
+            return judged(chain, figures[1], figures[0], verdict, about)
+
+        return self._file(row)
 
     def _about(self, problem: Problem, settings: Settings, *more: str) -> Filing:
         sets = (*problem.sets, *problem.judging)
         hashed = settings_hash(self._nominal, settings, *more)
         return Filing(self._serial, measured_at(sets), samples_hash(sets), hashed)
 
-    def _file(self, row: Row) -> str:
-        if self._history is None:
-            return ''
+    def _file(self, row: Callable[[], Row]) -> str:
         try:
-            self._history.file(row)
+            if self._history is not None:
+                self._history.file(row())
         except (CalibrationError, OSError) as err:
             return f'; not filed in the history: {err}'
         return ''

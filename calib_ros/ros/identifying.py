@@ -21,6 +21,7 @@ from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
 from calib_ros.progress import Progress
 from calib_ros.report import words
+from calib_ros.report.reports import reasons_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
 from calib_ros.ros.filer import Filer
@@ -101,9 +102,11 @@ class Identifying:
         """Identify; publish only what is accepted."""
         with self.progress.running():
             result = identify_model(given.problem, given.model, self.progress)
-        self.last = words.summary(result, given.numbers_of(result.outliers), given.warnings)
-        advice = (*result.refusals, *given.warnings, *words.remarks(result))
-        self._advice = next(iter(advice), '')
+        steps = (step for reason in reasons_of(result) for step in reason.steps)
+        first = next(steps, '')
+        numbers = given.numbers_of(result.outliers)
+        self.last = words.summary(result, numbers, given.warnings, first)
+        self._advice = first or next(iter((*given.warnings, *words.remarks(result))), '')
         self.observability = words.observability_in_words(result)
         self._residuals.publish(
             to_ros.residual_markers(
@@ -158,4 +161,4 @@ def _page(given: Snapshot, result: Identification) -> str | None:
     files = inputs_of([Path(journal)] if journal else [])
     origin = Origin(files, serial=serial, settings=given.configuration)
     poses = poses_of(given.problem, result)
-    return render(identification_report(given.problem, result, poses, origin))
+    return render(identification_report(given.problem, result, poses, origin, given.warnings))

@@ -75,12 +75,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             **node_options,
         )
         given, names = declare_all(self)
-        home = Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser()
+        home = Path(os.environ.get('ROS_HOME', '~/.ros'))
         chain, urdf = load_robot(self, given)
         self._given = given
         self._boundary = Boundary(self.get_logger())
         self._archive = Archive(
-            given.data_dir or home / 'calib_ros',
+            Path(given.data_dir or home / 'calib_ros').expanduser(),
             f'{chain.name}/{given.serial or self.get_namespace()}'.rstrip('/'),
             len(chain.joints),
             self._configuration,
@@ -92,7 +92,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         filer = Filer(given.history, given.serial, chain)
         self._filer, self._status_text = filer, ''
         self.lost = ''
-        """Why samples were lost at the end; empty when none were."""
+        """What samples were not kept in data_dir at the end, and why; empty when all were."""
         if given.resume:
             self._resume()
         self._inputs = Inputs(self, self._streams(), self._boundary.guarded)
@@ -107,7 +107,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._diagnostics = Diagnostics(
             self, self.session, self._archive, self._inputs, self._boundary, given.serial
         )
-        candidates = read_joints(given.candidates, chain) if given.candidates else None
+        candidates = None
+        if given.candidates:
+            candidates = read_joints(Path(given.candidates).expanduser(), chain)
         self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
@@ -154,10 +156,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         ended.append(self._guide.join(JOIN_TIMEOUT))
         self._take_messages()
         self.session.finish()
-        self._archive.close()
-        self.lost = self._archive.error
+        self.lost = self._archive.close()
         if self.lost:
-            self.get_logger().error(f'poses are lost: {self.lost}')
+            self.get_logger().error(self.lost)
         self.destroy_node()
         return all(ended)
 
@@ -166,9 +167,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     def _configuration(self) -> str:
         """Return what this node is set to as a parameter file."""
         given = self._given
-        more = {name: str(link) for name, link in given.links.items() if link}
-        if given.serial:
-            more['serial'] = given.serial
+        named = ('base_link', 'tip_link', 'serial')
+        more = {name: getattr(given, name) for name in named if getattr(given, name)}
         return words.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
@@ -212,19 +212,16 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
     ) -> Subscription:
         """Subscribe; a time that cannot be must not end the node."""
-        if topic == CLOCK_TOPIC:
-            callback = self._of_times(callback)
-        return super().create_subscription(msg_type, topic, callback, *args, **more)
 
-    def _of_times(self, callback: Callable[..., None]) -> Callable[..., None]:
-        def checked(message: Any) -> None:
-            if message.clock.sec < 0:
-                words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
-                self.get_logger().warning(words, once=True)
-            else:
+        def of_times(message: Any) -> None:
+            if message.clock.sec >= 0:
                 callback(message)
+                return
+            words = f'negative times on {CLOCK_TOPIC} are not used, {message.clock.sec} s say'
+            self.get_logger().warning(words, once=True)
 
-        return checked
+        taken = of_times if topic == CLOCK_TOPIC else callback
+        return super().create_subscription(msg_type, topic, taken, *args, **more)
 
     def _take_messages(self) -> None:
         """Take what has come in the order in which it came."""

@@ -69,7 +69,7 @@ class Keeper:
             self._named(name)  # refused now rather than after a day's work
         sources = parse_sources(given.settings.sources)
         in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
-        self._broadcast = Broadcast(node, given.frames, in_hand, urdf, given.links)
+        self._broadcast = Broadcast(node, given, in_hand, urdf)
         self._corrected_pose = node.create_publisher(PoseStamped, '~/corrected_pose', 10)
 
     def adopt(
@@ -180,9 +180,10 @@ class Keeper:
             return None
         if not name.endswith(('.yaml', '.yml')):
             raise InputError(f'{parameter} must end in .yaml or .yml')
+        allowed = self._given.allowed_folders
         return confined(
             name,
-            (self._archive.folder, *self._given.allowed_folders),
+            (self._archive.folder, *(Path(each).expanduser() for each in allowed)),
             f'choose {parameter} in data_dir, or start the node with allowed_folders',
         )
 

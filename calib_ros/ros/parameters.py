@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -23,9 +23,10 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.ros.arguments import BESIDE_SETTINGS
+from calib_ros.ros.arguments import PARAMETERS, Parameter
 from calib_ros.sampling.slices import SILENCE
-from calib_ros.settings import STARTUP, Settings
+from calib_ros.settings import Settings
+from calib_ros.values import LARGEST_SETTING, parse_like
 
 QOS = 'qos_overrides.'
 OF_ROS = ('use_sim_time', 'start_type_description_service')
@@ -41,29 +42,29 @@ class Links(TypedDict):
     tip_link: str | None
 
 
-class FrameNames(NamedTuple):
-    """What the frames are called on /tf_static; nothing is published of one without a name."""
-
-    base: str
-    flange: str
-    target: str
-
-
 @dataclass(frozen=True)
 class Given:
-    """What a node was started with; what else may change is read where it is used."""
+    """Parameters that a node was started with; what may change is read where it is used."""
 
     chain: str
-    links: Links
+    base_link: str
+    tip_link: str
     serial: str
     history: str
-    data_dir: Path | None
-    allowed_folders: tuple[Path, ...]
+    data_dir: str
+    allowed_folders: tuple[str, ...]
     resume: bool
     autoload: bool
-    candidates: Path | None
-    frames: FrameNames
+    candidates: str
+    base_frame: str
+    flange_frame: str
+    target_frame: str
     settings: Settings
+
+    @property
+    def links(self) -> Links:
+        """Return the links that are given."""
+        return Links(base_link=self.base_link or None, tip_link=self.tip_link or None)
 
 
 def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
@@ -80,38 +81,27 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     for name in overrides:
         node.undeclare_parameter(name)
     own = {
-        each.name: _declare(node, overrides, each.name, each.default, each.text, each.fixed)
-        for each in BESIDE_SETTINGS
+        each.name: _declare(node, overrides, each)
+        for each in PARAMETERS.values()
+        if each.name not in OF_ROS
     }
-    settings = Settings(
-        **{item.name: _declare_setting(node, overrides, item) for item in fields(Settings)}
-    )
+    settings = Settings(**{each.name: own[each.name] for each in fields(Settings)})
     refuse_unknown(node, [*overrides], QOS)
     if not own['chain']:
         raise ConfigError(
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    plain = ('chain', 'serial', 'history', 'resume', 'autoload')
-    given = Given(
-        links=Links(base_link=own['base_link'] or None, tip_link=own['tip_link'] or None),
-        data_dir=_path(own['data_dir']),
-        allowed_folders=tuple(Path(name).expanduser() for name in own['allowed_folders']),
-        candidates=_path(own['candidates']),
-        frames=FrameNames(*(own[f'{name}_frame'] for name in FrameNames._fields)),
-        settings=settings,
-        **{name: own[name] for name in plain},
-    )
-    return given, [*overrides]
+    known = own | {'settings': settings}
+    return Given(**{each.name: known[each.name] for each in fields(Given)}), [*overrides]
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
     """Return settings with what changes of parameters make of them."""
-    known = {item.name: item.default for item in fields(Settings)}
-    values: dict[str, Any] = {
-        each.name: _names(each.value) if isinstance(known[each.name], tuple) else each.value
+    values = {
+        each.name: parse_like(getattr(Settings, each.name), each.value, each.name)
         for each in changes
-        if each.name in known
+        if hasattr(Settings, each.name)
     }
     return replace(settings, **values)
 
@@ -152,59 +142,16 @@ def refuse_unknown(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.
             raise UnknownNameError('parameter', name, known)
 
 
-def _path(name: str) -> Path | None:
-    return Path(name).expanduser() if name else None
-
-
-def _declare(
-    node: Node,
-    overrides: Mapping[str, Any],
-    name: str,
-    default: Any,
-    text: str,
-    read_only: bool = True,
-    **ranges: Any,
-) -> Any:
-    descriptor = ParameterDescriptor(description=text, read_only=read_only, **ranges)
-    given = name in overrides
-    if given and (expected := _expected(name, default, overrides[name])):
-        raise ConfigError(f'parameter "{name}" must be {expected}')
-    if isinstance(default, tuple):  # an empty list has no type in ROS, [''] has one
-        return _names(node.declare_parameter(name, [''], descriptor).value)
-    if isinstance(default, float):  # so that 1 is taken as 1.0
-        value = float(overrides[name] if given else default)
-        return node.declare_parameter(name, value, descriptor, ignore_override=True).value
-    return node.declare_parameter(name, default, descriptor).value
-
-
-def _expected(name: str, default: Any, value: Any) -> str:
-    """Return in words what a value is and should be; empty when it will do."""
-    if isinstance(default, str) and not isinstance(value, str):
-        return f"text, not {value!r}: write it in quotes, for example {name}: '0012'"
-    if isinstance(default, tuple) and not (
-        isinstance(value, list) and all(isinstance(each, str) for each in value)
-    ):
-        return f"a list of texts such as ['a', 'b'], not {value!r}"
-    if isinstance(default, bool) and not isinstance(value, bool):
-        return f'true or false, not {value!r}'
-    if isinstance(default, float) and type(value) not in (int, float):
-        return f'a number, not {value!r}'
-    if type(default) is int and type(value) is not int:
-        return f'a whole number, not {value!r}'
-    return ''
-
-
-def _declare_setting(node: Node, overrides: Mapping[str, Any], item: Any) -> Any:
-    text, lower = item.metadata['text'], item.metadata.get('lower')
-    ranges: dict[str, Any] = {}
-    if isinstance(item.default, int):
-        ranges['integer_range'] = [IntegerRange(from_value=int(lower), to_value=2**31 - 1)]
-    elif isinstance(item.default, float):
-        span = FloatingPointRange(from_value=float(lower), to_value=1e9)
-        ranges['floating_point_range'] = [span]
-    fixed = item.name in STARTUP
-    return _declare(node, overrides, item.name, item.default, text, fixed, **ranges)
-
-
-def _names(values: Sequence[str] | None) -> tuple[str, ...]:
-    return tuple(name for name in values or () if name)
+def _declare(node: Node, overrides: Mapping[str, Any], each: Parameter) -> Any:
+    descriptor = ParameterDescriptor(description=each.text, read_only=each.fixed)
+    if each.lower is not None and isinstance(each.default, int):
+        span = IntegerRange(from_value=int(each.lower), to_value=int(LARGEST_SETTING))
+        descriptor.integer_range = [span]
+    elif each.lower is not None:
+        span = FloatingPointRange(from_value=float(each.lower), to_value=LARGEST_SETTING)
+        descriptor.floating_point_range = [span]
+    given = overrides.get(each.name, each.default)
+    value = parse_like(each.default, given, f'parameter "{each.name}"')
+    plain = [*value] or [''] if isinstance(value, tuple) else value  # [] has no type in ROS
+    node.declare_parameter(each.name, plain, descriptor, ignore_override=True)
+    return value

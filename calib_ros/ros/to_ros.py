@@ -9,12 +9,11 @@ arrives as garbage: everything is made a plain Python value here.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Point, PoseStamped, Quaternion, Transform, Vector3
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, PointCloud2, PointField
@@ -86,16 +85,6 @@ def cloud(fields: Sequence[str], rows: FloatArray, frame_id: str, stamp: Any) ->
     message.row_step = data.nbytes
     message.data = array('B', data.tobytes())
     return message
-
-
-def status(
-    name: str, hardware_id: str, level: bytes, text: str, values: Mapping[str, Any]
-) -> DiagnosticStatus:
-    """Return one line of diagnostics."""
-    pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticStatus(
-        name=name, hardware_id=hardware_id, level=level, message=text, values=pairs
-    )
 
 
 def residual_markers(

@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.collector import ADVANCE_NS, Collector
+from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, STEP, Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
@@ -20,21 +20,33 @@ from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import JOINTS, Piece, Slice, StreamKey, merged
 from calib_ros.settings import Settings
 from calib_ros.shown import NAMED
+from calib_ros.values import MOST_NAMES
 
 WATCH_NS = round(5e9 * LEAST_MOTION)
 """Time over which a watch looks."""
 DENSE_NS = round(0.8e9 * STEP)
 """Time between two samples that it keeps; nearer ones tell no more of speeds."""
-WATCHED = 5 * WATCH_NS // DENSE_NS
-"""Samples that it keeps at most, of several streams."""
-CLOCKS_MOVED = SMOOTHING
-"""Difference of two delays [s] from which a clock was moved; speeds tell none finer."""
-LOOK_AGAIN_NS = 4 * ADVANCE_NS
-"""Time between two looks for the delay."""
-EARLY = CLOCKS_MOVED / 2.0**0.5
+EARLY = SMOOTHING / 2.0**0.5
 """Time [s] by which measurements of a stop may be stamped too early: the accuracy of one delay. Of
 what then shows the arm leaving, most is left out as spikes; the rest moves the mean by less than
 the noise of a measurement."""
+
+
+class Sparse(Rows):
+    """Rows no nearer to each other than DENSE_NS."""
+
+    _last_ns = 0
+
+    def take(self, pieces: Sequence[Piece]) -> None:
+        """Take what is in pieces, as far as there is room."""
+        stamps, numbers = merged(pieces, self.width)
+        chosen: list[int] = []
+        for i, stamp_ns in enumerate(stamps.tolist()):
+            if abs(stamp_ns - self._last_ns) >= DENSE_NS:
+                self._last_ns = stamp_ns
+                chosen.append(i)
+        del chosen[self.capacity - self.count :]
+        self.extend(stamps[chosen], numbers[chosen])
 
 
 class Watch:
@@ -44,12 +56,12 @@ class Watch:
     they do, and are left out or refused. Without stops it is `sleepless`.
     """
 
-    def __init__(self, chain: Chain, sleepless: bool, max_gap: float) -> None:
+    def __init__(self, chain: Chain, sleepless: bool, settings: Settings) -> None:
         self._chain = chain
-        self._sleepless, self._max_gap = sleepless, max_gap
-        self._joints = Rows(len(chain.joints), WATCHED)
-        self._poses = Rows(7, WATCHED)
-        self._last_ns = [0, 0]
+        self._sleepless, self._max_gap = sleepless, settings.max_gap
+        self._capacity = settings.pose_buffer
+        self._joints = Sparse(len(chain.joints), self._capacity)
+        self._poses: dict[StreamKey, Sparse] = {}
         self._unrest = 0
         self._taken = self._agreed = 0
         self.awake = True
@@ -69,23 +81,20 @@ class Watch:
             self.awake, self._agreed = True, calm
         self._unrest, self._taken = unrest, taken
 
-    def take(self, joints: Sequence[Piece], poses: Sequence[Piece]) -> None:
-        """Take values of all joints, and measured positions, each with the rotation if known."""
+    def take(self, pieces: Sequence[Piece]) -> None:
+        """Take values of all joints, and measured positions with the rotation if known."""
         if not self.awake:
             return
-        for k, rows, pieces in ((0, self._joints, joints), (1, self._poses, poses)):
-            room = rows.capacity - rows.count
-            if not pieces or not room:
-                continue
-            stamps, numbers = merged(pieces, rows.width)
-            chosen: list[int] = []
-            last = self._last_ns[k]
-            for i, stamp_ns in enumerate(stamps.tolist()):
-                if abs(stamp_ns - last) >= DENSE_NS:
-                    last = stamp_ns
-                    chosen.append(i)
-            self._last_ns[k] = last
-            rows.extend(stamps[chosen[:room]], numbers[chosen[:room]])
+        joints = []
+        for each in pieces:
+            key = each.key
+            if not isinstance(key, StreamKey):
+                if len(key) == len(self._chain.joints):
+                    joints.append(each)
+            elif key.is_place and (key in self._poses or len(self._poses) < MOST_NAMES):
+                self._poses.setdefault(key, Sparse(7, self._capacity)).take([each])
+        if joints:
+            self._joints.take(joints)
 
     @property
     def begun_ns(self) -> int | None:
@@ -96,18 +105,19 @@ class Watch:
         """Look what the motion shows if it is time to, and begin anew."""
         if not (self.awake and self.begun_ns and abs(now_ns - self.begun_ns) > WATCH_NS):
             return
-        joints, poses = self._joints, self._poses
-        for rows in (joints, poses):
+        joints, poses = self._joints, self._poses.values()
+        for rows in (joints, *poses):
             rows.sort()
-        both = (joints.stamps, joints.values), (poses.stamps, poses.values)
-        found = _delay_of(self._chain, *both, self._max_gap)
-        for rows in (joints, poses):
-            rows.release(rows.count)
+        measured = [(rows.stamps, rows.values) for rows in poses]
+        found = _delay_of(self._chain, (joints.stamps, joints.values), measured, self._max_gap)
+        joints.release(joints.count)
+        self._poses.clear()
         if found is None:
             return
         known = self.delay
         every = (found.seconds, *found.rivals)
-        if known is None or min(abs(each - known.seconds) for each in every) > CLOCKS_MOVED:
+        # Speeds over SMOOTHING tell no finer difference.
+        if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
             if found.rivals:
                 self.unclear = found if known is None else None
                 return
@@ -125,7 +135,7 @@ class Clocks:
         self.settings = settings
         self._chain = chain
         self._continuous = settings.mode == 'continuous'
-        self.watch = Watch(chain, self._continuous, settings.max_gap)
+        self.watch = Watch(chain, self._continuous, settings)
         self._found: Delay | None = None  # in the motion that is sampled
         self._looked_ns = 0
 
@@ -135,18 +145,6 @@ class Clocks:
         if not self._continuous:
             return self.watch.delay
         return None if self._found is None or self._found.rivals else self._found
-
-    def take(self, given: Slice) -> None:
-        """Take messages."""
-        if self.watch.awake:
-            joints, poses = [], []
-            for each in given.pieces:
-                if not isinstance(each.key, StreamKey):
-                    if len(each.key) == len(self._chain.joints):
-                        joints.append(each)
-                elif not (each.key.distance or each.key.eye_in_hand or each.key.images):
-                    poses.append(each)
-            self.watch.take(joints, poses)
 
     def calm(self, given: Slice) -> tuple[int, int]:
         """Return stamps of joints between which there is nothing to look for."""
@@ -162,7 +160,7 @@ class Clocks:
         """
         if not collector.holding:
             return
-        if now_ns is not None and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
+        if now_ns is not None and 0 <= now_ns - self._looked_ns < 1e9 * LEAST_MOTION:
             return
         self._looked_ns = now_ns or 0
         self._found = self._find(collector, now_ns)
@@ -173,14 +171,8 @@ class Clocks:
 
         One that has rivals is not used.
         """
-        known, positions = collector.known(now_ns)
-        gap = self.settings.max_gap
-        delays = [_delay_of(self._chain, known, measured, gap) for measured in positions]
-        found = [each for each in delays if each is not None]
-        if not found:
-            return None
-        best = max(found, key=lambda delay: (not delay.rivals, delay.correlation))
-        if not best.rivals:
+        best = _delay_of(self._chain, *collector.known(now_ns), self.settings.max_gap)
+        if best is not None and not best.rivals:
             collector.delay_ns = round(best.seconds * 1e9)
         return best
 
@@ -207,11 +199,17 @@ class Clocks:
 def _delay_of(
     chain: Chain,
     joints: tuple[Stamps, FloatArray],
-    measured: tuple[Stamps, FloatArray],
+    streams: Sequence[tuple[Stamps, FloatArray]],
     max_gap: float,
 ) -> Delay | None:
-    """Return how late poses are: rows (N, 7 or more), with NaN where no rotation is known."""
-    stamps, rows = measured
-    oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
-    rotations = se3.from_quat(rows[:, QUAT]) if oriented else None
-    return find_delay(chain, *joints, stamps, rows[:, POSITION], rotations, max_gap)
+    """Return how late poses are, by the stream that shows it best.
+
+    Rows (N, 7 or more) of each stream have NaN where no rotation is known.
+    """
+    found = []
+    for stamps, rows in streams:
+        oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
+        rotations = se3.from_quat(rows[:, QUAT]) if oriented else None
+        delay = find_delay(chain, *joints, stamps, rows[:, POSITION], rotations, max_gap)
+        found += [] if delay is None else [delay]
+    return max(found, key=lambda delay: (not delay.rivals, delay.correlation), default=None)

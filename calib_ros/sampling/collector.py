@@ -78,7 +78,7 @@ class Collector:
         positions = [
             (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
             for key, rows in self.waiting.items()
-            if not (key.distance or key.eye_in_hand or key.images)
+            if key.is_place
         ]
         return (stamps[complete], joints[complete]), positions
 

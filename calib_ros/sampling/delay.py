@@ -20,22 +20,18 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.rows import Stamps
-from calib_ros.settings import Settings
+from calib_ros.settings import EXCEPTION, Settings
 
 SMOOTHING = 0.5 * Settings.max_gap
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
 STEP = SMOOTHING / 10.0
 """Time between two values of the speeds [s]."""
-MOST_DELAY = Settings.lateness
-"""Largest delay that is looked for [s]: as late as measurements may come."""
-LEAST_MOTION = 3.0 * MOST_DELAY
+LEAST_MOTION = 3.0 * Settings.lateness
 """Time in motion that is needed [s]: so that most of it is compared at every delay."""
 ALIKE_ENOUGH = float(np.sqrt(1.0 - MOST_OUTLIERS))
 """Least correlation: no more of the speeds' variance may be something else than of samples."""
 RISE = 0.02
 """Least rise of the correlation beyond a valley for another peak."""
-IN_MOTION = 0.1
-"""Share of the 95th percentile of the speed beyond which the arm counts as moving."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
 
@@ -59,9 +55,11 @@ def find_delay(
     stamps: Stamps,
     positions: FloatArray,
     rotations: FloatArray | None,
-    max_gap: float = MOST_DELAY,
+    max_gap: float = Settings.lateness,
 ) -> Delay | None:
     """Return the delay of measurements (N) against joint samples (M); None where none shows.
+
+    It is looked for up to the lateness that measurements may have.
 
     Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3). Between joint
     samples further apart than `max_gap` [s] nothing is known of their motion.
@@ -70,8 +68,8 @@ def find_delay(
         return None
     start = joint_stamps[0]
     joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
-    begin = max(joint_times[0], times[0] - MOST_DELAY)
-    end = min(joint_times[-1], times[-1] + MOST_DELAY)
+    begin = max(joint_times[0], times[0] - Settings.lateness)
+    end = min(joint_times[-1], times[-1] + Settings.lateness)
     if end - begin < LEAST_MOTION:
         return None
     begin = max(begin, end - MOST_TIME)
@@ -86,11 +84,11 @@ def find_delay(
     poses = chain.forward(joints[nearest])
     first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
     by_joints = np.interp(grid, *first)
-    moving = heard & (by_joints > IN_MOTION * np.percentile(by_joints, 95))
+    moving = heard & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
     second = _speed(times, positions, rotations, rotations is not None)
-    most = round(MOST_DELAY / STEP)
+    most = round(Settings.lateness / STEP)
     lags = STEP * np.arange(-most, most + 1)
     wide = begin + STEP * np.arange(-most, len(grid) + most)
     known = int(np.sum(wide < second[0][0])), int(np.sum(wide <= second[0][-1]))

@@ -115,14 +115,13 @@ class Entry:
             assert each.source is not None
             if self._frames.usual(each.source.device) is None:
                 frames.setdefault(each.source.device, set()).add(each.readings.strings[0])
-        if all(len(some) == 1 for some in frames.values()):
-            return sorted(parts, key=lambda part: int(part.places[0]))
-        single = [
-            Part(part.places[k : k + 1], part.source, part.readings.rows(slice(k, k + 1)))
-            for part in parts
-            for k in range(len(part.places))
-        ]
-        return sorted(single, key=lambda part: int(part.places[0]))
+        if any(len(some) > 1 for some in frames.values()):
+            parts = [
+                Part(part.places[k : k + 1], part.source, part.readings.rows(slice(k, k + 1)))
+                for part in parts
+                for k in range(len(part.places))
+            ]
+        return sorted(parts, key=lambda part: int(part.places[0]))
 
     def _is_in_frame(self, device: str, frame_id: str, wanted: str, count: int) -> bool:
         """Tell whether measurements are in the frame of their device; count them if not."""

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.sampling.cdr import decode, head, transforms
+from calib_ros.sampling.cdr import alike, head
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
@@ -163,35 +163,31 @@ class Intake:
         self.parts: list[Part] = []
         self.faults: dict[str, Counter[str]] = {JOINTS: Counter(), POSES: Counter()}
         self.problems: list[str] = []
-        lengths: dict[tuple[str, int], list[int]] = {}
+        groups: dict[tuple[str, int], list[int]] = {}
         for place, (stream, data) in enumerate(batch):
             if stream.type in OF_CAMERAS:
                 self._keep(place, stream, data)
                 continue
             size = len(data) if isinstance(data, bytes) else 0
-            lengths.setdefault((stream.topic, size), []).append(place)
+            groups.setdefault((stream.topic, size), []).append(place)
         linked: list[Linked] = []
         single: list[int] = []
-        for (_, size), places in lengths.items():
-            stream = batch[places[0]][0]
-            blobs = [batch[place][1] for place in places] if size else []
-            if stream.links is None:
-                found = decode(stream.type, blobs) if size else None
-                if found is None:
-                    single += places
-                else:
-                    self._add(stream.source, stream.type, np.array(places), found)
-                continue
-            left = set(places)
-            if size and stream.type == TRANSFORMS:
-                for alike in transforms(blobs, stream.links.layouts):
-                    where = np.array(places)[alike.which]
-                    left.difference_update(where.tolist())
-                    linked += [
-                        Linked(stream, where, link, alike.span(k), partial(alike.of, k))
-                        for k, link in enumerate(alike.layout.links)
-                    ]
-            single += left
+        for (_, size), group in groups.items():
+            stream, places = batch[group[0]][0], np.array(group)
+            left = np.ones(len(places), dtype=bool)
+            known = {} if stream.links is None else stream.links.layouts
+            blobs = [batch[place][1] for place in group]
+            for some in alike(stream.type, blobs, known) if size else ():
+                left[some.which] = False
+                where = places[some.which]
+                if stream.links is None:
+                    self._add(stream.source, stream.type, where, some.of(0))
+                    continue
+                linked += [
+                    Linked(stream, where, _pair(item.strings), some.span(k), partial(some.of, k))
+                    for k, item in enumerate(some.layout.items)
+                ]
+            single += places[left].tolist()
         self._add_links([*linked, *self._decode(sorted(single))])
 
     def _add(self, source: Source | None, kind: str, places: Places, found: Readings) -> None:
@@ -250,9 +246,8 @@ class Intake:
             self._add(stream.source, stream.type, *_stacked(some, strings))
         for (stream, strings, _), some in links.items():
             where, each = _stacked(some, strings)
-            link = frame_name(strings[0]), frame_name(strings[1])
             span = int(each.stamps_ns[0]), int(each.stamps_ns[-1])
-            yield Linked(stream, where, link, span, partial(Readings, *each))
+            yield Linked(stream, where, _pair(strings), span, partial(Readings, *each))
 
     def _add_links(self, come: Sequence[Linked]) -> None:
         """Add what is measured by links between frames.
@@ -286,6 +281,11 @@ class Intake:
         for links in links_of(stream for stream, _ in self._batch):
             cause = 'buffer full before their frames were linked'
             self.faults[POSES] += Counter({cause: links.let_go()})
+
+
+def _pair(strings: Sequence[str]) -> Pair:
+    """Return the two frames of a link."""
+    return frame_name(strings[0]), frame_name(strings[1])
 
 
 def _stacked(rows: Sequence[Row], strings: tuple[str, ...]) -> tuple[Places, Readings]:

@@ -20,10 +20,6 @@ from calib_ros.sampling.track import CAUSES
 from calib_ros.sampling.waiting import TOO_LATE
 from calib_ros.settings import Settings
 
-LEAST_FAR = Settings.lateness
-"""Least time [s] by which a stray stamp is off. One ahead by more than `lateness` would settle
-what has not come yet; joint states up to `max_gap` apart belong together."""
-
 
 class Road:
     """Keeps messages by slices up to a joint state after which there is something to do.
@@ -38,7 +34,9 @@ class Road:
         self.collector = Collector([j.type == 'revolute' for j in chain.joints], settings)
         self.collector.holding = settings.mode == 'continuous' and settings.delay == 0.0
         self.clocks = Clocks(chain, settings)
-        self.gate = Gate(max(settings.lateness + settings.max_gap, LEAST_FAR))
+        # A stamp ahead by more than `lateness` would settle what has not come yet; joint states
+        # up to `max_gap` apart belong together.
+        self.gate = Gate(max(settings.lateness + settings.max_gap, Settings.lateness))
         self.notes: Counter[str] = Counter()
         self._delay_ns = round(settings.delay * 1e9)
         self._newest = {JOINTS: 0, POSES: 0}
@@ -110,7 +108,7 @@ class Road:
                 self._newest[kind] = int(newest[-1])
                 if back := int((times < newest).sum()):  # nothing is lost by it
                     self.notes[f'{kind} with a stamp older than the one before'] += back
-        self.clocks.take(given)
+        self.clocks.watch.take(given.pieces)
         rounds = self.collector.take(given)
         if rounds:
             self.clocks.find(self.collector, rounds[-1])

@@ -8,7 +8,7 @@ A sample is what the live node takes, what the journal keeps, and what a row of 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -203,25 +203,40 @@ def collect(
     without a covariance of their own. `frames` remembers the names given to earlier samples. With
     `posed` the poses of boards are taken instead of their corners.
     """
+    known = list(samples)
     frames = Frames() if frames is None else frames
-    groups: dict[tuple[str, str, str, bool, bool], list[Sample]] = {}
-    for sample in samples:
-        base, tool = frames.of(sample)
+
+    def observed(members: Sequence[int]) -> Observations:
+        return _observations([known[k] for k in members], posed)
+
+    return sets_of(known, observed, sigmas, frames, posed)
+
+
+def sets_of(
+    samples: Sequence[Sample],
+    observed: Callable[[Sequence[int]], Observations],
+    sigmas: tuple[float, float],
+    frames: Frames,
+    posed: bool = False,
+) -> tuple[tuple[Observations, ...], tuple[Observations, ...]]:
+    """Return what `collect` does of samples, or of an example of each kind of them.
+
+    `observed` returns those of one set, by their numbers, as observations.
+    """
+    groups: dict[tuple[str, str, str, bool, bool], list[int]] = {}
+    for k, sample in enumerate(samples):
         kind = 'socket' if sample.socket else 'plane' if sample.plane else ''
         kind = kind or ('distance' if sample.distance is not None else 'pose')
         kind = 'view' if sample.view is not None and not posed else kind
-        key = (base, tool, kind, sample.eye_in_hand, sample.validation)
-        groups.setdefault(key, []).append(sample)
-    fitted: list[Observations] = []
-    held_out: list[Observations] = []
+        key = (*frames.of(sample), kind, sample.eye_in_hand, sample.validation)
+        groups.setdefault(key, []).append(k)
+    sets: tuple[list[Observations], list[Observations]] = ([], [])
     for (base, tool, kind, eye_in_hand, validation), members in groups.items():
-        observations = replace(_observations(members), base=base, tool=tool)
-        if kind == 'view':
-            observations = _seen(observations, members)
-        elif eye_in_hand:
-            observations = observations.inverted(sigmas)
-        (held_out if validation else fitted).append(observations)
-    return tuple(fitted), tuple(held_out)
+        found = replace(observed(members), base=base, tool=tool)
+        if eye_in_hand and kind != 'view':
+            found = found.inverted(sigmas)
+        sets[validation].append(found)
+    return tuple(sets[0]), tuple(sets[1])
 
 
 def lenses(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
@@ -254,7 +269,7 @@ def _seen(posed: Observations, samples: Sequence[Sample]) -> Observations:
     )
 
 
-def _observations(samples: Sequence[Sample]) -> Observations:
+def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
     """Return samples between the same frames and of the same kind as observations."""
     count = len(samples)
     oriented = np.array([sample.rotation is not None for sample in samples])
@@ -279,7 +294,7 @@ def _observations(samples: Sequence[Sample]) -> Observations:
         nothing = np.zeros(samples[0].joints.shape)  # it stood; how it came there is not known
         return np.array([nothing if row is None else row for row in rows], dtype=np.float64)
 
-    return Observations(
+    found = Observations(
         np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
         np.array([sample.joints for sample in samples], dtype=np.float64),
         positions,
@@ -294,3 +309,4 @@ def _observations(samples: Sequence[Sample]) -> Observations:
         socket=samples[0].socket,
         plane=samples[0].plane,
     )
+    return found if posed or samples[0].view is None else _seen(found, samples)

@@ -45,8 +45,6 @@ ONE_FRAME = (
     'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
     'its own for each source'
 )
-RECENT = NO_ACCIDENT
-"""Samples that a check of the calibration in use looks at."""
 
 
 class CalibrationSession:
@@ -233,7 +231,7 @@ class CalibrationSession:
         found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
-        if frozen(self.samples[-RECENT:]) and (hint := frozen(self.samples)):
+        if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
         return found + self._road.hints(self.received[POSES])
 
@@ -327,7 +325,7 @@ class CalibrationSession:
 
     def recent(self) -> tuple[Calibration, Problem]:
         """Return the calibration in use, and the last stops since then as a problem."""
-        calibration, sets = self._since(RECENT)
+        calibration, sets = self._since(NO_ACCIDENT)
         return calibration, problem_since(calibration, self.chain, sets, self.settings)
 
     def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:

@@ -37,6 +37,11 @@ class StreamKey(NamedTuple):
     frame_id: str = ''
     images: bool = False
 
+    @property
+    def is_place(self) -> bool:
+        """Tell whether it says where the target is in the frame of its device."""
+        return not (self.distance or self.eye_in_hand or self.images)
+
 
 Columns: TypeAlias = tuple[int, ...]
 """The numbers in the chain of the joints that a message names."""

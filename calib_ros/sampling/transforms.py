@@ -18,6 +18,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import Layout
@@ -33,8 +34,6 @@ Pair: TypeAlias = tuple[str, str]
 
 STATIC = '_static'
 """What the name of the topic of links that stand still ends with."""
-HELD = Settings.pose_buffer
-"""Transforms that wait for the frames between which they are."""
 
 
 class Route(NamedTuple):
@@ -75,6 +74,7 @@ class Links:
         self._moving: dict[Pair, Seen] = {}
         self._changed: set[Pair] = set()
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
+        self._parents: dict[str, list[Pair]] = {}  # the links to each frame, as routes up to date
         self._known = False  # whether the routes are up to date
         self._wanted: set[Pair] = set()
         self._open = True  # whether frames of a source are not linked yet
@@ -99,6 +99,11 @@ class Links:
         """Learn that a moving link has come."""
         seen = self._moving.get(link)
         if seen is None:
+            if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
+                self._update()
+                for each in [*self._moving][: MOST_ENTRIES // 2]:
+                    if each not in self._wanted:
+                        del self._moving[each]
             self._moving[link] = Seen(count, first_ns, last_ns)
             self._known = False
             return
@@ -126,7 +131,7 @@ class Links:
         if self._open:
             self._held.append((link, stamps, numbers))
             self._count += len(stamps)
-            while self._count > HELD:
+            while self._count > Settings.pose_buffer:
                 oldest, gone, _ = self._held.popleft()
                 self._count -= len(gone)
                 self._let_go[oldest] += len(gone)
@@ -180,14 +185,24 @@ class Links:
         """Return in words which links move and how often they come, those that stand out first."""
         if not self._moving:
             return f'nothing moves on {self.topic}'
-        order = sorted(self._moving, key=lambda link: (not self._stands_alone(link), link))
+        self._update()
+        # No other moving link is above or below one that stands alone, unlike those of an arm.
+        above = {parent: self._above(parent)[0] for parent, _ in self._moving}
+        parents = {frame for frames in above.values() for frame in frames}
+        alone = {
+            (parent, child)
+            for parent, child in self._moving
+            if child not in parents
+            and not any(pair in self._moving for each in above[parent] for pair in self._to(each))
+        }
+        order = sorted(self._moving, key=lambda link: (link not in alone, link))
         listed = [
             f'{parent} to {child} at {self._moving[parent, child].rate:.0f} Hz'
             for parent, child in order
         ]
         words = f'what moves on {self.topic}: {", ".join(some(listed, LISTED))}'
         parent, child = order[0]
-        if not self._stands_alone(order[0]):
+        if not alone:
             return f'{words}; they hang on one another, as the joints of a robot do'
         kind = '' if self.kind == TRANSFORMS else f'type={short_type(self.kind)} '
         pair = f'parent={shlex.quote(parent)} child={shlex.quote(child)}'
@@ -197,13 +212,6 @@ class Links:
 
     # Details
 
-    def _stands_alone(self, link: Pair) -> bool:
-        """Tell whether no other moving link is above or below it, as in the chain of an arm."""
-        parent, child = link
-        above = [pair for frame in self._above(parent)[0] for pair in self._to(frame)]
-        below = [pair for pair in self._moving if child in self._above(pair[0])[0]]
-        return not below and not any(pair in self._moving for pair in above)
-
     def _of(self, link: Pair) -> Iterator[tuple[Source, Route]]:
         for source, route in self._routes.items():
             if isinstance(route, Route) and route.link == link:
@@ -211,6 +219,9 @@ class Links:
 
     def _update(self) -> None:
         if not self._known:
+            self._parents = {}
+            for link in sorted({*self._fixed, *self._moving}):
+                self._parents.setdefault(link[1], []).append(link)
             self._routes = {source: self._route(source) for source in self.sources}
             routes = self._routes.values()
             self._wanted = {route.link for route in routes if isinstance(route, Route)}
@@ -275,9 +286,7 @@ class Links:
 
     def _to(self, frame: str) -> list[Pair]:
         """Return the links from parents of a frame."""
-        return sorted(
-            {link for each in (self._fixed, self._moving) for link in each if link[1] == frame}
-        )
+        return self._parents.get(frame, [])
 
     def _composed(self, path: Sequence[tuple[Pair, bool]]) -> FloatArray:
         matrix = np.eye(4)

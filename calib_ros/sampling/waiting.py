@@ -14,16 +14,15 @@ from calib_ros.sampling.rows import Rows, Stamps
 from calib_ros.sampling.slices import Slice, StreamKey
 from calib_ros.values import MOST_NAMES
 
-MOST_STREAMS = MOST_NAMES
-"""Streams of measurements that are told apart: a tracker may number markers without end."""
 TOO_LATE = 'measurements: later than lateness allows'
-TOO_MANY = f'measurements: of one more than {MOST_STREAMS} targets, or frames'
+TOO_MANY = f'measurements: of one more than {MOST_NAMES} targets, or frames'
 
 
 class Waiting(dict[StreamKey, Rows]):
     """The buffers by stream, of rows (N, width) each.
 
-    A stream of which samples are `kept` cannot be forgotten.
+    A tracker may number markers without end: a stream without any use is forgotten, unless
+    samples of it are `kept`.
     """
 
     def __init__(
@@ -61,7 +60,7 @@ class Waiting(dict[StreamKey, Rows]):
     def room(self, given: Slice) -> int | None:
         """Return up to where there is room for messages; None where it must be made."""
         streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
-        if len(self.keys() | {each.key for each in streams}) > MOST_STREAMS:
+        if len(self.keys() | {each.key for each in streams}) > MOST_NAMES:
             return None
         end = len(given)
         for key, places, *_ in streams:
@@ -73,11 +72,11 @@ class Waiting(dict[StreamKey, Rows]):
     def _stream(self, key: StreamKey) -> Rows | None:
         """Return the buffer of a stream; None when too many others are in use."""
         if key not in self:
-            if len(self) >= MOST_STREAMS:  # forget those without any use
+            if len(self) >= MOST_NAMES:  # forget those without any use
                 for each in [each for each, rows in self.items() if not rows.count]:
                     if not self._kept(each):
                         del self[each]
-            if len(self) >= MOST_STREAMS:
+            if len(self) >= MOST_NAMES:
                 return None
             self[key] = Rows(self._width, self._capacity)
         return self[key]

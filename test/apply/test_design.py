@@ -170,7 +170,7 @@ def test_worth_by_updates_equals_that_computed_anew(oriented):
     chosen = list(range(12))
     so_far = space.known + information_of(space.rows[chosen])
     by_det, by_task = (
-        choice._score(space, criterion, task)[0](so_far, space.rows) for criterion in ('d', 'task')
+        choice._Worth(space, criterion, task).of(so_far, space.rows) for criterion in ('d', 'task')
     )
     for k in (3, 20, 29):  # one of them a second time
         more = np.concatenate([q[chosen], q[k : k + 1]])
@@ -186,7 +186,7 @@ def test_indices_are_those_of_the_report(criterion):
     q = some(design.chain, 30)
     space = Candidates(design, q)
     so_far = space.known + information_of(space.rows[:12])
-    worth = choice._score(space, criterion, None)[0](so_far, space.rows)
+    worth = choice._Worth(space, criterion).of(so_far, space.rows)
     rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
     factor = np.linalg.qr(rows, mode='r')
     assert worth[20] == pytest.approx(getattr(observability(factor, 13), criterion), rel=1e-5)

@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 from calib_ros.apply import choice, planning, simulation
 from calib_ros.apply.candidates import visit_order
 from calib_ros.apply.choice import choose
-from calib_ros.apply.design import Design, accuracy
+from calib_ros.apply.design import Design, accuracy, predicted
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identifiability import observability
@@ -217,18 +217,14 @@ def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, sessi
 def test_next_poses_lead_to_the_wanted_error():
     chain = arm()
     design, q, task = design_of(chain), some(chain, 500), some(chain, 100, 2)
-    taken, errors = [], []
-    for _ in range(60):
-        step = planning.next_pose(design, q, task, wanted=1.5e-4)
-        if step.enough:
-            break
-        assert step.then <= step.now
-        taken.append(step.joints)
-        errors.append(step.then)
-        design = design.after(step.joints[np.newaxis])
-    assert 10 <= len(taken) < 20
-    assert errors[-1] <= 1.5e-4 < errors[-2]
-    whole = accuracy(design_of(chain), q[choose(design_of(chain), q, len(taken))], task)[-1]
+    errors = [np.inf]
+    while errors[-1] > 1.5e-4:
+        design = design.after(q[choose(design, q, 1)])
+        errors.append(predicted(design, task))
+        assert errors[-1] <= errors[-2]
+    count = len(errors) - 1
+    assert 10 <= count < 20
+    whole = accuracy(design_of(chain), q[choose(design_of(chain), q, count)], task)[-1]
     assert errors[-1] < 1.1 * whole
 
 
@@ -238,9 +234,8 @@ def test_the_next_pose_is_where_the_others_were_not():
     design = design_of(chain).after(near)
     other = some(chain, 20)
     q = np.concatenate([near + 0.01, other])
-    step = planning.next_pose(design, q, other, wanted=1e-4)
-    assert np.abs(step.joints - POSTURE).max() > 0.4
-    assert not step.enough
+    (best,) = choose(design, q, 1)
+    assert np.abs(q[best] - POSTURE).max() > 0.4
 
 
 @pytest.mark.parametrize('criterion', ['d', 'task'])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib_ros.apply import simulation
+from calib_ros.apply import simulation, verification
 from calib_ros.apply.candidates import Visibility
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
@@ -154,7 +154,8 @@ def test_the_limits_hold_as_often_as_they_say(shape, count):
     assert held.mean() < 0.995  # wide enough, and no wider
 
 
-def test_the_limits_of_a_verdict_are_those(arm):
+def test_the_limits_of_a_verdict_are_those(arm, monkeypatch):
+    monkeypatch.setattr(verification, 'DECIDING', 5)  # fewer than were measured
     errors = np.random.default_rng(0).normal(scale=1e-4, size=(7, 3))
     found = verify(arm, [with_errors(arm, errors)], 1e-4)
     wanted = rms_interval(errors, np.arange(7), 0.95)

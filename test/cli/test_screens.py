@@ -26,7 +26,7 @@ from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.cli import screen
 from calib_ros.cli.command import TEXTS
-from calib_ros.cli.commands import COMMANDS
+from calib_ros.cli.commands import examples_of
 from calib_ros.cli.main import _parser, main
 from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
@@ -122,7 +122,7 @@ def test_the_help_of_a_command(shown, name):
 
 @pytest.mark.parametrize('name', TEXTS)
 def test_the_examples_of_a_help_are_right(name):
-    for example in COMMANDS[name].examples:
+    for example in examples_of(name):
         given = shlex.split(example)
         assert given[0] == name
         assert _parser(given).parse_args(given)
@@ -155,6 +155,8 @@ MORE = {
     'identify_refused': (3, 'identify', 'good_arm.csv', *UR5E),
     'identify_of_a_program': (1, 'identify', 'result/report.html', *UR5E),
     'verify_of_a_bag': (3, 'verify', 'bag', *UR5E, '--calibration', 'result', '--tolerance', '1'),
+    'identify_another_arm': (3, 'identify', 'measured.csv', '--chain', 'ur10'),
+    'verify_of_a_lost_calibration': (3, 'verify', 'bumped.csv', *UR5E, '--calibration', 'result'),
     'a_table_as_command': (2, 'measured.csv'),
     'a_bag_as_command': (2, 'bag'),
     'nothing_there': (1, 'identify', 'missing.csv', *UR5E),

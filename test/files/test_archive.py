@@ -3,6 +3,7 @@
 import os
 import resource
 import shutil
+import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -42,6 +43,18 @@ def full_disk(limit):
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_robots_with_long_names_have_files_of_their_own(tmp_path):
+    robots = [f'arm/{"é" * 150}{k}' for k in range(2)]
+    for k, robot in enumerate(robots):
+        archive = open_archive(tmp_path, robot)
+        archive.add(sample(k))
+        archive.close()
+        assert not archive.error
+        archive.save('calibration', 'settings: none')
+        assert archive.note('identified') is not None
+    assert [stamps(tmp_path, robot) for robot in robots] == [[0], [1]]
 
 
 def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
@@ -129,6 +142,28 @@ def test_a_full_disk_loses_nothing(tmp_path):
     archive.write()
     assert archive.error == ''
     assert stamps(tmp_path) == [1, 3, 5, 6, 7]
+
+
+@pytest.mark.parametrize('begun', [True, False])
+def test_what_the_folder_does_not_take_is_kept_elsewhere_at_the_end(tmp_path, monkeypatch, begun):
+    folder, elsewhere = tmp_path / 'data', tmp_path / 'tmp'
+    elsewhere.mkdir()
+    archive = open_archive(folder)
+    if begun:
+        archive.add(sample(1))
+    shutil.rmtree(folder)
+    folder.write_text('in the way')
+    archive.add(sample(2))
+    assert archive.trouble
+    monkeypatch.setattr(tempfile, 'tempdir', str(elsewhere))
+    words = archive.close()
+    (journal,) = elsewhere.glob('*/*.csv')
+    assert f'poses are in {journal}, not in {folder}: ' in words
+    assert stamps(journal.parent) == ([1, 2] if begun else [2])
+    archive = open_archive(tmp_path)
+    with full_disk(0):
+        archive.add(sample(3))
+        assert archive.close().startswith('poses are lost: ')
 
 
 def test_what_waits_for_room_is_not_lost_by_a_clear(tmp_path):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from killed import every_kill, forked, killed_at, status_of, tree
 
-from calib_ros.atomic import confined, whole_folder, write_file, write_files
+from calib_ros.atomic import confined, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
 
 OWN = ('a.txt', 'b.txt', 'sub')
@@ -224,6 +224,51 @@ def test_a_full_disk_changes_nothing(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=r'No space left on device: .*a\.txt'):
         make(path, 'B')
     assert tree(tmp_path) == {f'out/{name}': text for name, text in expected('A').items()}
+
+
+@pytest.mark.parametrize('links', [True, False])
+@pytest.mark.parametrize('fails_again', [False, True])
+def test_of_files_that_belong_together_none_is_replaced_alone(
+    tmp_path, monkeypatch, links, fails_again
+):
+    names = [tmp_path / name for name in 'abc']
+    names[0].write_text('a of A')
+    names[2].mkdir()  # cannot be replaced
+    if not links:
+        monkeypatch.setattr(os, 'link', unsupported)
+    if fails_again:
+        monkeypatch.setattr(Path, 'unlink', unsupported)
+        with pytest.raises(InputError, match=r'b is new, but files that belong .*do not use it'):
+            write_together(dict.fromkeys(names, 'B'), overwrite=True)
+        return
+    with pytest.raises(OSError, match=r'directory: .*c'):
+        write_together(dict.fromkeys(names, 'B'), overwrite=True)
+    assert tree(tmp_path) == {'a': 'a of A'}
+    names[2].rmdir()
+    write_together(dict.fromkeys(names, 'B'), overwrite=True)
+    assert tree(tmp_path) == {'a': 'B', 'b': 'B', 'c': 'B'}
+
+
+def test_a_process_killed_meanwhile_leaves_no_files_of_two_sets(tmp_path):
+    names = [tmp_path / name for name in 'abc']
+
+    def write(text):
+        write_together(dict.fromkeys(names, text), overwrite=True)
+
+    def check():
+        found = {name: text for name, text in tree(tmp_path).items() if name[0] != '.'}
+        assert 'a' in found
+        assert len(set(found.values())) == 1
+        write('A')
+
+    write('A')
+    assert every_kill(tmp_path, lambda: write('B'), check) > 10
+    assert tree(tmp_path)['c'] == 'B'
+
+
+def test_a_name_may_be_as_long_as_the_disk_takes(tmp_path):
+    write_file(tmp_path / ('x' * 255), 'A')
+    assert tree(tmp_path) == {'x' * 255: 'A'}
 
 
 @pytest.mark.parametrize('links', [True, False])

@@ -17,6 +17,7 @@ from recorded import (
     pose_stamped,
     pose_with_covariance,
     record,
+    record_in_chunks,
     recording,
     session_of,
     standing,
@@ -65,11 +66,13 @@ def test_a_bag_gives_what_its_arrays_hold(tmp_path, storage, oriented, held_out,
 
 
 @storages
-def test_a_file_of_a_bag_is_as_good_as_its_folder(tmp_path, storage):
-    write_bag(tmp_path / 'bag', recording(), storage)
+@pytest.mark.parametrize('mode', ['none', 'file'])
+def test_a_file_of_a_bag_is_as_good_as_its_folder(tmp_path, storage, mode):
+    """As it is, or packed by the recorder as a whole."""
+    record_in_chunks(tmp_path / 'bag', storage, mode)
     (file,) = (path for path in (tmp_path / 'bag').iterdir() if path.suffix != '.yaml')
-    folder, _ = session_of(tmp_path / 'bag')
-    alone, warnings = session_of(file)
+    folder, _ = session_of(tmp_path / 'bag', mode='continuous', delay=1e-12)
+    alone, warnings = session_of(file, mode='continuous', delay=1e-12)
     assert warnings == ()
     assert_equal(alone.problem().observations, folder.problem().observations)
 

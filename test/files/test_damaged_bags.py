@@ -197,6 +197,17 @@ def test_a_path_to_nothing_is_refused(tmp_path):
         session_of(tmp_path / 'missing')
 
 
+def test_one_packed_message_that_is_damaged_costs_no_other(tmp_path):
+    path = record_in_chunks(tmp_path / 'bag', 'sqlite3', 'message')
+    (file,) = path.glob('*.db3')
+    with closing(sqlite3.connect(file, isolation_level=None)) as connection:
+        connection.execute("UPDATE messages SET data = x'0011223344' WHERE id = 7")
+    session, (warning,) = session_of(path)
+    account = session.account()
+    assert account.joint_states + account.poses == 279
+    assert '1 of 280 messages are lost' in warning
+
+
 def test_one_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
     path = tmp_path / 'bag'
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:

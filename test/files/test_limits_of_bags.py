@@ -11,12 +11,12 @@ import pytest
 
 from calib_ros.errors import InputError
 from calib_ros.files.bags import Replayed, replay
-from calib_ros.files.mcap import LARGEST_CHUNK
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.salvage import recorded
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.texts import LARGEST_TABLE
 
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
 
@@ -129,7 +129,7 @@ def test_a_chunk_that_unpacks_to_more_costs_its_messages_only(bag):
     place = content.index(b'\x06', 8)
     while struct.unpack_from('<Q', content, place + 1)[0] > len(content):
         place = content.index(b'\x06', place + 1)
-    content[place + 25 : place + 33] = struct.pack('<Q', LARGEST_CHUNK + 1)
+    content[place + 25 : place + 33] = struct.pack('<Q', LARGEST_TABLE + 1)
     file.write_bytes(bytes(content))
     replayed = replay(bag, session())
     assert replayed.read < replayed.recorded

@@ -86,9 +86,9 @@ def test_harmonics_that_are_small_each_are_found_together():
     """As drives of measured robots have: none alone shows, together they are most of the error."""
     rng = np.random.default_rng(2)
     true = arm_with('', rng)
-    names = [n for j in UR10E.joint_names for k in range(3, 60) for n in effects.waves(j, k)]
+    names = [n for j in UR10E.joint_names for k in range(3, 41) for n in effects.waves(j, k)]
     true = true.with_effect_values({name: 3e-5 * rng.normal() for name in names})
-    seen = observed(true, UR10E.random_joints(120, rng), rng)
+    seen = observed(true, UR10E.random_joints(250, rng), rng)
     problem = Problem(UR10E, seen, **SIGMAS)
     plain, auto = identify(problem), identify_model(problem, 'auto')
     assert [verdict.what for verdict in auto.verdicts if verdict.pays] == [
@@ -96,7 +96,7 @@ def test_harmonics_that_are_small_each_are_found_together():
     ]
     unseen = UR10E.random_joints(500, rng)
     assert auto.accepted
-    assert rms(auto.chain, true, unseen) < 0.9 * rms(plain.chain, true, unseen)
+    assert rms(auto.chain, true, unseen) < 0.8 * rms(plain.chain, true, unseen)
 
 
 def test_effects_of_several_kinds_are_found_together():

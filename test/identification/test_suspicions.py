@@ -45,7 +45,7 @@ def test_the_scale_of_a_device_is_found(name, oriented):
     assert std < 5e-5
     assert freedom >= 4
     assert not result.accepted
-    assert any('alike' in each for each in result.refusals)
+    assert any('alike, by 0.3 %' in each for each in result.refusals)
 
 
 def test_growth_that_arms_have_is_said_and_not_refused():

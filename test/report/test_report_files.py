@@ -62,7 +62,8 @@ def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, 
     out = tmp_path / 'out'
     arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
     assert main(arguments) == 0
-    said = capsys.readouterr().err
+    told, said = capsys.readouterr()
+    assert told.endswith(f'wrote {out}\n')  # nothing to open
     assert said.count('\n') == 2
     assert 'calib_ros[report]' in said
     assert 'calib_ros[pdf]' in said

@@ -19,9 +19,8 @@ from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.ros.broadcast import Broadcast
-from calib_ros.ros.parameters import FrameNames
 
-NAMES = FrameNames('base_link', 'tool0', 'ball')
+NAMES = {'base_frame': 'base_link', 'flange_frame': 'tool0', 'target_frame': 'ball'}
 
 
 class Published(SimpleNamespace):
@@ -79,10 +78,8 @@ def test_a_calibration_that_is_loaded_is_broadcast(published, tmp_path):
     truth = true_arm()
     path = tmp_path / 'calibration.yaml'
     path.write_text(dump_chain(truth, {'world_frame': 'leica'}))
-    names = {f'{name}_frame': value for name, value in NAMES._asdict().items()}
-    with Cell(
-        chain='ur10e', data_dir=str(tmp_path), calibration_filename=path.name, **names
-    ) as cell:
+    given = NAMES | {'data_dir': str(tmp_path), 'calibration_filename': path.name}
+    with Cell(chain='ur10e', **given) as cell:
         (message,) = published  # at the start
         assert cell.call('load').success
         assert len(published) == 2
@@ -92,10 +89,11 @@ def test_a_calibration_that_is_loaded_is_broadcast(published, tmp_path):
         np.testing.assert_allclose(found[key], truth.frame(frame).matrix, rtol=0, atol=1e-12)
 
 
-def broadcast(published, chain, world='leica', names=NAMES, in_hand=False, urdf=''):
+def broadcast(published, chain, world='leica', in_hand=False, urdf='', **names):
     published.clear()
+    given = SimpleNamespace(links={}, **(NAMES | names))
     with Cell() as cell:
-        Broadcast(cell.peer, names, in_hand, urdf, {}).publish(chain, world)
+        Broadcast(cell.peer, given, in_hand, urdf).publish(chain, world)
     return transforms(published[0])
 
 
@@ -119,8 +117,6 @@ def test_a_camera_on_the_flange_sees_a_target_that_stands(published):
 
 def test_frames_without_a_name_are_left_out(published):
     chain = true_arm()
-    assert set(broadcast(published, chain, names=NAMES._replace(base=''))) == {('tool0', 'ball')}
-    assert set(broadcast(published, chain, names=NAMES._replace(flange=''))) == {
-        ('leica', 'base_link')
-    }
+    assert set(broadcast(published, chain, base_frame='')) == {('tool0', 'ball')}
+    assert set(broadcast(published, chain, flange_frame='')) == {('leica', 'base_link')}
     assert set(broadcast(published, chain, world='')) == {('tool0', 'ball')}

@@ -110,7 +110,7 @@ def test_ros_takes_text_for_text(text):
     [
         ('resume', 'maybe', 'true or false'),
         ('folds', '2.5', 'a whole number'),
-        ('settle', 'long', 'a number'),
+        ('settle', 'long', 'a finite number'),
         ('priors', '[1, 2]', 'a list of texts'),
     ],
 )

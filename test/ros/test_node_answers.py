@@ -14,8 +14,12 @@ from std_srvs.srv import SetBool
 
 from calib_ros.apply.simulation import measure
 from calib_ros.files.history import History
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
-from calib_ros.ros.identifying import _without_middle
+from calib_ros.report.advice import rules
+from calib_ros.ros.identifying import Snapshot, _page, _without_middle
 
 
 def test_errors_are_answers(cell, recording):
@@ -52,6 +56,24 @@ def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
     assert found.startswith(verdict[:25])
     assert found.endswith(advice[2:])
     assert ' ... ' in found
+
+
+@pytest.mark.parametrize('rule', Rule)
+def test_a_refusal_keeps_what_to_do_first(rule):
+    step = rules()[rule].steps[0]
+    found = _without_middle(
+        f'NOT accepted: {"no gain on held-out poses; " * 9}To do first: {step}', 260
+    )
+    assert found.startswith('NOT accepted: no gain')
+    assert found.endswith(step)
+
+
+def test_the_page_that_is_saved_has_the_warnings():
+    arm, rng = load_chain('ur10e'), np.random.default_rng(0)
+    problem = Problem(arm, measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4))
+    origin = {'journal': '', 'robot_serial': ''}
+    given = Snapshot(problem, 'geometric', (), {}, origin, '', ('the clock jumped',))
+    assert 'the clock jumped' in _page(given, identify(problem))
 
 
 def test_answers_are_in_the_log_as_well(cell, recording):

@@ -264,7 +264,7 @@ def test_two_nodes_of_one_name_are_told(cell, tmp_path):
 def test_a_list_without_end_is_refused(cell):
     for entries, said in (
         ([f'joint_{k}.a' for k in range(100_000)], 'fixed has 100000 entries, at most 1000'),
-        (['x' * 100_000], 'an entry of 100000 characters'),
+        (['x' * 100_000], 'has 100000 characters in an entry'),
     ):
         (result,) = cell.set_parameters({'fixed': entries})
         assert not result.successful

@@ -21,7 +21,8 @@ from hypothesis import given, settings, strategies as st
 from streams import START, stamps, stops, sweep
 
 from calib_ros.sampling.slices import NO_ACCIDENT
-from calib_ros.sampling.waiting import MOST_STREAMS, TOO_MANY
+from calib_ros.sampling.waiting import TOO_MANY
+from calib_ros.values import MOST_NAMES
 
 LATE = 'measurements: later than lateness allows'
 
@@ -184,8 +185,8 @@ def test_targets_without_end_are_dropped_and_counted():
     made = collector()
     play(made, [glimpse(k, 0.5 + 1e-4 * k) for k in range(200)], finish=False)
     play(made, [glimpse(200, time) for time in (0.6, 0.7)], finish=False)
-    assert made.waiting.count == MOST_STREAMS
-    assert made.dropped == {TOO_MANY: 200 - MOST_STREAMS + 2}
+    assert made.waiting.count == MOST_NAMES
+    assert made.dropped == {TOO_MANY: 200 - MOST_NAMES + 2}
 
 
 def test_targets_that_gave_no_sample_make_room_for_others():
@@ -194,11 +195,11 @@ def test_targets_that_gave_no_sample_make_room_for_others():
     glimpses = [glimpse(100 * leg + k, 1.2 + 2.0 * leg + 5e-3 * k) for leg in legs for k in few]
     made, samples = toured(glimpses)
     assert [each.target for each in samples] == [''] * 5
-    assert made.dropped == {TOO_MANY: 4 * (100 - (MOST_STREAMS - 1))}
+    assert made.dropped == {TOO_MANY: 4 * (100 - (MOST_NAMES - 1))}
 
 
 def test_a_target_that_was_sampled_makes_no_room(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.waiting.MOST_STREAMS', 2)
+    monkeypatch.setattr('calib_ros.sampling.waiting.MOST_NAMES', 2)
     motion = tour()
     made = collector()
     both = [pose_events(motion, 1.5, key=marker(k)) for k in (1, 2)]

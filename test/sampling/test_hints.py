@@ -3,15 +3,20 @@
 """Joint states that are slow, noisy or on another clock: as good as they can be, or told."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from streams import START, S, hear, stamps, stops, sweep
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.entry import Part
+from calib_ros.sampling.messages import Readings
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
 UR5E = load_chain('ur5e')
@@ -217,3 +222,22 @@ def test_a_delay_left_open_is_found_when_the_motion_is_less_regular():
     made.finish()
     (warning,) = told(made)
     assert re.search(r'0\.1[45]\d s later', warning)
+
+
+def test_clocks_of_two_devices_are_watched_as_of_one():
+    """What one device sees lies elsewhere for the other: between them nothing moves."""
+    motion, rng = tour(15), np.random.default_rng(3)
+    times = np.arange(0.0, 29.5, 0.01)
+    come = [(times, None, Readings(stamps(times), ('', *UR5E.joint_names), motion(times)))]
+    for k, device in enumerate(('', 'B')):
+        seen = np.arange(0.003 + 0.01 * k, 29.2, 0.02)
+        found = measure(replace(TRUE, base=random_frame(rng, 1.0)), motion(seen), rng, 2e-5, 1e-4)
+        rows = np.hstack([found.positions, se3.to_quat(found.rotations)])
+        source = Source(f'tracker{device}', device=device)
+        come.append((seen + 0.3, source, Readings(stamps(seen + 0.3), ('tracker',), rows)))
+    order = np.argsort(np.concatenate([each for each, *_ in come]), kind='stable')
+    places = np.split(np.argsort(order), np.cumsum([len(each) for each, *_ in come])[:-1])
+    made = CalibrationSession(UR5E)
+    made.take([Part(place, *part) for place, (_, *part) in zip(places, come, strict=True)])
+    (warning,) = told(made)
+    assert re.search(r'0\.[23]\d\d s later', warning)

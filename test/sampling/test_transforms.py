@@ -22,11 +22,12 @@ from recorded import (
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import se3
-from calib_ros.sampling.cdr import transforms
+from calib_ros.sampling.cdr import alike
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source, parse_source, parse_sources
+from calib_ros.sampling.transforms import Links
 from calib_ros.settings import Settings
 
 storages = pytest.mark.parametrize('storage', sorted(STORAGES))
@@ -312,8 +313,22 @@ def session_fed(come, little_endian=True, at_once=True):
     return session
 
 
+def test_frames_without_end_are_not_remembered(rng):
+    """As of a tracker that numbers its markers: the one that is wanted is told from them."""
+    come = [('/tf_static', tf(link('world', 'tracker', 1, frame(rng))))]
+    come += [tf(link('tracker', f'marker {k}', 101 * MS)) for k in range(1200)]
+    come += [tf(link('tracker', 'tool', ms * MS, frame(rng))) for ms in TIMES]
+    come += [tf(link('tracker', f'later {k}', 601 * MS)) for k in range(1200)]
+    session = session_fed([*come, tf(link('tracker', 'tool', 701 * MS, frame(rng)))])
+    assert session.account().samples == 5
+    links = Links('/tf')
+    for k in range(5000):
+        links.move(('tracker', f'marker {k}'), 1, k, k)
+    assert 'and 980 more' in str(links)
+
+
 def test_what_could_not_wait_for_its_frames_is_counted(monkeypatch, rng):
-    monkeypatch.setattr('calib_ros.sampling.transforms.HELD', 5)
+    monkeypatch.setattr(Settings, 'pose_buffer', 5)
     stamps = [100 + 5 * k for k in range(20)]
     come = [tf(link('tracker', 'tool', ms * MS, frame(rng))) for ms in stamps]
     come += [robot(300 * MS, rng), ('/tf_static', tf(link('world', 'tracker', 1, frame(rng))))]
@@ -346,12 +361,12 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
     """Serialisers leave bytes of any kind where numbers are aligned."""
     message = tf(link('world', 'tool', 105 * MS, frame(rng)), link('a', 'bc', 7, frame(rng)))
     data = bytes(TYPESTORE.serialize_cdr(message, TRANSFORMS))
-    (alike,) = transforms([data], {})
-    assert alike.layout.links == (('world', 'tool'), ('a', 'bc'))
+    (one,) = alike(TRANSFORMS, [data], {})
+    assert tuple(item.strings for item in one.layout.items) == (('world', 'tool'), ('a', 'bc'))
     other = bytearray(data)
     gap = data.index(b'world\0') + 6
     other[gap : gap + 2] = b'\xff\xff'
-    (both,) = transforms([data, bytes(other)], {})
+    (both,) = alike(TRANSFORMS, [data, bytes(other)], {})
     assert both.which.tolist() == [0, 1]
     stamps, _, numbers = both.of(1)
     assert stamps.tolist() == [7, 7]
@@ -361,13 +376,13 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
 @pytest.mark.parametrize('cut', range(4, 130, 7))
 def test_messages_that_are_cut_off_are_not_read(rng, cut):
     data = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
-    assert transforms([data[:cut]], {}) == [] or cut >= len(data)
+    assert alike(TRANSFORMS, [data[:cut]], {}) == [] or cut >= len(data)
 
 
 def test_a_name_of_absurd_length_is_not_read():
     data = bytearray(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
     data[16:20] = b'\xff\xff\xff\xff'
-    assert transforms([bytes(data)], {}) == []
+    assert alike(TRANSFORMS, [bytes(data)], {}) == []
 
 
 @pytest.mark.parametrize(

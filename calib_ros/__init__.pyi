@@ -1,0 +1,41 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The public interface: `__init__.py` reads where each name is, type checkers what it is."""
+
+from calib_ros.apply.compensation import Compensator as Compensator, compensate as compensate
+from calib_ros.apply.planning import Plan as Plan, plan as plan
+from calib_ros.apply.program import Program as Program
+from calib_ros.apply.verification import Verification as Verification, verify as verify
+from calib_ros.errors import CalibrationError as CalibrationError
+from calib_ros.files.bags import replay as replay
+from calib_ros.files.tables import read_table as read_table
+from calib_ros.identification.calibration import (
+    Calibration as Calibration,
+    load_calibration as load_calibration,
+)
+from calib_ros.identification.difference import (
+    Difference as Difference,
+    difference as difference,
+)
+from calib_ros.identification.identification import (
+    Identification as Identification,
+    identify as identify,
+)
+from calib_ros.identification.model_choice import identify_model as identify_model
+from calib_ros.identification.observations import Observations as Observations
+from calib_ros.identification.problem import Problem as Problem
+from calib_ros.identification.recalibration import (
+    Recalibration as Recalibration,
+    recalibrate as recalibrate,
+)
+from calib_ros.kinematics.chain import Chain as Chain
+from calib_ros.kinematics.chain_file import dump_chain as dump_chain, load_chain as load_chain
+from calib_ros.kinematics.urdf import (
+    chain_from_urdf as chain_from_urdf,
+    corrected_urdf as corrected_urdf,
+)
+from calib_ros.sampling.session import CalibrationSession as CalibrationSession
+from calib_ros.settings import Settings as Settings
+
+__version__: str
+__all__: list[str]
