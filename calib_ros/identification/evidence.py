@@ -38,6 +38,7 @@ from scipy import special
 from scipy.linalg import lapack
 
 from calib_ros.identification.leastsquares import Normal, System, normal_equations
+from calib_ros.identification.levels import PRINTED, SCALE
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -58,10 +59,6 @@ CONSIDERED = ('eccentricity', 'gravity')
 SHOWN, REFUTED = 1.35, 3.0
 """Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
 which those of usual size are refuted."""
-SCALE = 1e-4
-"""Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
-PRINTED = 5e-3
-"""The same of a printed board."""
 MOST_SAMPLES = 2000
 """Samples from which sizes are told; of more, every so many are taken."""
 SETTLED = 0.02

@@ -26,6 +26,10 @@ TELLING = 8
 """Values from which on their spread tells anything: it is known to a quarter, (2 n)^-1/2."""
 KNOWN = 1.0 / HALF_THE_DIGITS
 """Degrees of freedom that are as good as infinite."""
+SCALE = 1e-4
+"""Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
+PRINTED = 5e-3
+"""The same of a printed board."""
 
 
 def chance_of(squares: float, rank: int, freedom: float) -> float:

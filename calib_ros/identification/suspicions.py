@@ -28,10 +28,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
-from calib_ros.identification.evidence import SCALE
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
-from calib_ros.identification.levels import NEARER
+from calib_ros.identification.levels import NEARER, SCALE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
