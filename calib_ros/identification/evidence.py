@@ -173,27 +173,11 @@ def posterior_of(
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
-    Parameters
-    ----------
-    chain, nominal : Chain
-        The fitted arm, and the one whose offsets are normal about zero.
-    names : sequence of str
-        Parameters that were fitted.
-    system : System
-        The samples of the fit, with their weights.
-    noise : float
-        Size of the noise [sigma given].
-    known : mapping of str to float
-        Priors [m or rad] that were given.
-    more : sequence of str
-        Effects to consider.
-    doubts : mapping of str to float
-        Parameters that something else than the arm moves as well, with its standard deviation.
-    at_the_fit : Normal
-        The last normal equations of the fit, if they are known.
-    judging : bool
-        Whether a region is asked for, else nothing is `doubted`.
-
+    Offsets of the fitted `chain` from the `nominal` one are normal about zero. `names` were fitted
+    to the `system` with its weights, and `more` effects are considered. `noise` is its size [sigma
+    given], `known` are priors [m or rad] that were given. `doubts` are parameters that something
+    else than the arm moves as well, with its standard deviation; `at_the_fit` are the last normal
+    equations, if they are known. Nothing is `doubted` unless `judging` where it may be used.
     """
     chain = chain.with_effects(more)
     every = (*names, *more)

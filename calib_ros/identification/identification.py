@@ -250,7 +250,7 @@ def identify(
         With fewer equations than parameters.
 
     """
-    known = None if simpler is None else Simpler(simpler.chain, simpler.distances, simpler.noise)
+    known = Simpler(simpler.chain, simpler.distances, simpler.noise) if simpler else None
     structural, start, fitted = fit(problem, known)
     problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain
     progress(1 / 2)  # of many poses (benchmarks/end_to_end.py)
@@ -264,8 +264,8 @@ def identify(
     parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
-    more = considered(chain, names)
-    posterior = fitted.posterior(_size(fitted, share), more, rounding_errors(problem, coarse))
+    size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
+    posterior = fitted.posterior(size, considered(chain, names), doubts)
     found = _findings(fitted, before, posterior, validation, parameters, coarse)
     result = Identification(
         chain=chain,
