@@ -25,7 +25,7 @@ from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identification import Identification, identify
 from calib_ros.identification.leastsquares import owners, stacked
-from calib_ros.identification.levels import CERTAIN, SURE
+from calib_ros.identification.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import COUNTS, log_gain
@@ -125,7 +125,7 @@ def _with_harmonics(
     one_by_one = 0
     while one_by_one < SEVERAL and strongest_added():
         one_by_one += 1
-    if model.equations > len(model.harmonics):
+    if model.many and model.equations > len(model.harmonics):
         progress('effects: all harmonics')
         if added(model.judge_all_harmonics(chosen), model.harmonics):
             return tuple(chosen), tuple(verdicts)
@@ -146,7 +146,9 @@ class _Linear:
         self._names = geometric.names
         posterior = geometric.posterior
         priors = {n: s for n, s in posterior.priors.items() if n in self._names}
-        self._noise, self._sizes = geometric.noise.size, posterior.sizes
+        self._noise, self._sizes = geometric.noise.size, dict(posterior.sizes)
+        # what is considered as couplings may be what a drive does to its own joint
+        self._sizes['drive'] = max(self._sizes.get(k, 0.0) for k in ('drive', 'coupling'))
         problem = replace(problem, learned=Learned(priors, self._noise))
         self._problem = problem
         judged = np.split(
@@ -181,7 +183,7 @@ class _Linear:
             for harmonic in HARMONICS
         ]
         self.harmonics = [name for pair in self._pairs for name in pair]
-        self.equations = len(owner)
+        self.equations, self.many = len(owner), False
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
@@ -241,12 +243,14 @@ class _Linear:
     def strongest_harmonic(self, chosen: Sequence[str], progress: Told) -> list[Parameter] | None:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
-        None where the strongest one of residuals moved in time often explains as much.
+        None where the strongest one of residuals moved in time often explains as much. Whether
+        all explain more than of those, each by itself, `many` tells.
         """
         pairs = [pair for pair in self._pairs if pair[0] not in chosen]
         if self._shifts is None or not pairs:
             return None
         shares = self._shares(chosen, pairs, progress)
+        self.many = chance(shares.sum(axis=0)) < 1.0 - CONFIDENT
         if chance(shares.max(axis=0)) >= 1.0 - CERTAIN:
             return None
         return list(pairs[int(np.argmax(shares[:, 0]))])
