@@ -55,7 +55,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.say(words)
     if chain.tool is None:
         x, y, z = ASSUMED_TOOL
-        screen.say(f'the tool is unknown: the target is assumed at {x} {y} {z} m from the flange')
+        screen.say(
+            f'the tool is unknown: the target is assumed at {x:g} {y:g} {z:g} m from the flange'
+        )
     if options.out is not None:
         page = _page_beside(options.out)
         report = plan_report(

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cos_sin, cross
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cross
 
 if TYPE_CHECKING:
     from calib_ros.kinematics.chain import Chain
@@ -144,19 +144,38 @@ def basis(
     phi = np.zeros((len(names), q.shape[1]))
     if not names:
         return phi
+    circles: dict[int, NDArray[np.complex128]] = {}
     for kind, (rows, joints, others) in _by_kind(tuple(names), chain.joint_names).items():
         if kind == 'ratio':
             phi[rows] = q[joints]
         elif kind == 'coupling':
             phi[rows] = q[others.astype(int)]
         elif kind in WAVES:
-            cos, sin = cos_sin(others[:, np.newaxis] * q[joints])
-            phi[rows] = sin if kind == 'sin' else cos
+            for joint in np.unique(joints).tolist():
+                here = np.flatnonzero(joints == joint)
+                wave = _wave(q[joint], others[here], circles, joint)
+                phi[rows[here]] = wave.imag if kind == 'sin' else wave.real
         elif kind == 'backlash' and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):
             phi[rows] = _torques(chain, q, joints, others if kind == 'gravity' else None)
     return phi
+
+
+def _wave(
+    q: FloatArray, orders: FloatArray, circles: dict[int, NDArray[np.complex128]], joint: int
+) -> NDArray[np.complex128]:
+    """Return exp(i k q) (K, B) of orders k (K,) at the values (B,) of a joint.
+
+    Powers of exp(i q), kept in `circles`, where most orders up to the highest are wanted.
+    """
+    highest, whole = int(orders.max()), (orders == np.round(orders)) & (orders > 0.0)
+    if 2 * len(orders) <= highest or not whole.all():
+        return np.asarray(np.exp(1j * orders[:, np.newaxis] * q))
+    if len(circles.get(joint, ())) < highest:
+        turn = np.broadcast_to(np.exp(1j * q), (highest, len(q)))
+        circles[joint] = np.multiply.accumulate(turn, axis=0)
+    return np.asarray(circles[joint][orders.astype(int) - 1])
 
 
 def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
@@ -166,9 +185,14 @@ def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) ->
     if not any(values):
         return q
     shares = np.zeros((len(q), len(names)))
-    for k, name in enumerate(names):
-        shares[chain.joint_names.index(Parameter(name).owner), k] = values[k]
+    shares[_driven(tuple(names), chain.joint_names), np.arange(len(names))] = values
     return np.asarray(q + shares @ phi)
+
+
+@lru_cache(maxsize=256)
+def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> list[int]:
+    """Return the number of the joint that each effect moves."""
+    return [joint_names.index(Parameter(name).owner) for name in names]
 
 
 @lru_cache(maxsize=256)

@@ -146,13 +146,12 @@ class Aim:
 
     def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
         """Return the derivative (n, n, B) of the effective joint values by those reported."""
-        here = self._chain.effective(q, approach)
-        slope, step = np.empty((len(q), *q.shape)), 1e-6  # right to 1e-9 of what effects add
-        for k in range(len(q)):
-            moved = q.copy()
-            moved[k] += step
-            slope[:, k] = (self._chain.effective(moved, approach) - here) / step
-        return slope
+        count, step = len(q), 1e-6  # right to 1e-9 of what effects add
+        moved = np.repeat(q[:, np.newaxis], count + 1, axis=1)  # the last as it is
+        moved[np.arange(count), np.arange(count)] += step
+        came = None if approach is None else np.tile(approach, count + 1)
+        found = self._chain.effective(moved.reshape(count, -1), came).reshape(moved.shape)
+        return np.asarray((found[:, :-1] - found[:, -1:]) / step)
 
 
 def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:

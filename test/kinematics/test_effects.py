@@ -333,3 +333,14 @@ def test_effects_shift_joint_values_and_nothing_else(rng):
     )
     zero = chain.with_effects(tuple(values))
     np.testing.assert_array_equal(zero.forward(q), chain.forward(q))
+
+
+@pytest.mark.parametrize('orders', [range(1, 41), (7, 40), (2.5, 1.0, 3.0), (0, -1, 1)])
+def test_waves_are_sines_and_cosines_however_many(rng, orders):
+    joint = UR10E.joint_names[1]
+    names = [name for order in orders for name in effects.waves(joint, order)]
+    q = UR10E.random_joints(20, rng)
+    found = effects.basis(UR10E, names, q.T, None)
+    for order, (sin, cos) in zip(orders, found.reshape(-1, 2, len(q)), strict=True):
+        np.testing.assert_allclose(sin, np.sin(order * q[:, 1]), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(cos, np.cos(order * q[:, 1]), rtol=0, atol=1e-13)
