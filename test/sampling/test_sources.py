@@ -3,7 +3,7 @@
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.messages import DECODERS
+from calib_ros.sampling.messages import DECODERS, TRANSFORMS
 from calib_ros.sampling.sources import DISTANCE, STANDARD, Source, parse_source, parse_sources
 
 
@@ -73,3 +73,28 @@ def test_the_standard_sources_can_be_written_down():
     """What the node listens to by itself is what these lines say."""
     for source in STANDARD:
         assert parse_source(f'{source.topic} type={source.type}') == source
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '/tf',
+        '/tf parent=world',
+        '/tf child=tool',
+        '/tf parent=tool child=/tool',
+        '/x type=TFMessage',
+        '/x type=PoseStamped parent=world child=tool',
+    ],
+)
+def test_both_frames_are_needed_and_only_there(text):
+    with pytest.raises(ConfigError, match='needs parent=FRAME child=FRAME'):
+        parse_source(text)
+
+
+def test_sources_of_one_topic_name_different_frames():
+    texts = ['/tf parent=world child=a', '/tf parent=world child=b']
+    a, b = parse_sources(texts)
+    assert a == Source('/tf', TRANSFORMS, parent='world', child='a')
+    assert b.child == 'b'
+    with pytest.raises(ConfigError, match='"/tf world a" is named twice'):
+        parse_sources([*texts, texts[0]])

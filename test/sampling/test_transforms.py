@@ -20,13 +20,13 @@ from recorded import (
     transform_stamped,
 )
 
-from calib_ros.errors import ConfigError, InputError
+from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.cdr import alike
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import Source, parse_source, parse_sources
+from calib_ros.sampling.sources import parse_sources
 from calib_ros.sampling.transforms import Links
 from calib_ros.settings import Settings
 
@@ -383,28 +383,3 @@ def test_a_name_of_absurd_length_is_not_read():
     data = bytearray(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
     data[16:20] = b'\xff\xff\xff\xff'
     assert alike(TRANSFORMS, [bytes(data)], {}) == []
-
-
-@pytest.mark.parametrize(
-    'text',
-    [
-        '/tf',
-        '/tf parent=world',
-        '/tf child=tool',
-        '/tf parent=tool child=/tool',
-        '/x type=TFMessage',
-        '/x type=PoseStamped parent=world child=tool',
-    ],
-)
-def test_both_frames_are_needed_and_only_there(text):
-    with pytest.raises(ConfigError, match='needs parent=FRAME child=FRAME'):
-        parse_source(text)
-
-
-def test_sources_of_one_topic_name_different_frames():
-    texts = ['/tf parent=world child=a', '/tf parent=world child=b']
-    a, b = parse_sources(texts)
-    assert a == Source('/tf', TRANSFORMS, parent='world', child='a')
-    assert b.child == 'b'
-    with pytest.raises(ConfigError, match='"/tf world a" is named twice'):
-        parse_sources([*texts, texts[0]])
