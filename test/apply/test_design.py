@@ -44,6 +44,14 @@ def test_gauge_freedoms_are_left_out_as_in_the_identification(name, oriented, co
     assert set(design.names) == set(result.names)
 
 
+def test_priors_are_known_before_anything_is_measured(rng):
+    chain = arm()
+    seen = simulation.measure(chain, some(chain, 10), rng, *SIGMAS)
+    design = Design.of(Problem(chain, seen, priors={'*_joint.a': 2e-3}))
+    wanted = [500.0 if name.endswith('_joint.a') else 0.0 for name in design.names]
+    np.testing.assert_allclose(design.known, np.diag(wanted), rtol=1e-12)
+
+
 @pytest.mark.parametrize('oriented', [True, False])
 def test_predicted_errors_are_those_of_the_identification(oriented):
     """Predicted before anything is measured, at the nominal chain, and after the fit."""

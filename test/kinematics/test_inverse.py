@@ -83,6 +83,14 @@ def test_what_is_out_of_reach_is_said_to_be(rng):
     assert np.isfinite(found.joints).all()
 
 
+def test_joints_without_limits_have_none():
+    joint = Joint('turntable', a=0.0, alpha=0.0, d=0.0, theta=0.0)
+    assert [each.tolist() for each in limits(Chain('one', 'standard', (joint,)))] == [
+        [-np.inf],
+        [np.inf],
+    ]
+
+
 def test_limits_hold_and_full_turns_are_taken_back():
     chain = Chain(
         'stand',
