@@ -238,6 +238,8 @@ class _Linear:
             verdict = self.judge(chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn')
             if verdict.pays:
                 break
+        self._told = {}  # each by itself is as large as usual
+        self._errors.clear()
         return verdict
 
     def strongest_harmonic(self, chosen: Sequence[str], progress: Told) -> list[Parameter] | None:

@@ -221,9 +221,8 @@ def _explained(
     rows = rows / scale
     if len(rows) - count - len(added) < len(rows) // 3:
         return 0.0
-    rest = np.asarray(np.linalg.qr(rows, mode='r'))[
-        count:, count:
-    ]  # what those fitted cannot follow
+    factor = np.asarray(np.linalg.qr(rows, mode='r'))
+    rest = factor[count:, count:]  # what those fitted cannot follow
     residual = rest[:, -1]
     total = float(residual @ residual)
     solution = np.linalg.lstsq(rest[:, :-1], residual, rcond=1e-6)[0]

@@ -9,7 +9,7 @@ from fits import NOISE, SIGMAS, UR10E, rms
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.model_choice import _Linear as Linear, identify_model
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.effects import group_of
@@ -97,6 +97,15 @@ def test_harmonics_that_are_small_each_are_found_together():
     unseen = UR10E.random_joints(500, rng)
     assert auto.accepted
     assert rms(auto.chain, true, unseen) < 0.8 * rms(plain.chain, true, unseen)
+
+
+def test_all_harmonics_leave_nothing_behind(rng):
+    """A single one is judged after them as before."""
+    problem = Problem(UR10E, observed(arm_with('gear', rng), UR10E.random_joints(60, rng), rng))
+    model = Linear(problem, identify(problem))
+    before = model.judge([], GEAR, '')
+    assert not model.judge_all_harmonics([]).pays
+    assert model.judge([], GEAR, '') == before
 
 
 def test_effects_of_several_kinds_are_found_together():
