@@ -14,9 +14,9 @@ for harmonics of gears: the one that explains most is added while it pays as wel
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import groupby
 
 import numpy as np
 from scipy import linalg
@@ -115,22 +115,17 @@ def _with_harmonics(
         chosen.extend(name for name in names if verdict.pays and name not in chosen)
         return verdict.pays
 
-    def strongest_added() -> bool:
-        found = model.strongest_harmonic(chosen, progress)
-        if found is None:
-            return False
-        what = f'{found[0].owner}, {found[0].effect[1]} per turn'
-        return added(model.judge(chosen, found, what), found)
-
-    one_by_one = 0
-    while one_by_one < SEVERAL and strongest_added():
-        one_by_one += 1
-    if model.many and model.equations > len(model.harmonics):
-        progress('effects: all harmonics')
-        if added(model.judge_all_harmonics(chosen), model.harmonics):
-            return tuple(chosen), tuple(verdicts)
-    while one_by_one >= SEVERAL and strongest_added():
-        pass
+    for count in itertools.count(1):
+        pair, several = model.strongest_harmonic(chosen, progress)
+        more = False
+        if pair:
+            what = f'{pair[0].owner}, {pair[0].effect[1]} per turn'
+            more = added(model.judge(chosen, pair, what), pair)
+        if several and (count == SEVERAL or (count < SEVERAL and not more)):
+            progress('effects: all harmonics')
+            more = not added(model.judge_all_harmonics(chosen), model.harmonics) and more
+        if not more:
+            break
     return tuple(chosen), tuple(verdicts)
 
 
@@ -183,13 +178,12 @@ class _Linear:
             for harmonic in HARMONICS
         ]
         self.harmonics = [name for pair in self._pairs for name in pair]
-        self.equations, self.many = len(owner), False
+        self._equations = len(owner)
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
-        self._errors: dict[tuple[int, ...], FloatArray] = {}
+        self._errors: dict[tuple[float, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
-        self._told: dict[str, float] = {}
         self._seen: Columns | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -216,12 +210,18 @@ class _Linear:
                     kept.append(name)
         return found
 
-    def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> Verdict:
-        """Compare the errors on configurations left out, with and without some effects."""
+    def judge(
+        self, chosen: Sequence[str], added: Sequence[str], what: str, size: float = 0.0
+    ) -> Verdict:
+        """Compare the errors on configurations left out, with and without some effects.
+
+        These may be as large as `size`, or as usual without one.
+        """
         new = [name for name in added if name not in chosen]
         found, pays = [], True
         for dealing in range(len(self._folds)):
-            before, after = (self._left_out(n, dealing) for n in (chosen, [*chosen, *new]))
+            before = self._left_out(dealing, chosen)
+            after = self._left_out(dealing, chosen, new, size)
             gain, limit = log_gain(before, after, self._groups, SURE)
             pays = pays and gain > max(limit, COUNTS)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
@@ -233,29 +233,30 @@ class _Linear:
         """Judge all harmonics together, of the usual size and else of a smaller one."""
         new = [name for name in self.harmonics if name not in chosen]
         for size in SIZES:
-            self._told = dict.fromkeys(new, size)
-            self._errors.clear()
-            verdict = self.judge(chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn')
+            verdict = self.judge(
+                chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn', size
+            )
             if verdict.pays:
                 break
-        self._told = {}  # each by itself is as large as usual
-        self._errors.clear()
         return verdict
 
-    def strongest_harmonic(self, chosen: Sequence[str], progress: Told) -> list[Parameter] | None:
+    def strongest_harmonic(
+        self, chosen: Sequence[str], progress: Told
+    ) -> tuple[Sequence[Parameter], bool]:
         """Return sine and cosine of the harmonic that explains most of what is left.
 
-        None where the strongest one of residuals moved in time often explains as much. Whether
-        all explain more than of those, each by itself, `many` tells.
+        None where the strongest one of residuals moved in time often explains as much. And whether
+        all harmonics, each by itself, explain more than of those.
         """
         pairs = [pair for pair in self._pairs if pair[0] not in chosen]
         if self._shifts is None or not pairs:
-            return None
+            return (), False
         shares = self._shares(chosen, pairs, progress)
-        self.many = chance(shares.sum(axis=0)) < 1.0 - CONFIDENT
+        several = chance(shares.sum(axis=0)) < 1.0 - CONFIDENT
+        several = several and self._equations > len(self.harmonics)
         if chance(shares.max(axis=0)) >= 1.0 - CERTAIN:
-            return None
-        return list(pairs[int(np.argmax(shares[:, 0]))])
+            return (), several
+        return pairs[int(np.argmax(shares[:, 0]))], several
 
     def _shares(
         self,
@@ -272,7 +273,7 @@ class _Linear:
         if not {*wanted, *chosen} <= self._moved.keys():
             lots: list[Sequence[str]] = [[name for name in self._number if name]]
             if wanted & {name for pair in self._pairs for name in pair}:
-                for _, own in groupby(self._pairs, lambda pair: pair[0].owner):
+                for _, own in itertools.groupby(self._pairs, lambda pair: pair[0].owner):
                     left = [n for pair in own for n in pair if n not in self._number]
                     lots += [left] if left else []
             names = [name for lot in lots for name in lot]
@@ -314,13 +315,21 @@ class _Linear:
         chain = self._chain.with_effects([name for name in names if name not in self._names])
         return self._system.rows_of(chain, names)
 
-    def _left_out(self, chosen: Sequence[str], dealing: int) -> FloatArray:
-        """Return position errors (N, 3) [m] of every sample, predicted from the other folds."""
-        which = [*range(len(self._names)), *self._of(chosen)]
-        key = (dealing, *which)
+    def _left_out(
+        self, dealing: int, chosen: Sequence[str], new: Sequence[str] = (), size: float = 0.0
+    ) -> FloatArray:
+        """Return position errors (N, 3) [m] of every sample, predicted from the other folds.
+
+        The effects are the chosen ones and new ones, these as large as `size` or as usual.
+        """
+        which = [*range(len(self._names)), *self._of([*chosen, *new])]
+        key = (dealing, size, *which)
         if key in self._errors:
             return self._errors[key]
-        extra = np.column_stack(self._extra(chosen))
+        priors = np.append(self._priors(chosen), self._priors(new, size))
+        extra, offset = self._system.extra_rows(self._chain, self._names)
+        offset = np.append(offset, np.zeros(len(priors)))
+        extra = np.column_stack([linalg.block_diag(extra, np.diag(priors)), offset])
         ends = [*which, self._number['']]
         folds = self._problem.folds
         parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
@@ -340,16 +349,10 @@ class _Linear:
         self._errors[key] = np.concatenate(errors)
         return self._errors[key]
 
-    def _extra(self, chosen: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Return rows (K, P) and residuals (K,) in sigma of separations and priors."""
-        extra, offset = self._system.extra_rows(self._chain, self._names)
-        wide = np.diag(self._priors(chosen))
-        return linalg.block_diag(extra, wide), np.append(offset, np.zeros(len(chosen)))
-
-    def _priors(self, names: Sequence[str]) -> FloatArray:
+    def _priors(self, names: Sequence[str], told: float = 0.0) -> FloatArray:
         """Return noise / sigma (P,) of the priors; zero without one.
 
-        Effects may be as large as usual, or as large as the data show.
+        Effects may be as large as is told, else as usual or as large as the data show.
         """
         sigmas = self._problem.prior_sigmas
         found = np.zeros(len(names))
@@ -358,7 +361,7 @@ class _Linear:
             if name not in self._names:
                 group = str(group_of(self._chain, name))
                 usual = max(effects.expected(name), self._sizes.get(group, 0.0))
-                size = self._told.get(name, usual)
+                size = told or usual
             found[k] = self._noise / size if size else 0.0
         return found
 
