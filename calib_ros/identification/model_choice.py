@@ -1,48 +1,31 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which non-geometric effects pay for themselves, by cross-validation.
+"""Which non-geometric effects pay for themselves, by cross-validation (`linear_model.py`).
 
-At the geometric fit every effect is one more column of the linear model, so all candidates are
-compared without refitting: the residual of a part left out is r - J_S beta, with beta from the
-other parts. Parts are dealt out twice, one by one and in blocks of what was measured in
-succession, and both must agree, because neighbours share errors. Groups of effects are added one
-by one, the best first, as long as the position error on the configurations left out falls by more
-than chance explains, and explain more of the residuals than of the same moved in time
-(`drift.py`), as a drift would be. Then the spectrum of what is left is searched, joint by joint,
-for harmonics of gears: the one that explains most is added while it pays as well.
+Groups of effects are added one by one, the best first, as long as the position error on the
+configurations left out falls by more than chance explains, and explain more of the residuals than
+of the same moved in time (`drift.py`), as a drift would be. Then the spectrum of what is left is
+searched, joint by joint, for harmonics of gears: the one that explains most is added while it pays
+as well, and all of them where many explain something.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import linalg
 
-from calib_ros.identification.drift import Columns, Shifts, chance
-from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identification import Identification, identify
-from calib_ros.identification.leastsquares import owners, stacked
-from calib_ros.identification.levels import CERTAIN, CONFIDENT, SURE
-from calib_ros.identification.observations import numbered
-from calib_ros.identification.problem import Learned, Problem
-from calib_ros.identification.validation import COUNTS, log_gain
+from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
-from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.progress import Told, nobody, share_of
 
-HARMONICS = range(3, 41)
-"""Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
 SEVERAL = 3
 """Harmonics that are added before all of them are tried at once (benchmarks/real_robots.py)."""
-SIZES = (1e-4, 2e-5)
-"""Sizes [rad] of which all harmonics together may be (benchmarks/real_robots.py)."""
-COMPARED = 3000
-"""Samples by which effects are compared; of more, every so many are taken."""
 
 
 def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:
@@ -82,7 +65,7 @@ def _chosen(
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     """Return the effects that pay for themselves, and the verdicts on all that were tried."""
     progress('effects')
-    model = _Linear(problem, geometric)
+    model = LinearModel(problem, geometric)
     chosen: list[str] = []
     verdicts: dict[str, Verdict] = {}
     groups = model.useful({name: effects.members(problem.chain, name) for name in effects.GROUPS})
@@ -106,7 +89,7 @@ def _chosen(
 
 
 def _with_harmonics(
-    model: _Linear, chosen: list[str], verdicts: list[Verdict], progress: Told
+    model: LinearModel, chosen: list[str], verdicts: list[Verdict], progress: Told
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     """Add the strongest harmonics one by one, or all of them where that predicts better."""
 
@@ -127,245 +110,3 @@ def _with_harmonics(
         if not more:
             break
     return tuple(chosen), tuple(verdicts)
-
-
-class _Linear:
-    """The linear model about the geometric fit, with columns of effects made when asked for.
-
-    Rows are sample by sample. Nothing measures at sockets that could drift, so nothing is moved
-    in time there, and no spectrum is searched.
-    """
-
-    def __init__(self, problem: Problem, geometric: Identification) -> None:
-        self._chain = geometric.chain
-        self._names = geometric.names
-        posterior = geometric.posterior
-        priors = {n: s for n, s in posterior.priors.items() if n in self._names}
-        self._noise, self._sizes = geometric.noise.size, dict(posterior.sizes)
-        # what is considered as couplings may be what a drive does to its own joint
-        self._sizes['drive'] = max(self._sizes.get(k, 0.0) for k in ('drive', 'coupling'))
-        problem = replace(problem, learned=Learned(priors, self._noise))
-        self._problem = problem
-        judged = np.split(
-            geometric.fitted.judged, np.cumsum([len(each) for each in problem.sets])[:-1]
-        )
-        share = max(1, -(-sum(map(len, problem.sets)) // COMPARED))
-        sets = [
-            each.select(np.flatnonzero(good)[::share])
-            for each, good in zip(problem.sets, judged, strict=True)
-        ]
-        self._system = problem.system(sets)
-        numbers = numbered(sets)
-        self._groups = np.concatenate(numbers)
-        blocks = np.full(int(self._groups.max(initial=-1)) + 1, -1)
-        for each in numbers:  # every fold has some of each set
-            new = np.unique(each[blocks[each] < 0])
-            blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
-        dealings = (self._groups % problem.folds, blocks[self._groups])
-        rows = self._rows(self._names)
-        self._columns = np.ascontiguousarray(stacked(rows).T)
-        self._residual = self._columns[-1].copy()
-        self._number = {name: k for k, name in enumerate([*self._names, ''])}
-        self._ends = np.cumsum([each[-1].size for each in rows])
-        owner = owners(rows)
-        self._folds = [dealing[owner] for dealing in dealings]
-        self._inside = np.array([d == k for d in self._folds for k in range(problem.folds)])
-        self._products = np.array([_square(self._columns[:, part].T) for part in self._inside])
-        self._pairs = [
-            effects.waves(joint.name, harmonic)
-            for joint in self._chain.joints
-            if joint.type == 'revolute'
-            for harmonic in HARMONICS
-        ]
-        self.harmonics = [name for pair in self._pairs for name in pair]
-        self._equations = len(owner)
-        self._shifts: Shifts | None = None
-        if not any(each.socket for each in sets):
-            self._shifts = Shifts(self._system, [each[-1] for each in rows])
-        self._errors: dict[tuple[float, ...], FloatArray] = {}
-        self._moved: dict[str, int] = {}
-        self._seen: Columns | None = None
-
-    def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-        """Return the effects of each group whose columns are independent of the geometric model.
-
-        What that model leaves of a column stands in the lower rows of a triangular factor.
-        """
-        every = list(dict.fromkeys(name for names in groups.values() for name in names))
-        count = len(self._names)
-        which = self._of([*self._names, *every])
-        factor = np.asarray(np.linalg.qr(self._columns[which].T, mode='r'))
-        number = {name: k for k, name in enumerate(every, count)}
-        found: dict[str, list[str]] = {}
-        for group, names in groups.items():
-            basis = np.zeros((len(factor[count:]), 0))
-            found[group] = kept = list[str]()
-            for name in names:
-                column = factor[:, number[name]]
-                rest = column[count:] - basis @ (basis.T @ column[count:])
-                rest -= basis @ (basis.T @ rest)
-                size = float(np.linalg.norm(rest))
-                if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)) and size > 0.0:
-                    basis = np.column_stack([basis, rest / size])
-                    kept.append(name)
-        return found
-
-    def judge(
-        self, chosen: Sequence[str], added: Sequence[str], what: str, size: float = 0.0
-    ) -> Verdict:
-        """Compare the errors on configurations left out, with and without some effects.
-
-        These may be as large as `size`, or as usual without one.
-        """
-        new = [name for name in added if name not in chosen]
-        found, pays = [], True
-        for dealing in range(len(self._folds)):
-            before = self._left_out(dealing, chosen)
-            after = self._left_out(dealing, chosen, new, size)
-            gain, limit = log_gain(before, after, self._groups, SURE)
-            pays = pays and gain > max(limit, COUNTS)
-            found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
-        if pays and self._shifts is not None:
-            pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
-        return Verdict(what, found[0], found[1], bool(pays))
-
-    def judge_all_harmonics(self, chosen: Sequence[str]) -> Verdict:
-        """Judge all harmonics together, of the usual size and else of a smaller one."""
-        new = [name for name in self.harmonics if name not in chosen]
-        for size in SIZES:
-            verdict = self.judge(
-                chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn', size
-            )
-            if verdict.pays:
-                break
-        return verdict
-
-    def strongest_harmonic(
-        self, chosen: Sequence[str], progress: Told
-    ) -> tuple[Sequence[Parameter], bool]:
-        """Return sine and cosine of the harmonic that explains most of what is left.
-
-        None where the strongest one of residuals moved in time often explains as much. And whether
-        all harmonics, each by itself, explain more than of those.
-        """
-        pairs = [pair for pair in self._pairs if pair[0] not in chosen]
-        if self._shifts is None or not pairs:
-            return (), False
-        shares = self._shares(chosen, pairs, progress)
-        several = chance(shares.sum(axis=0)) < 1.0 - CONFIDENT
-        several = several and self._equations > len(self.harmonics)
-        if chance(shares.max(axis=0)) >= 1.0 - CERTAIN:
-            return (), several
-        return pairs[int(np.argmax(shares[:, 0]))], several
-
-    def _shares(
-        self,
-        chosen: Sequence[str],
-        groups: Sequence[Sequence[str]],
-        progress: Told = nobody,
-    ) -> FloatArray:
-        """Return the shares (G, S) of the moved residuals that groups of effects explain.
-
-        Columns are made once: those of effects, and with them all harmonics when one is asked for.
-        """
-        assert self._shifts is not None
-        wanted = {name for group in groups for name in group}
-        if not {*wanted, *chosen} <= self._moved.keys():
-            lots: list[Sequence[str]] = [[name for name in self._number if name]]
-            if wanted & {name for pair in self._pairs for name in pair}:
-                for _, own in itertools.groupby(self._pairs, lambda pair: pair[0].owner):
-                    left = [n for pair in own for n in pair if n not in self._number]
-                    lots += [left] if left else []
-            names = [name for lot in lots for name in lot]
-            self._moved = {name: k for k, name in enumerate(names)}
-            self._seen = self._shifts.columns(self._lots(lots, progress), self._priors(names))
-        assert self._seen is not None
-        numbers = self._moved
-        return self._shifts.shares(
-            self._seen,
-            [numbers[name] for name in (*self._names, *chosen)],
-            [[numbers[name] for name in group] for group in groups],
-        )
-
-    def _lots(self, lots: Sequence[Sequence[str]], progress: Told) -> Iterator[list[FloatArray]]:
-        """Yield the weighted columns (P, c, N) of each set, lot by lot."""
-        for number, names in enumerate(lots):
-            if number:
-                progress(f'harmonics of {Parameter(names[0]).owner}')
-                progress(number / len(lots))
-            yield [each[:-1] for each in self._rows(names)]
-
-    def _of(self, names: Sequence[str]) -> list[int]:
-        """Return the numbers of the columns of effects, each made once."""
-        missing = [name for name in names if name not in self._number]
-        if missing:
-            added = stacked(self._rows(missing)).T[:-1]
-            self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
-            self._columns = np.concatenate([self._columns, added])
-            size, count = len(self._columns), len(added)
-            new = np.array([added[:, part] @ self._columns[:, part].T for part in self._inside])
-            known, self._products = self._products, np.zeros((len(new), size, size))
-            self._products[:, :-count, :-count] = known
-            self._products[:, :, -count:] = np.swapaxes(new, 1, 2)
-            self._products[:, -count:] = new
-        return [self._number[name] for name in names]
-
-    def _rows(self, names: Sequence[str]) -> list[FloatArray]:
-        """Return weighted Jacobian and residual (P + 1, c, N) of each set."""
-        chain = self._chain.with_effects([name for name in names if name not in self._names])
-        return self._system.rows_of(chain, names)
-
-    def _left_out(
-        self, dealing: int, chosen: Sequence[str], new: Sequence[str] = (), size: float = 0.0
-    ) -> FloatArray:
-        """Return position errors (N, 3) [m] of every sample, predicted from the other folds.
-
-        The effects are the chosen ones and new ones, these as large as `size` or as usual.
-        """
-        which = [*range(len(self._names)), *self._of([*chosen, *new])]
-        key = (dealing, size, *which)
-        if key in self._errors:
-            return self._errors[key]
-        priors = np.append(self._priors(chosen), self._priors(new, size))
-        extra, offset = self._system.extra_rows(self._chain, self._names)
-        offset = np.append(offset, np.zeros(len(priors)))
-        extra = np.column_stack([linalg.block_diag(extra, np.diag(priors)), offset])
-        ends = [*which, self._number['']]
-        folds = self._problem.folds
-        parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
-        rest = parts.sum(axis=0) + _square(extra)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))  # a fold may hold all of it
-        weights = np.zeros((len(parts), len(self._columns)))
-        for fold, part in enumerate(parts):
-            left = (rest - part)[:-1]
-            scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
-            factor = linalg.cho_factor(scaled)
-            weights[fold, which] = scale * linalg.cho_solve(factor, scale * left[:, -1])
-        here = self._folds[dealing][np.newaxis]
-        predicted = np.take_along_axis(weights @ self._columns, here, axis=0)[0]
-        pieces = np.split(self._residual - predicted, self._ends[:-1])
-        sets = self._system.sets
-        errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]
-        self._errors[key] = np.concatenate(errors)
-        return self._errors[key]
-
-    def _priors(self, names: Sequence[str], told: float = 0.0) -> FloatArray:
-        """Return noise / sigma (P,) of the priors; zero without one.
-
-        Effects may be as large as is told, else as usual or as large as the data show.
-        """
-        sigmas = self._problem.prior_sigmas
-        found = np.zeros(len(names))
-        for k, name in enumerate(names):
-            size = sigmas.get(name, 0.0)
-            if name not in self._names:
-                group = str(group_of(self._chain, name))
-                usual = max(effects.expected(name), self._sizes.get(group, 0.0))
-                size = told or usual
-            found[k] = self._noise / size if size else 0.0
-        return found
-
-
-def _square(rows: FloatArray) -> FloatArray:
-    """Return the products (P, P) of the columns of rows (R, P)."""
-    return np.asarray(rows.T @ rows)

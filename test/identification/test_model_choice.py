@@ -9,7 +9,8 @@ from fits import NOISE, SIGMAS, UR10E, rms
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.model_choice import _Linear as Linear, identify_model
+from calib_ros.identification.linear_model import LinearModel
+from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.effects import group_of
@@ -102,7 +103,7 @@ def test_harmonics_that_are_small_each_are_found_together():
 def test_all_harmonics_leave_nothing_behind(rng):
     """A single one is judged after them as before."""
     problem = Problem(UR10E, observed(arm_with('gear', rng), UR10E.random_joints(60, rng), rng))
-    model = Linear(problem, identify(problem))
+    model = LinearModel(problem, identify(problem))
     before = model.judge([], GEAR, '')
     assert not model.judge_all_harmonics([]).pays
     assert model.judge([], GEAR, '') == before
