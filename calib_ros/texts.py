@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -112,6 +112,18 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     if len(documents) > 1:
         raise error(f'{where} must hold one YAML document, not {len(documents)}')
     return documents[0] if documents else None
+
+
+def dump_yaml(document: Mapping[str, Any]) -> str:
+    """Return plain values as YAML; texts of any kind, as names of parameters are, as texts."""
+    import yaml
+
+    class Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
+        """The fast one if there is one: a tenth of the time."""
+
+    Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
+    text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
+    return str(text)
 
 
 @cache

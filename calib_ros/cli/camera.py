@@ -15,7 +15,7 @@ from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
 from calib_ros.files.detector import black_of, detect
 from calib_ros.files.images import SUFFIXES, Image, files_of, image_of, read_image
-from calib_ros.kinematics.chain_file import dump_yaml
+from calib_ros.texts import dump_yaml
 
 
 def _board(options: argparse.Namespace, screen: Screen) -> int:

@@ -22,7 +22,7 @@ from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.layouts import joint_columns
 from calib_ros.files.waypoints import joint_values
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, parse_yaml, read_text
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
 
 RATES = ('positions', 'velocities', 'accelerations')
@@ -75,7 +75,6 @@ def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
 
 
 def _read_yaml(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
-    import yaml
 
     where = str(path)
     message = parse_yaml(text, where, InputError)
@@ -101,16 +100,7 @@ def _read_yaml(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
             point | {key: rows[k] for key, rows in arrays.items()}
             for k, point in enumerate(points)
         ]
-        dumper = getattr(yaml, 'CSafeDumper', yaml.SafeDumper)
-        return str(
-            yaml.dump(
-                message | {'points': new},
-                Dumper=dumper,
-                sort_keys=False,
-                default_flow_style=None,
-                width=1000,
-            )
-        )
+        return dump_yaml(message | {'points': new})
 
     return ProgramFile(program, tuple(f'point {k + 1}' for k in range(len(points))), text_with)
 

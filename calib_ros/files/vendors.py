@@ -37,10 +37,11 @@ from calib_ros.files.export import (
 )
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.chain_file import dump_yaml, table_hash
+from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.kinematics.urdf_tree import parse_urdf
+from calib_ros.texts import dump_yaml
 from calib_ros.values import SAME
 
 

@@ -26,9 +26,9 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.lens import Lens
-from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS, Parameter
+from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.texts import parse_yaml
+from calib_ros.texts import dump_yaml, parse_yaml
 from calib_ros.values import (
     LARGEST,
     MOST_NAMES,
@@ -223,18 +223,6 @@ def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> st
     if calibration is not None:
         document['calibration'] = dict(calibration)
     return dump_yaml(document)
-
-
-def dump_yaml(document: Mapping[str, Any]) -> str:
-    """Return plain values as YAML."""
-    import yaml
-
-    class Dumper(yaml.SafeDumper):
-        """Writes parameters by their names."""
-
-    Dumper.add_representer(Parameter, yaml.SafeDumper.represent_str)
-    text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
-    return str(text)
 
 
 def _flag(content: dict[str, Any], where: str, default: bool) -> bool:

@@ -21,11 +21,11 @@ from calib_ros.identification.region import Region
 from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import dump_yaml
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 from calib_ros.shown import some
+from calib_ros.texts import dump_yaml
 
 WEAK = 0.01
 """A parameter with a larger standard deviation [m or rad] is named as weakly determined."""

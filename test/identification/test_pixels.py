@@ -20,8 +20,9 @@ from calib_ros.identification.pixels import PixelSamples
 from calib_ros.identification.resection import _from_homography, board_poses, resect
 from calib_ros.identification.samples import seen_residuals
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import dump_yaml, load_chain
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
+from calib_ros.texts import dump_yaml
 
 UR = load_chain('ur5e')
 POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])

@@ -29,7 +29,7 @@ from calib_ros.files.images import grey
 from calib_ros.files.recording import Recording
 from calib_ros.files.tables import read_journal
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import dump_yaml, load_chain
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling import pictures
 from calib_ros.sampling.intake import Stream, feed, measured
@@ -38,6 +38,7 @@ from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
+from calib_ros.texts import dump_yaml
 
 cv2 = pytest.importorskip('cv2')
 from photographs import CHARUCO, rendered
