@@ -16,7 +16,7 @@ import numpy as np
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import identifiability
-from calib_ros.identification.evidence import MOST_SAMPLES, Posterior, posterior_of
+from calib_ros.identification.evidence import Posterior, posterior_of
 from calib_ros.identification.leastsquares import (
     System,
     factor_of,
@@ -186,7 +186,7 @@ def _fit_all(
 
 def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
     """Return what tells the priors of a richer model, which is fitted again with them."""
-    share = -(-sum(map(len, problem.sets)) // MOST_SAMPLES)
+    share = -(-sum(map(len, problem.sets)) // (2 * SOME))
     if simpler is None or share < 2:
         return problem, simpler
     first, *more = (each.select(np.arange(0, len(each), share)) for each in problem.sets)
