@@ -13,7 +13,9 @@ from scipy import special
 from calib_ros.apply.workspace import Survey, rms_map
 from calib_ros.escapes import one_line
 from calib_ros.identification.validation import ParameterRow
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.poses import Poses
 
@@ -21,6 +23,8 @@ Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 QUANTILES = 400
 """Points of a curve that stands for any number of poses."""
+ROUND = ('eccentricity', 'gear')
+"""Groups of effects that go round with a joint."""
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
@@ -193,6 +197,37 @@ def coverage(
         'margin': _margin(130, 20, 50),
     }
     return {'data': [mesh], 'layout': layout}, tuple(rows)
+
+
+def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
+    """Return what the drives add to the joint values, where these (N, n) lie; None for nothing."""
+    waves = [each for each in chain.effects if effects.group_of(each[0]) in ROUND]
+    owners = np.array([Parameter(name).owner for name, _ in waves])
+    driven = [k for k, name in enumerate(chain.joint_names) if name in owners]
+    if not driven:
+        return None
+    low, high = joints[:, driven].min(axis=0), joints[:, driven].max(axis=0)
+    q = np.linspace(low.min(), high.max(), parts)
+    phi = effects.basis(chain, [name for name, _ in waves], np.tile(q, (len(joints.T), 1)), None)
+    added = 1e3 * np.array([value for _, value in waves])[:, np.newaxis] * phi
+    names = [chain.joint_names[k] for k in driven]
+    error = np.array([added[owners == name].sum(axis=0) for name in names])
+    error[(q < low[:, np.newaxis]) | (q > high[:, np.newaxis])] = np.nan
+    largest = float(np.nanmax(np.abs(error)))
+    mesh = {
+        'type': 'heatmap',
+        'x': numbers(np.degrees(q)),
+        'y': list(map(label, names)),
+        'z': numbers(error, 3),
+        **scale_of('mrad', 'RdBu', zmin=-largest, zmax=largest),
+        'hovertemplate': '%{y} at %{x}°: %{z:.3f} mrad<extra></extra>',
+    }
+    layout = {
+        'xaxis': axis('joint value [°]'),
+        'yaxis': {'autorange': 'reversed', 'automargin': True},
+        'margin': _margin(130, 20, 50),
+    }
+    return {'data': [mesh], 'layout': layout}
 
 
 def error_map(survey: Survey) -> Figure:

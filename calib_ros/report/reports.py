@@ -223,6 +223,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
     yield coverage(result.chain, poses.joints, 'How far each joint was moved')
     if result.verdicts:
         yield _effects(result)
+    yield from _drives(result, poses)
     if result.accepted:
         yield _map(result)
 
@@ -240,6 +241,22 @@ def _effects(result: Identification) -> Section:
             for v in result.verdicts
         ),
     )
+
+
+def _drives(result: Identification, poses: Poses) -> Iterator[Section]:
+    """Return what the drives of the joints add to their values."""
+    figure = figures.drives(result.chain, poses.joints)
+    if figure is not None:
+        yield Section(
+            'drives',
+            'Errors of the drives',
+            (
+                'What eccentricities and gears add to each joint value, over the values that '
+                'were measured. Narrow stripes come from gears, wide ones from eccentricities.',
+            ),
+            figure,
+            height=100 + 45 * len(figure['data'][0]['y']),
+        )
 
 
 def _outliers(poses: Poses, most: int = 50) -> Section:
@@ -293,9 +310,11 @@ def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
 
 
 def _parameters(result: Identification) -> Section:
-    """Return the table of all parameters."""
+    """Return the table of all parameters but the harmonics of gears, of which there are many."""
     rows = []
-    for p in result.parameters:
+    listed = [p for p in result.parameters if group_of(p.name) != 'gear']
+    unlisted = len(result.parameters) - len(listed)
+    for p in listed:
         unit = p.name.unit
         scale, small = (1.0, unit) if p.name.of_lens else (1e3, f'm{unit}')
         placed = p.std is None or result.chain.owns_frame(p.name)
@@ -311,6 +330,11 @@ def _parameters(result: Identification) -> Section:
             'together with others), "not excited" (the poses do not determine them) and "fixed" '
             '(held on request). Base and tool are placed by the fit: they have no offset.',
             f'{result.rank} are fitted, in {result.iterations} iterations.',
+            *(
+                (f'{unlisted} are harmonics of gears: result.json lists them.',)
+                if unlisted
+                else ()
+            ),
             *words.priors_in_words(result),
         ),
         head=('parameter', 'value', 'offset', 'std', '± (95 %)', 'unit', 'status'),
