@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import CERTAIN, TELLING
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -224,7 +224,7 @@ class _Forms:
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())
         freedom = float(known.sum() - np.trace(white))
-        if not (size > 0.0 and pairs > 0.0 and freedom > 1.0):
+        if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # of one every ratio is the same
             return 0.0, 0.0
         ratio = -float(np.trace(linked)) / freedom
         both = float((linked**2).sum() + pairs - 2.0 * (product**2).sum())
@@ -246,15 +246,15 @@ class _Forms:
             matrices = [white, *(known[kernel] for kernel in kernels.get(part, ()))]
             forms += [self._form(part, matrix) for matrix in matrices]
         moments = self._moments(forms)
-        scale = np.sqrt(np.diag(moments))
+        scale = np.sqrt(np.maximum(np.diag(moments), HALF_THE_DIGITS))
         scaled = moments / np.outer(scale, scale)
-        # the covariance of the forms under white noise weighs the equations
-        factor = linalg.cholesky(scaled + ROUNDING * np.eye(len(scale)), lower=True)
+        # the covariance of the forms under white noise weighs the equations; those of no spread,
+        # where hardly more was measured than fitted, say nothing
+        squares, directions = linalg.eigh(scaled)
+        told = squares > HALF_THE_DIGITS * squares[-1]
+        roots, directions = np.sqrt(squares[told]), directions[:, told]
         values = np.array([form.value for form in forms]) / scale
-        found = optimize.nnls(
-            linalg.solve_triangular(factor, scaled, lower=True),
-            linalg.solve_triangular(factor, values, lower=True),
-        )[0]
+        found = optimize.nnls(roots[:, np.newaxis] * directions.T, values @ directions / roots)[0]
         sizes = found / scale
         return {
             part: sizes[[k for k, form in enumerate(forms) if form.part == part]]

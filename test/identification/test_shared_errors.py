@@ -245,3 +245,18 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     excess *= np.trace(free) / (residual[60:] ** 2).sum()
     expected = excess / np.sqrt(2.0 * np.trace(centred @ centred))
     assert forms.test(1, links)[1] == pytest.approx(expected, rel=1e-9)
+
+
+def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
+    """One residual is all that 20 images of 2 means each leave of 39 parameters."""
+    rng = np.random.default_rng(0)
+    count, kernels = 20, [(kind, x) for kind, xs in shared_errors.LENGTHS.items() for x in xs]
+    for _ in range(20):
+        place, time = rng.normal(size=(count, 2)), np.arange(count, dtype=float)
+        parts = [rng.normal(size=(2 * count, 2, count)), np.zeros((2 * count, 3, count))]
+        units = shared_errors._Stops(parts, np.ones(count), place, time)
+        forms = shared_errors._Forms(units, np.zeros((0, 2 * count - 1)))
+        assert forms.test(0, units.links('near')) == (0.0, 0.0)
+        sizes = forms.sizes({0: kernels})[0]
+        assert np.isfinite(sizes).all()
+        assert (sizes >= 0.0).all()
