@@ -22,7 +22,7 @@ from scipy.linalg import lapack
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[NDArray[np.intp]]
@@ -34,8 +34,6 @@ PATIENCE = 3
 """Steps in succession that may raise the cost before they are damped."""
 STALLED = 50
 """Iterations in which the cost must fall by a thousandth, or the step left to go by half."""
-DAMPED, UNDAMPED = 1e-6, 1e-12
-"""Damping, of columns of unit length, with which it begins and below which it ends."""
 SEPARATION_SIGMA = 1e-5
 """Standard deviation [m] of a known distance between sockets."""
 SMALL_STEP = 1e-3
@@ -290,7 +288,7 @@ def minimise(
         if gain >= -1e-12 * best.cost:
             best, best_chain = normal, chain
             growth = 2.0
-            if damping > UNDAMPED:
+            if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
             else:
                 damping, patience = 0.0, PATIENCE
@@ -301,7 +299,7 @@ def minimise(
         else:
             normal, chain = best, best_chain
             patience = 0
-            damping, growth = max(growth * damping, DAMPED), 2.0 * growth
+            damping, growth = max(growth * damping, HALF_THE_DIGITS), 2.0 * growth
     return Fit(best_chain, best, iteration, False)
 
 

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
+from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
-from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
@@ -36,8 +36,6 @@ WIDER = 5
 """How many times as wide a step must not fit as well (benchmarks/harm.py)."""
 WHOLE = 1e-3
 """Share of a step by which multiples of it may be off."""
-USUAL = (5e-4, 1e-3)
-"""Errors [m, rad] of an arm, whose size is found."""
 RATIOS = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 NOISES = np.geomspace(0.2, 20.0, 15)
 DECIDED = float(special.logit(CERTAIN))
@@ -111,7 +109,8 @@ def may_be_rounding(
     parts = system.rows_of(chain, wanted)
     owner, rows = owners(parts), stacked(parts)
     basis = linalg.qr(rows[:, : len(frames)], mode='economic', check_finite=False)[0]
-    columns = rows[:, len(frames) : len(frames) + len(arm)] * [_usual(name) for name in arm]
+    columns = rows[:, len(frames) : len(frames) + len(arm)]
+    columns = columns * [TYPICAL[group_of(before, name) or 'drive'] for name in arm]
     alike = []
     for name, level in levels.items():
         size = steps[Parameter(name).owner] / np.sqrt(12.0)
@@ -132,11 +131,6 @@ def may_be_rounding(
     }
     healthy = max(found[key] for key in found if key[1] == 0.0)
     return bool(max(found.values()) - healthy < DECIDED)
-
-
-def _usual(name: str) -> float:
-    parameter = Parameter(name)
-    return USUAL[not parameter.is_length] if parameter.of_dh else effects.expected(name)
 
 
 def _evidence(columns: FloatArray, values: FloatArray, freedom: int) -> float:
