@@ -24,7 +24,6 @@ from scipy import linalg, special
 from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN
-from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -90,9 +89,7 @@ def may_be_rounding(
     `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
     of rounded joints, and `good` (N,) tells which samples of each set are no outliers.
     """
-    share = -(-sum(map(len, problem.sets)) // SOME_POSES)
-    pairs = zip(problem.sets, good, strict=True)
-    sets = [each.select(np.flatnonzero(which)[::share]) for each, which in pairs]
+    sets = [each.select(which).spread() for each, which in zip(problem.sets, good, strict=True)]
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
     for number, joint in enumerate(problem.chain.joints):

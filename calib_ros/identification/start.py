@@ -103,8 +103,7 @@ def _start_one(
         return chain
     if observations.socket:
         return _in_socket(chain, observations)
-    index = np.unique(np.linspace(0, len(observations) - 1, SOME_POSES).round().astype(int))
-    subset = observations.select(index)
+    subset = observations.spread()
     system = System((Samples(subset, sigma_position, sigma_orientation),))
     arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
     determined: tuple[str, ...] = ()
