@@ -27,6 +27,7 @@ from scipy import linalg
 from calib_ros.apply.design import Candidates, Design, information_of, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
+from calib_ros.identification.identifiability import indices_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import CRITERIA, Criterion
@@ -187,14 +188,7 @@ class _Worth:
         back = times(rows, self._factor)
         total = self._factor.T @ information @ self._factor + np.swapaxes(back, 1, 2) @ back
         singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
-        smallest, largest = singular[:, 0], singular[:, -1]
-        found = {
-            'o2': smallest / largest,
-            'o3': smallest,
-            'o4': smallest**2 / largest,
-            'o5': 1.0 / np.sum(1.0 / singular, axis=1),
-        }
-        return np.asarray(found[self._criterion])
+        return indices_of(singular)[self._criterion]
 
 
 def _root(information: FloatArray) -> FloatArray:

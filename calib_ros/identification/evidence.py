@@ -38,7 +38,8 @@ from scipy import special
 from scipy.linalg import lapack
 
 from calib_ros.identification.leastsquares import Normal, System, normal_equations
-from calib_ros.identification.levels import PRINTED, SCALE
+from calib_ros.identification.levels import CONFIDENT, PRINTED, SCALE
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -56,14 +57,12 @@ TAILS = 3.0
 """Degrees of freedom of the prior (benchmarks/harm.py)."""
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, fitted or not; couplings hardly show in moves of one joint."""
-SHOWN, REFUTED = 1.35, 3.0
-"""Logarithms of the ratio of probabilities beyond which effects show (95 %, one-sided), and from
-which those of usual size are refuted."""
-MOST_SAMPLES = 2000
-"""Samples from which sizes are told; of more, every so many are taken."""
+SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
+"""Logarithms of the ratio of probabilities beyond which effects show, and from which those of
+usual size are refuted."""
 SETTLED = 0.02
 """Change of the logarithm of a size from which on it stands still."""
-LEAST_SIZE = 1e-3
+LEAST_SIZE = SPREAD**-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
 
@@ -235,10 +234,11 @@ def _told(
     many are taken; `known` holds the products of all of them for the names alone.
     """
     columns = list(dict.fromkeys([*names, *(name for parts in beside for name in parts)]))
-    share = max(1, -(-system.count // MOST_SAMPLES))
+    most = 10 * SOME_POSES
+    share = -(-system.count // most)
     if known is None or share > 1 or beside:
-        few = system.select([np.arange(0, each.count, share) for each in system.sets])
-        known = normal_equations(chain, columns, replace(few, prior=None))
+        few = replace(system.spread(most), prior=None)
+        known = normal_equations(chain, columns, few)
     extra = np.column_stack(system.separation_rows(chain, columns))
     mixing = np.eye(len(columns) + 1, len(names))
     for parts in beside:

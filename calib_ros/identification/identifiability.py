@@ -293,15 +293,21 @@ class Observability:
 
 def observability(factor: FloatArray, poses: int) -> Observability:
     """Return the indices from R (P, P) of the weighted Jacobian of a number of poses."""
-    singular = np.linalg.svd(factor, compute_uv=False)
-    smallest, largest = float(singular[-1]), float(singular[0])
-    return Observability(
-        o1=float(np.exp(np.mean(np.log(np.maximum(singular, 1e-300)))) / np.sqrt(poses)),
-        o2=smallest / largest,
-        o3=smallest,
-        o4=smallest**2 / largest,
-        o5=float(1.0 / np.sum(1.0 / np.maximum(singular, 1e-300))),
-    )
+    singular = np.asarray(np.linalg.svd(factor, compute_uv=False), dtype=float)
+    mean = float(np.exp(np.log(np.maximum(singular, 1e-300)).mean()))
+    rest = {name: float(index) for name, index in indices_of(singular).items()}
+    return Observability(mean / np.sqrt(poses), **rest)
+
+
+def indices_of(singular: FloatArray) -> dict[str, FloatArray]:
+    """Return the indices o2 to o5 (...) of singular values (..., P)."""
+    smallest, largest = singular.min(axis=-1), singular.max(axis=-1)
+    return {
+        'o2': smallest / largest,
+        'o3': smallest,
+        'o4': smallest**2 / largest,
+        'o5': 1.0 / np.sum(1.0 / np.maximum(singular, 1e-300), axis=-1),
+    }
 
 
 def correlated(

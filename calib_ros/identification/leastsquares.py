@@ -22,7 +22,7 @@ from scipy.linalg import lapack
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[NDArray[np.intp]]
@@ -32,10 +32,6 @@ STEP_TOLERANCE = 1e-6
 larger, in RMS residuals)."""
 PATIENCE = 3
 """Steps in succession that may raise the cost before they are damped."""
-STALLED = 50
-"""Iterations in which the cost must fall by a thousandth, or the step left to go by half."""
-DAMPED, UNDAMPED = 1e-6, 1e-12
-"""Damping, of columns of unit length, with which it begins and below which it ends."""
 SEPARATION_SIGMA = 1e-5
 """Standard deviation [m] of a known distance between sockets."""
 SMALL_STEP = 1e-3
@@ -260,8 +256,9 @@ def minimise(
     steps have not brought it below the best, the fit goes back there and steps are damped
     (Levenberg 1944, Marquardt 1963), by the ratio of the gain to the one foreseen (Nielsen 1999).
     It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
-    It ends as well, not converged, where STALLED iterations bring no progress, or after so many
-    `iterations`; curved valleys need 400. `normal` are the equations at the start, if known.
+    It ends as well, not converged, where ROUNDS iterations bring no progress (a thousandth of the
+    cost, or half of the step left to go), or after so many `iterations`; curved valleys need 400.
+    `normal` are the equations at the start, if known.
     """
     normal = normal or normal_equations(chain, names, system)
     if not names:
@@ -271,7 +268,7 @@ def minimise(
     patience = PATIENCE
     stalled, least_cost, least_left = 0, np.inf, np.inf
     iteration = 0
-    while iteration < iterations and stalled < STALLED:
+    while iteration < iterations and stalled < ROUNDS:
         iteration += 1
         step = _solve(normal.matrix, normal.gradient)
         left = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
@@ -290,7 +287,7 @@ def minimise(
         if gain >= -1e-12 * best.cost:
             best, best_chain = normal, chain
             growth = 2.0
-            if damping > UNDAMPED:
+            if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
             else:
                 damping, patience = 0.0, PATIENCE
@@ -301,7 +298,7 @@ def minimise(
         else:
             normal, chain = best, best_chain
             patience = 0
-            damping, growth = max(growth * damping, DAMPED), 2.0 * growth
+            damping, growth = max(growth * damping, HALF_THE_DIGITS), 2.0 * growth
     return Fit(best_chain, best, iteration, False)
 
 

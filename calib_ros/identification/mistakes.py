@@ -24,7 +24,7 @@ import numpy as np
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, NEARER
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.samples import Samples
@@ -39,8 +39,6 @@ from calib_ros.kinematics.se3 import FloatArray
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
 
-TRIED = 48
-"""Samples of a set, spread evenly, by which suspects are tried (benchmarks/mistakes.py)."""
 POLISHED = 6
 """Suspects that are polished (benchmarks/mistakes.py)."""
 
@@ -148,9 +146,7 @@ def _known(frame: Frame | None) -> Frame | None:
 
 
 def _few(observations: Observations) -> Observations:
-    count = len(observations)
-    index = np.linspace(0, count - 1, min(count, TRIED)).round().astype(int)
-    return observations.select(np.unique(index))
+    return observations.spread(SOME_POSES // 4)
 
 
 @dataclass(frozen=True, eq=False)

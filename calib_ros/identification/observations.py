@@ -190,8 +190,8 @@ class Observations(Shown):
 
     def spread(self, most: int = SOME_POSES) -> Observations:
         """Return every so many pairs, at most so many."""
-        step = 1 + len(self) // most
-        return self if step == 1 else self.select(np.arange(0, len(self), step))
+        step = -(-len(self) // most)
+        return self if step <= 1 else self.select(np.arange(0, len(self), step))
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
         """Return the poses the other way round: a camera on the flange sees a fixed target.

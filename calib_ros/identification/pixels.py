@@ -22,15 +22,13 @@ from numpy.typing import NDArray
 
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.resection import image_products
+from calib_ros.identification.robust import INNER
 from calib_ros.identification.samples import BLOCK, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import View, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-
-BOUNDED = 3.0
-"""Usual residuals that one point counts for at most in the sum of its image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,14 +152,14 @@ class PixelSamples(Samples):
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
         """Yield the residuals of all points, and of all images: what their points share.
 
-        No point counts for more than some usual ones in its image.
+        No point counts for more than INNER usual ones in its image.
         """
         found, _ = self.whitened_residuals(chain)
         yield found, slice(None)
         if not self.count:
             return
         length = np.linalg.norm(found, axis=1, keepdims=True)
-        most = BOUNDED * np.median(length)
+        most = INNER * np.median(length)
         sums = np.add.reduceat(
             found * np.minimum(1.0, most / np.maximum(length, 1e-300)), self._begins
         )

@@ -42,7 +42,7 @@ from calib_ros.identification.leastsquares import (
     products_of,
 )
 from calib_ros.identification.levels import chance_of
-from calib_ros.identification.observations import Observations, numbered
+from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document
@@ -57,8 +57,6 @@ from calib_ros.shown import Shown
 
 PER_METRE = SIZES['rad'] / SIZES['m']
 """Angles [rad] grow by so much more than lengths [m]."""
-MOST_FOLDS = 20
-"""Parts into which the new poses are dealt to judge each by the others."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -275,7 +273,7 @@ def _judged(
 ) -> tuple[ErrorFigures, ErrorFigures]:
     """Return the errors of the new poses before, and by what the others tell."""
     groups = numbered(sets)
-    count = min(MOST_FOLDS, distinct(np.concatenate(groups)))
+    count = min(SOME_POSES, distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
     chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
     chains = []

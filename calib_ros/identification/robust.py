@@ -31,6 +31,7 @@ from scipy import special
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, minimise
+from calib_ros.identification.levels import ALIKE
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
@@ -48,9 +49,6 @@ MANY = 20_000
 SUSPICIOUS = 1.2
 """Ratio of residuals to those expected from which gross errors, or errors that the samples of a
 configuration share, may hide in them (benchmarks/outliers.py)."""
-SHRUNK = 0.5
-"""Ratio of half of the residuals from which a fit is another one, not a detail of the first
-(benchmarks/outliers.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +91,7 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
         return first
     second = reweighted(trimmed_start(chain, names, system), names, system, loss)
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
-    if sums[1] < SHRUNK**2 * sums[0]:
+    if sums[0] > ALIKE**2 * sums[1]:  # another fit, not a detail of the first
         return replace(second, iterations=first.iterations + second.iterations)
     return first
 

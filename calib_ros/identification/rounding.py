@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
+from calib_ros.identification.evidence import TYPICAL, group_of
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN
-from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
-from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
@@ -36,8 +35,6 @@ WIDER = 5
 """How many times as wide a step must not fit as well (benchmarks/harm.py)."""
 WHOLE = 1e-3
 """Share of a step by which multiples of it may be off."""
-USUAL = (5e-4, 1e-3)
-"""Errors [m, rad] of an arm, whose size is found."""
 RATIOS = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 NOISES = np.geomspace(0.2, 20.0, 15)
 DECIDED = float(special.logit(CERTAIN))
@@ -92,9 +89,7 @@ def may_be_rounding(
     `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
     of rounded joints, and `good` (N,) tells which samples of each set are no outliers.
     """
-    share = -(-sum(map(len, problem.sets)) // SOME_POSES)
-    pairs = zip(problem.sets, good, strict=True)
-    sets = [each.select(np.flatnonzero(which)[::share]) for each, which in pairs]
+    sets = [each.select(which).spread() for each, which in zip(problem.sets, good, strict=True)]
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
     for number, joint in enumerate(problem.chain.joints):
@@ -111,7 +106,8 @@ def may_be_rounding(
     parts = system.rows_of(chain, wanted)
     owner, rows = owners(parts), stacked(parts)
     basis = linalg.qr(rows[:, : len(frames)], mode='economic', check_finite=False)[0]
-    columns = rows[:, len(frames) : len(frames) + len(arm)] * [_usual(name) for name in arm]
+    columns = rows[:, len(frames) : len(frames) + len(arm)]
+    columns = columns * [TYPICAL[group_of(before, name) or 'drive'] for name in arm]
     alike = []
     for name, level in levels.items():
         size = steps[Parameter(name).owner] / np.sqrt(12.0)
@@ -132,11 +128,6 @@ def may_be_rounding(
     }
     healthy = max(found[key] for key in found if key[1] == 0.0)
     return bool(max(found.values()) - healthy < DECIDED)
-
-
-def _usual(name: str) -> float:
-    parameter = Parameter(name)
-    return USUAL[not parameter.is_length] if parameter.of_dh else effects.expected(name)
 
 
 def _evidence(columns: FloatArray, values: FloatArray, freedom: int) -> float:

@@ -32,6 +32,7 @@ from calib_ros.identification.leastsquares import (
     minimise,
     normal_equations,
 )
+from calib_ros.identification.levels import TELLING
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.robust import robust_fit
@@ -44,10 +45,6 @@ from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
-FOR_A_PLACE = 8
-"""Samples from which a place by distances is drawn, of 4 unknowns."""
-ONE_ORIENTATION = 0.9999
-"""Ratio of the leading singular values from which orientations are one, within 0.01 rad."""
 GOOD = 0.03
 """A start is taken without a search when its RMS error is below this share of the spread."""
 
@@ -106,8 +103,7 @@ def _start_one(
         return chain
     if observations.socket:
         return _in_socket(chain, observations)
-    index = np.unique(np.linspace(0, len(observations) - 1, SOME_POSES).round().astype(int))
-    subset = observations.select(index)
+    subset = observations.spread()
     system = System((Samples(subset, sigma_position, sigma_orientation),))
     arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
     determined: tuple[str, ...] = ()
@@ -238,15 +234,14 @@ def _trilaterated(
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
     chosen = np.arange(len(points))
-    if robust and len(points) > FOR_A_PLACE:
-        draws = (
-            np.random.default_rng(0).random((STARTS, len(points))).argsort(axis=1)[:, :FOR_A_PLACE]
-        )
+    if robust and len(points) > TELLING:
+        order = np.random.default_rng(0).random((STARTS, len(points))).argsort(axis=1)
+        draws = order[:, :TELLING]
         found = (np.linalg.pinv(columns[draws]) @ wanted[draws, np.newaxis])[:, :3, 0]
         lengths = np.linalg.norm(points + found[:, np.newaxis], axis=2)
         misfits = np.abs(lengths - observations.distances)
         best = misfits[np.argmin(np.median(misfits, axis=1))]
-        chosen = np.argsort(best)[: max(len(points) // 2, FOR_A_PLACE)]
+        chosen = np.argsort(best)[: max(len(points) // 2, TELLING)]
     matrix = np.eye(4)
     matrix[:3, 3] = np.linalg.lstsq(columns[chosen], wanted[chosen], rcond=None)[0][:3]
     return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
@@ -269,13 +264,11 @@ def _closed_form(
                 np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
             )
         system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
-        _, sizes, right = np.linalg.svd(system)
+        right = np.linalg.svd(system)[2]
         for sign in (1.0, -1.0):  # the singular vector's sign is open, its determinant is not
             matrix = sign * right[0].reshape(3, 3, order='F')
             if np.linalg.det(matrix) > 0.0:
                 yield se3.nearest_rotation(matrix)
-        if sizes[1] < ONE_ORIENTATION * sizes[0]:
-            return
     positions = observations.positions - observations.positions.mean(axis=0)
     tool_point = chain.frame('tool').matrix[:3, 3]
     reached = arm[:, :3, 3] + arm[:, :3, :3] @ tool_point

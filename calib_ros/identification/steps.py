@@ -41,8 +41,6 @@ from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 EXPLAINED = 0.5
 """Share of the squares of the residuals from which on something explains them: most of them
 (benchmarks/harm.py)."""
-PLACES = 40
-"""Stops at which steps are looked for first."""
 LEAST_ASIDE = 3
 """Stops before and after a step: fewer are gross errors."""
 
@@ -102,12 +100,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     places = np.arange(LEAST_ASIDE, scan.stops - LEAST_ASIDE + 1)
     if not len(places):
         return None
-    coarse = places[:: 1 + (len(places) - 1) // PLACES]
-    found = scan.best(coarse, 0.5 * EXPLAINED)  # of a step near by
-    if found is None:
-        return None
-    near = np.abs(places - found.stop) <= np.diff(coarse).max(initial=0)
-    found = scan.best(places[near], EXPLAINED)
+    found = scan.best(places)
     return None if found is None or scan.drifts(found) else scan.described(found)
 
 
@@ -171,8 +164,8 @@ class _Scan:
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
 
-    def best(self, places: NDArray[np.intp], least: float) -> _Found | None:
-        """Return the best step at one of the stops, if it explains more than the least share."""
+    def best(self, places: NDArray[np.intp]) -> _Found | None:
+        """Return the best step at one of the stops, if it explains most of the squares."""
         products = self._to_the_end(places)
         own = products[:, :, [self._names.index(name) for name in self._added]]
         cross = products[:, :, : self._fitted] @ self._root
@@ -200,9 +193,9 @@ class _Scan:
             k = int(np.argmax(share))
             rest = (1.0 - share[k]) / (freedom - rank[k])
             beyond = 1.0 - rest * freedom
-            chance = PLACES * len(self._groups) * self._chance(float(gain[k]), int(rank[k]))
+            chance = len(places) * len(self._groups) * self._chance(float(gain[k]), int(rank[k]))
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
-            if beyond > least and chance < 1.0 - SURE and criterion < lowest:
+            if beyond > EXPLAINED and chance < 1.0 - SURE and criterion < lowest:
                 lowest = criterion
                 change = size[k] * (axes[k] @ (along[k] * inverse[k]))
                 found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))

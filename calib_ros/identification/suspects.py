@@ -18,8 +18,6 @@ from calib_ros.kinematics.se3 import FloatArray
 
 Sets: TypeAlias = tuple[Observations, ...]
 Change: TypeAlias = Callable[[Observations], Observations]
-ROWS = (1, -1, 2, -2)
-"""Rows by which joint values may stand beside another measurement."""
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
@@ -69,7 +67,7 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
     )
     yield from _of_joints(chain)
     yield from _of_arms(chain)
-    for rows in ROWS:
+    for rows in (1, -1, 2, -2):
         where = 'below' if rows > 0 else 'above'
         count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
         yield Suspect(

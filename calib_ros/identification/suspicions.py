@@ -28,9 +28,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
+from calib_ros.identification.evidence import SPREAD, TYPICAL
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
-from calib_ros.identification.levels import NEARER, SCALE
+from calib_ros.identification.levels import NEARER, SCALE, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
@@ -45,17 +46,12 @@ from calib_ros.kinematics.se3 import FloatArray
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
 
-CHANCE = 1e-4
-"""Probability of a scale as significant in an arm whose offsets only scatter
-(benchmarks/harm.py)."""
 LEAST_SCALE = 0.5 * SCALE
 """Of a device of which it is told: half of what those of good ones scatter by."""
 LARGEST_SCALE = 1e-3
 """Growth of an arm by 40 degrees, if all of it is of aluminium (23 ppm a degree)."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths that are tried."""
-ANOTHER = (2e-3, 5e-3)
-"""Least offset [m, rad] of an arm that may be another one than the nominal."""
 
 
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
@@ -121,7 +117,7 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     scale, std, freedom = scale_of(problem, result)
     if freedom < 2.0 or abs(scale) < LEAST_SCALE:
         return '', False
-    limit = special.stdtrit(freedom, 1.0 - 0.5 * CHANCE) * std
+    limit = special.stdtrit(freedom, 0.5 + 0.5 * SURE) * std
     if abs(scale) < limit:
         return '', False
     certain = abs(scale) - limit > LARGEST_SCALE
@@ -138,7 +134,8 @@ def _percent(share: float) -> str:
 
 def _sister(problem: Problem, result: Identification) -> str:
     """Return in words which shipped robot is much nearer to the arm found than the nominal."""
-    if not any(each.beyond(*ANOTHER) for each in result.parameters):
+    far = SPREAD * TYPICAL['length'], SPREAD * TYPICAL['angle']
+    if not any(each.beyond(*far) for each in result.parameters):
         return ''
     types = [joint.type for joint in problem.chain.joints]
     joints = problem.sets[0].spread().joints

@@ -23,22 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.leastsquares import System, minimise
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, FloatArray
 
 STARTS = 500
 """As many as FAST-LTS has."""
-CONCENTRATIONS = 4
-"""Concentration steps from every start; then only the BEST are followed to their end."""
 BEST = 10
-"""As many as FAST-LTS has."""
-RELINEARISATIONS = 5
-"""Times that the model is made anew at the best half at most (benchmarks/outliers.py)."""
-SEARCHED = 300
-"""Samples that are searched, evenly spread over all, of each set a tenth at least; the fit that
-follows takes all."""
-DRAWN = 0.5
-"""Equations of a start per parameter: the fewer, the likelier is a start without gross errors."""
+"""As many as FAST-LTS follows to their end, after two concentration steps from every start."""
 
 
 def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
@@ -54,11 +46,11 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
     halves = _Halves(few, need)
     masks = halves.draw(need)
     linear = _Linear(chain, names, few)
-    for _ in range(CONCENTRATIONS):
+    for _ in range(2):
         masks, sums = halves.concentrate(linear.squares(masks))
     masks = masks[np.argsort(sums)[:BEST]]
     half = masks[0]
-    for _ in range(RELINEARISATIONS):
+    for _ in range(ROUNDS):
         for _ in range(ROUNDS):
             before = masks
             masks, sums = halves.concentrate(linear.squares(masks))
@@ -84,8 +76,8 @@ def trimmed_sum(chain: Chain, system: System) -> float:
 
 
 def _thinned(system: System) -> System:
-    """Return a part of the samples."""
-    most = max(SEARCHED // len(system.sets), SEARCHED // 10)
+    """Return SOME_POSES evenly spread over all samples, of each set a tenth of them at least."""
+    most = SOME_POSES // min(len(system.sets), 10)
     return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
 
 
@@ -111,13 +103,16 @@ class _Halves:
         self._sizes = [int(np.ceil(0.5 * (1.0 + need) * s.count)) for s in system.sets]
 
     def draw(self, need: float) -> NDArray[np.bool_]:
-        """Return seeded starts: some configurations of every set."""
+        """Return seeded starts: of every set half the configurations that all parameters need.
+
+        The fewer, the likelier is a start without gross errors; ties go by what was known before.
+        """
         rng = np.random.default_rng(0)
         masks = []
         for group in self._groups:
             count = int(group.max(initial=-1)) + 1
             rank = np.argsort(rng.random((STARTS, count)), axis=1)
-            masks.append((rank < np.ceil(DRAWN * need * count))[:, group])
+            masks.append((rank < np.ceil(0.5 * need * count))[:, group])
         return np.concatenate(masks, axis=1)
 
     def concentrate(self, squares: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:

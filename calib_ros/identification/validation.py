@@ -16,7 +16,7 @@ from scipy import special
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise, without_each
-from calib_ros.identification.levels import CONFIDENT, KNOWN
+from calib_ros.identification.levels import CONFIDENT, KNOWN, TELLING
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
@@ -29,8 +29,6 @@ from calib_ros.shown import Shown, as_frame
 COUNTS = 0.005
 """Change of an RMS error that counts, of itself; less is how it happens to fall
 (benchmarks/real_robots.py)."""
-SPARE = 6
-"""Equations that a fit to a part of the configurations must have to spare."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +171,11 @@ def compare(
 ) -> Comparison:
     """Return the residuals of all sets, one after the other, by both chains."""
     numbers = np.concatenate(numbered(sets))
-    index = np.arange(len(numbers))
-    second = _joined([residuals(after, each) for each in sets], numbers, index)
-    first = _joined([residuals(before, each) for each in sets], numbers, index)
-    return Comparison(
-        first,
-        second,
-        np.ones(len(numbers), dtype=bool) if judged is None else judged,
+    first, second = (
+        _joined([residuals(chain, each) for each in sets], numbers) for chain in (before, after)
     )
+    every = np.ones(len(numbers), dtype=bool)
+    return Comparison(first, second, every if judged is None else judged)
 
 
 def validate(
@@ -294,17 +289,19 @@ def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int
     known = dict(problem.model.effects)
     names = [name for name in names if name not in known]  # which have priors
     folds = min(problem.folds, count)
-    if folds > 1 and rows * (folds - 1) // folds >= len(names) + SPARE:
+    if folds > 1 and rows * (folds - 1) // folds >= len(names) + TELLING:
         return folds
     folds = count
     unknown = set(names) - problem.informed
-    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + SPARE:
+    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + TELLING:
         return 0
     return folds
 
 
 def _joined(
-    pieces: Sequence[Residuals], configurations: NDArray[np.intp], index: NDArray[np.intp]
+    pieces: Sequence[Residuals],
+    configurations: NDArray[np.intp],
+    index: NDArray[np.intp] | slice = slice(None),
 ) -> Residuals:
     """Return the residuals of several parts as one, put in order by an index (N,)."""
     return Residuals(
@@ -365,13 +362,10 @@ def _leave_one_place_out(
         for each in problem.sets
     ]
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
-    index = np.arange(len(groups))
+    first = _joined([part.before for part in parts], groups)
+    second = _joined([part.after for part in parts], groups)
     return (
-        Comparison(
-            _joined([part.before for part in parts], groups, index),
-            _joined([part.after for part in parts], groups, index),
-            ~robust.outliers,
-        ),
+        Comparison(first, second, ~robust.outliers),
         f'leaving out one of {len(places)} places at a time',
     )
 

@@ -37,9 +37,6 @@ from calib_ros.shown import Shown
 
 Flags = NDArray[np.bool_]
 
-POSITION_FIRST = 1e-3
-"""Metres that a radian counts where not every orientation can be reached: position first."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution(Shown):
@@ -104,7 +101,7 @@ class Follower:
         self.lower, self.upper = limits(leader)
         freedoms = mobility(leader)
         self.complete = freedoms == 6
-        self._weight = weight or (LEVER if self.complete else POSITION_FIRST)
+        self._weight = weight or (LEVER if self.complete else 1e-3)  # as `Limits` promises
         self._first_weight = LEVER if self.complete else self._weight
         # where more joints than freedoms make J^T J singular, D stands above its rounding
         ridge = ROUNDING if len(unit) > freedoms else HALF_THE_DIGITS**2
