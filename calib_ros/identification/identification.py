@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from calib_ros.errors import InputError
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.acceptance import Findings, refusals, remarks
 from calib_ros.identification.configurations import distinct
@@ -248,8 +249,20 @@ def identify(
     ------
     TooFewObservationsError
         With fewer equations than parameters.
+    InputError
+        When the fit runs away, with the mistake that explains it, if one does.
 
     """
+    try:
+        return _identified(problem, simpler, progress)
+    except np.linalg.LinAlgError as err:
+        found = mistakes.explained(problem) or 'check the arm, its joint values and the units'
+        raise InputError(f'the measurements do not fit the arm at all: {found}') from err
+
+
+def _identified(
+    problem: Problem, simpler: Identification | None, progress: Told
+) -> Identification:
     known = Simpler(simpler.chain, simpler.distances, simpler.noise) if simpler else None
     structural, start, fitted = fit(problem, known)
     problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain

@@ -257,7 +257,8 @@ def minimise(
     (Levenberg 1944, Marquardt 1963), by the ratio of the gain to the one foreseen (Nielsen 1999).
     It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
     It ends as well, not converged, where ROUNDS iterations bring no progress (a thousandth of the
-    cost, or half of the step left to go), or after so many `iterations`; curved valleys need 400.
+    cost, or half of the step left to go), where numbers end, or after so many `iterations`; curved
+    valleys need 400.
     `normal` are the equations at the start, if known.
     """
     normal = normal or normal_equations(chain, names, system)
@@ -275,6 +276,8 @@ def minimise(
         settled = left < tolerance * max(1.0, normal.rms(system))
         if damping > 0.0 and not settled:
             step = _solve(normal.matrix, normal.gradient, damping)
+        if not np.isfinite(step).all():
+            break
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
             return Fit(chain, normal, iteration, True, left)
@@ -317,20 +320,27 @@ def without_each(
     rest = parts.sum(axis=0) + extra.T @ extra - parts
     for k, normal in enumerate(rest):
         step = _solve(normal[:-1, :-1], normal[:-1, -1])
-        near = chain.with_offsets(dict(zip(names, step, strict=True)))
-        if np.abs(step[curved]).max(initial=0.0) > SMALL_STEP:
+        near = chain
+        if np.isfinite(step).all():
+            near = chain.with_offsets(dict(zip(names, step, strict=True)))
+        if not np.abs(step[curved]).max(initial=0.0) <= SMALL_STEP:
             few = system.select([numbers != k for numbers in folds])
             near = minimise(near, names, few, tolerance=1e-3).chain
         yield near
 
 
 def _solve(matrix: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:
-    """Return the damped step; a matrix that rounding made singular is damped a little more."""
+    """Return the damped step; a matrix that rounding made singular is damped a little more.
+
+    NaN where the numbers of the matrix end.
+    """
     size = np.arange(len(matrix))
     if not len(size):
         return gradient
     scale = 1.0 / np.sqrt(np.maximum(matrix[size, size], 1e-300))
     scaled = matrix * scale * scale[:, np.newaxis]
+    if not np.isfinite(scaled).all():
+        return np.full(len(matrix), np.nan)
     unit = scaled[size, size]
     while True:
         scaled[size, size] = unit + damping

@@ -27,12 +27,14 @@ from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, NEARER
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.resection import board_poses
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms
 from calib_ros.identification.suspects import Sets, Suspect, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
+from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -79,9 +81,9 @@ def remarked(problem: Problem, result: Identification) -> Identification:
 def _suspicious(problem: Problem, result: Identification) -> bool:
     """Tell whether errors, before or after, are larger than those of faulty arms.
 
-    Couplings may explain most of what is left, however small.
+    Couplings may explain most of what is left, however small, and a fit without end anything.
     """
-    if not result.refusals and result.coupled:
+    if not result.converged or (not result.refusals and result.coupled):
         return True
     judged = result.validation or result.fitted
     for each in (judged.before, judged.after, result.fitted.before):
@@ -100,7 +102,10 @@ def _rms(vectors: FloatArray) -> float:
 
 def explained(problem: Problem) -> Explained | None:
     """Return what explains the measurements much better than what was given, if anything does."""
-    sets = tuple(e for e in problem.sets if e.distances is None and e.pixels is None)
+    sets = tuple(e for e in problem.sets if e.distances is None)
+    of_images = any(each.pixels is not None for each in sets)
+    if of_images:
+        sets = tuple(_as_poses(problem, e) for e in sets if e.pixels is not None)
     if not sets or max(map(len, sets)) < 6:
         return None  # base and tool alone explain nearly all of them
     if not any(each.socket for each in sets):
@@ -113,7 +118,7 @@ def explained(problem: Problem) -> Explained | None:
     if given is None:
         return None
     rough = []
-    for k, each in enumerate(suspects(chain, few)):
+    for k, each in enumerate(suspects(chain, few, of_images)):
         whole = [_moved(problem, one, each.rows) for one in sets] if each.rows else few
         found = _tried(each.chain or chain, tuple(map(each.change, map(_few, whole))))
         if found is not None and found.share < given.share:
@@ -143,6 +148,13 @@ def explained(problem: Problem) -> Explained | None:
 
 def _known(frame: Frame | None) -> Frame | None:
     return frame if frame is not None and frame.fixed else None
+
+
+def _as_poses(problem: Problem, each: Observations) -> Observations:
+    """Return what was measured, boards in images by their poses."""
+    if each.pixels is None:
+        return each
+    return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
 
 
 def _few(observations: Observations) -> Observations:
@@ -225,6 +237,7 @@ def _error(chain: Chain, sets: Sets) -> float:
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     """Return each measurement with the joint values so many rows below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
+    same = [_as_poses(problem, e) for e in same]
     parts = [replace(e, covariance=None) for e in (each, *same) if e.distances is None]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
     here = slice(max(0, -rows), len(order) - max(0, rows))

@@ -129,15 +129,19 @@ def resect(observations: Observations, lens: Lens) -> BoardPoses:
 
 
 def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return (M,) which images show enough points that are not in line."""
+    """Return (M,) which images show enough points that are not in line, nor are there."""
     assert observations.points is not None
+    assert observations.pixels is not None
     count = np.bincount(index)
-    mean = np.stack([np.bincount(index, row) for row in observations.points.T], axis=1)
-    rest = observations.points - (mean / count[:, np.newaxis])[index]
-    outer = np.einsum('ni,nj->nij', rest, rest).reshape(-1, 9)
+    told = count >= 4
     begins = np.flatnonzero(np.diff(index, prepend=-1))
-    spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins).reshape(-1, 3, 3))
-    return np.asarray((count >= 4) & (spread[:, 1] > DEGENERATE**2 * spread[:, 2]))
+    for places in (observations.points, observations.pixels):
+        mean = np.stack([np.bincount(index, row) for row in places.T], axis=1)
+        rest = places - (mean / count[:, np.newaxis])[index]
+        outer = rest[:, :, np.newaxis] * rest[:, np.newaxis]
+        spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins))
+        told &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
+    return np.asarray(told)
 
 
 def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:

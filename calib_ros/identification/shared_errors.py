@@ -140,6 +140,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
         for part, found in alike.items()
     }
     sizes = forms.sizes(kernels)
+    alike = {part: found for part, found in alike.items() if sizes[part].any()}
     even = few if share == 1 else _gather(fit.chain, names, system, share, 1)
     middles: dict[int, FloatArray] = {}
     by_time: dict[int, list[tuple[float, float]]] = {}

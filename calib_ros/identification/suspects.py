@@ -42,11 +42,19 @@ class Suspect:
     published: str = 'correct it where it is published'
 
 
-def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
-    """Yield what may have gone wrong, the most usual first."""
-    turning = np.array([joint.type == 'revolute' for joint in chain.joints])
-    degrees = _joints(np.diag(np.where(turning, np.radians(1.0), 1.0)))
+def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Suspect]:
+    """Yield what may have gone wrong, the most usual first.
+
+    Poses `of_images` are those of a board in a camera; joint values stand in a table of places.
+    """
+    if of_images:
+        yield from _of_boards(sets[0].inverse)
+        for each in _of_places(chain):
+            remedy = each.published if 'chain' in each.published else 'correct it in --places'
+            yield replace(each, remedy=remedy)
+        return
     if not any(each.socket for each in sets):
+        degrees = _turned(chain, np.radians(1.0))
         yield from _units(chain, degrees)
         if all(each.oriented.any() for each in sets):
             whole = all(each.oriented.all() for each in sets)
@@ -59,12 +67,17 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
             _mirrored,
             3,
         )
-    yield Suspect('the joint values are in degrees, not radians', '--joint-angle deg', degrees)
-    yield Suspect(
-        'the joint values are in radians, not degrees',
-        '--joint-angle rad',
-        _joints(np.diag(np.where(turning, np.degrees(1.0), 1.0))),
-    )
+    yield from _of_places(chain)
+
+
+def _of_places(chain: Chain) -> Iterator[Suspect]:
+    """Yield what may be wrong about joint values and the arm."""
+    for one, other, unit, size in (
+        ('degrees', 'radians', 'deg', np.radians(1.0)),
+        ('radians', 'degrees', 'rad', np.degrees(1.0)),
+    ):
+        what = f'the joint values are in {one}, not {other}'
+        yield Suspect(what, f'--joint-angle {unit}', _turned(chain, size))
     yield from _of_joints(chain)
     yield from _of_arms(chain)
     for rows in (1, -1, 2, -2):
@@ -78,6 +91,21 @@ def suspects(chain: Chain, sets: Sets) -> Iterator[Suspect]:
             rows=rows,
             published='check the stamps, and delay',
         )
+
+
+def _of_boards(inverse: bool) -> Iterator[Suspect]:
+    """Yield what may be wrong about a camera and its board."""
+    ways = (
+        ('the camera is on the flange', '--eye-in-hand (or eye_in_hand)', 'true'),
+        ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)', 'false'),
+    )
+    what, remedy, value = ways[inverse]
+    in_sources = f'set eye_in_hand={value} in sources'
+    yield Suspect(what, remedy, Observations.inverted, published=in_sources)
+    for unit, size in SCALES.items():
+        remedy = 'give square and marker in metres'
+        what = f'the lengths of the board are in {unit}, not metres'
+        yield Suspect(what, remedy, _scaled(size), published=remedy)
 
 
 def _units(chain: Chain, degrees: Change) -> Iterator[Suspect]:
@@ -250,6 +278,10 @@ def _one_by_one(*changes: Change) -> Change:
 
 def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
     return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
+
+
+def _turned(chain: Chain, size: float) -> Change:
+    return _joints(np.diag([size if j.type == 'revolute' else 1.0 for j in chain.joints]))
 
 
 def _lengths(chain: Chain, size: float) -> Change:

@@ -89,6 +89,17 @@ def test_a_fit_without_progress_ends_and_says_so(monkeypatch):
     assert fit.chain is start
 
 
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_a_fit_whose_numbers_end_stays_where_it_is(value, monkeypatch):
+    start, names, system = still_joint('ur10e', 0)
+    ended = normal_equations(start, names, system)
+    ended = replace(ended, matrix=value * ended.matrix)
+    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: ended)
+    fit = minimise(start, names, system)
+    assert not fit.converged
+    assert fit.chain is start
+
+
 def test_normal_equations_and_triangular_factor_agree_over_blocks():
     _, true, seen = measured_arm(12, 2 * BLOCK + 7, (1e-4, 1e-4))
     names = UR10E.parameter_names

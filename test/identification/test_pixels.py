@@ -13,8 +13,10 @@ from measured import rows_of, write_csv
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.identification import identification
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System, products_of, stacked
+from calib_ros.identification.mistakes import explained
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.pixels import PixelSamples
 from calib_ros.identification.resection import _from_homography, board_poses, resect
@@ -285,3 +287,65 @@ def test_corners_and_a_table_by_the_command_line(tmp_path, capsys, rng):
     assert 'need --board' in capsys.readouterr().err
     assert main([*words[:1], '--chain', 'flange_pose', *words[3:]]) == 1
     assert 'holds joint values: give the chain of the arm' in capsys.readouterr().err
+
+
+def spoilt(seen, joints=None, points=None, on_flange=None):
+    return Observations.from_pixels(
+        seen.joints if joints is None else joints,
+        seen.pixels,
+        seen.points if points is None else points,
+        seen.images,
+        seen.on_flange if on_flange is None else on_flange,
+    )
+
+
+MISTAKES = {
+    'degrees': (lambda s: spoilt(s, np.degrees(s.joints)), 'degrees, not radians: correct it in'),
+    'sign': (lambda s: spoilt(s, s.joints * [1, 1, -1, 1, 1, 1]), 'sign: -1 in the chain file'),
+    'shift': (lambda s: spoilt(s, np.roll(s.joints, len(POINTS), axis=0)), '1 row below'),
+    'board': (lambda s: spoilt(s, points=1e3 * s.points), 'give square and marker in metres'),
+    'mount': (lambda s: spoilt(s, on_flange=not s.on_flange), '--eye-in-hand'),
+}
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+@pytest.mark.parametrize('kind', list(MISTAKES))
+def test_the_usual_mistakes_are_named(kind, on_flange):
+    change, words = MISTAKES[kind]
+    _, seen = scene(2, on_flange)
+    assert explained(Problem(known(on_flange), seen, sigma_pixel=SIGMA)) is None
+    wrong = change(seen)
+    found = explained(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))
+    assert words in str(found)
+    if kind == 'mount':
+        assert ('leave out' in str(found)) == wrong.on_flange
+        live = Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA, of_messages=True)
+        value = 'false' if wrong.on_flange else 'true'
+        assert f'set eye_in_hand={value} in sources' in str(explained(live))
+
+
+def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
+    change, words = MISTAKES['board']
+    result = identify(Problem(known(True), change(scene(2, True)[1]), sigma_pixel=SIGMA))
+    assert words in str(result.refusals[0])
+
+
+def test_corners_in_one_place_tell_no_pose():
+    _, seen = scene(2, True)
+    same = replace(seen, pixels=np.zeros_like(seen.pixels))
+    with pytest.raises(InputError, match='not in line'):
+        identify(Problem(known(True), same, sigma_pixel=SIGMA))
+
+
+def test_a_fit_that_runs_away_ends_in_words(monkeypatch):
+    def away(*_):
+        raise np.linalg.LinAlgError('singular posterior')
+
+    monkeypatch.setattr(identification, 'fit', away)
+    _, seen = scene(2, True)
+    for given, words in (
+        (seen, 'the measurements do not fit the arm at all: check the arm'),
+        (spoilt(seen, points=1e3 * seen.points), 'at all: the lengths of the board are in mm'),
+    ):
+        with pytest.raises(InputError, match=words):
+            identify(Problem(known(True), given, sigma_pixel=SIGMA))
