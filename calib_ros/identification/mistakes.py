@@ -24,7 +24,7 @@ import numpy as np
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, NEARER
-from calib_ros.identification.observations import SOME_POSES, Observations
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
@@ -158,7 +158,7 @@ def _as_poses(problem: Problem, each: Observations) -> Observations:
 
 
 def _few(observations: Observations) -> Observations:
-    return observations.spread(SOME_POSES // 4)
+    return observations.spread()
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
 from calib_ros.identification.identifiability import DEGENERATE
+from calib_ros.identification.levels import NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
@@ -38,7 +39,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     Raises
     ------
     InputError
-        When no image shows enough points.
+        When no image shows enough points, or half of those that do fit no pose of the board.
 
     """
     told = _tell_a_pose(observations, observations.images)
@@ -49,6 +50,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
         )
     rows = observations.select(told[observations.images])
     found = resect(rows, lens)
+    _require_fit(rows, found.rms)
     first = np.flatnonzero(np.diff(rows.images, prepend=-1))
     alone = replace(rows, pixels=None, points=None, on_flange=False).select(first)
     seen = replace(
@@ -58,6 +60,22 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
         oriented=np.ones(len(alone), dtype=bool),
     )
     return seen.inverted() if observations.on_flange else seen
+
+
+def _require_fit(observations: Observations, rms: FloatArray) -> None:
+    """Raise unless a pose of the board explains most of where most images show its points."""
+    assert observations.pixels is not None
+    index, pixels = observations.images, observations.pixels
+    count = np.bincount(index)[:, np.newaxis]
+    centre = np.stack([np.bincount(index, row) for row in pixels.T], axis=1) / count
+    spread = np.sqrt(np.bincount(index, ((pixels - centre[index]) ** 2).sum(axis=1)) / count[:, 0])
+    beside = ~(rms < NEARER * spread)
+    if 2 * beside.sum() > len(rms):
+        raise InputError(
+            f'the corners do not fit the board in {beside.sum()} of {len(rms)} images '
+            f'(typically {np.median(rms[beside]):.3g} px beside it): check the columns and rows '
+            'of the board, the numbers of its corners, and the lens'
+        )
 
 
 def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> FloatArray:

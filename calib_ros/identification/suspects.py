@@ -106,6 +106,8 @@ def _of_boards(inverse: bool) -> Iterator[Suspect]:
         remedy = 'give square and marker in metres'
         what = f'the lengths of the board are in {unit}, not metres'
         yield Suspect(what, remedy, _scaled(size), published=remedy)
+    remedy = 'give images and corners as the camera sees them, u to the right and v down'
+    yield Suspect('the images are mirrored', remedy, _mirrored, published=remedy)
 
 
 def _units(chain: Chain, degrees: Change) -> Iterator[Suspect]:

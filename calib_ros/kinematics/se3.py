@@ -66,7 +66,7 @@ def exp_rotation(vector: FloatArray) -> FloatArray:
 
 def turned(x: float, y: float, z: float) -> FloatArray:
     """Return the rotation matrix (3, 3) of one rotation vector [rad] (Rodrigues)."""
-    angle = math.sqrt(x * x + y * y + z * z)
+    angle = math.hypot(x, y, z)
     # sin(a) / a and (1 - cos(a)) / a^2, without loss of digits
     half = math.sin(0.5 * angle) / (0.5 * angle) if angle > 0.0 else 1.0
     first, second = math.sin(angle) / angle if angle > 0.0 else 1.0, 0.5 * half * half

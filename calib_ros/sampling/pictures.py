@@ -156,8 +156,8 @@ class Pictures:
         seen = Observations.from_pixels(joints, view.pixels, view.points, index)
         try:
             found = board_poses(seen, view.lens)
-        except InputError:
-            return Refusal('of corners in a line', 'its corners are in a line')
+        except InputError as err:
+            return Refusal('that tells no pose of the board', str(err))
         pose = se3.transform(found.rotations, found.positions)
         return replace(
             sample,

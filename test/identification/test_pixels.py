@@ -289,10 +289,10 @@ def test_corners_and_a_table_by_the_command_line(tmp_path, capsys, rng):
     assert 'holds joint values: give the chain of the arm' in capsys.readouterr().err
 
 
-def spoilt(seen, joints=None, points=None, on_flange=None):
+def spoilt(seen, joints=None, points=None, on_flange=None, pixels=None):
     return Observations.from_pixels(
         seen.joints if joints is None else joints,
-        seen.pixels,
+        seen.pixels if pixels is None else pixels,
         seen.points if points is None else points,
         seen.images,
         seen.on_flange if on_flange is None else on_flange,
@@ -304,6 +304,10 @@ MISTAKES = {
     'sign': (lambda s: spoilt(s, s.joints * [1, 1, -1, 1, 1, 1]), 'sign: -1 in the chain file'),
     'shift': (lambda s: spoilt(s, np.roll(s.joints, len(POINTS), axis=0)), '1 row below'),
     'board': (lambda s: spoilt(s, points=1e3 * s.points), 'give square and marker in metres'),
+    'mirrored': (
+        lambda s: spoilt(s, pixels=[1600, 0] + s.pixels * [-1, 1]),
+        'images are mirrored',
+    ),
     'mount': (lambda s: spoilt(s, on_flange=not s.on_flange), '--eye-in-hand'),
 }
 
@@ -328,6 +332,15 @@ def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
     change, words = MISTAKES['board']
     result = identify(Problem(known(True), change(scene(2, True)[1]), sigma_pixel=SIGMA))
     assert words in str(result.refusals[0])
+
+
+def test_corners_of_another_board_are_named():
+    _, seen = scene(2, True)
+    other = np.tile(
+        POINTS[np.random.default_rng(0).permutation(len(POINTS))], (len(seen) // len(POINTS), 1)
+    )
+    with pytest.raises(InputError, match='do not fit the board in 30 of 30 images'):
+        identify(Problem(known(True), spoilt(seen, points=other), sigma_pixel=SIGMA))
 
 
 def test_corners_in_one_place_tell_no_pose():
