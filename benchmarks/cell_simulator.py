@@ -201,6 +201,18 @@ def resized(plain, wrong, what, size):
     return wrong
 
 
+def bent(places, size, rng):
+    """Return places (N, 3) [m] as a device sees them that bends space by so much (RMS).
+
+    By squares and cubes of the coordinates.
+    """
+    x = (places - places.mean(axis=0)) / np.sqrt(places.var(axis=0).sum())
+    powers = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
+    powers += [x[:, i] ** 2 * x[:, j] for i in range(3) for j in range(3)]
+    error = np.array(powers).T @ rng.normal(size=(len(powers), 3))
+    return places + size * error / rms(np.linalg.norm(error, axis=1))
+
+
 def home_of(arm, rng, inner=0.6):
     """Return joint values (n,) away from the limits."""
     middle, half = arm.limits.mean(axis=1), np.ptp(arm.limits, axis=1) / 2.0

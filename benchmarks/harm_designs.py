@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
-from cell_simulator import RIPPLE, Arm, poses, resized
+from cell_simulator import RIPPLE, Arm, bent, poses, resized
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.observations import Observations
@@ -85,6 +85,10 @@ DESIGNS = (
     *(
         Design(f'one orientation{how}', 30, ('lines',), what='wobble', size=size, robots=LINES)
         for how, size in (('', 0.0), (', to 1 mrad', 1e-3))
+    ),
+    *(
+        Design(f'device off by {1e3 * size:g} mm', 40, (*ORDERS, 'local'), what='bent', size=size)
+        for size in (1e-4, 3e-4, 1e-3)
     ),
     Design('scale of 500 ppm', 40, what='scale', size=5e-4),
     Design('scale of 1 %', 40, what='scale', size=1e-2),
@@ -174,6 +178,9 @@ def measured_by(design, arm, q, rng):
         seen = replace(seen, positions=seen.positions + moved)
     if what == 'drift':
         seen = replace(seen, positions=seen.positions + drift(len(q), size, rng))
+    if what == 'bent':
+        seen = replace(seen, positions=bent(seen.positions, size, rng))
+        options['sigma_position'] = float(np.hypot(NOISE[0], size))
     if what == 'scale':
         seen = replace(seen, positions=seen.positions * (1.0 + size))
     if what == 'rounded':

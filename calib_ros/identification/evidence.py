@@ -24,7 +24,7 @@ Effects that a model leaves out are *considered*: they are columns of the same p
 of their own, so that the arm as it may be, effects included, can be held against the one that was
 fitted (`region.py`; Schmidt 1966 has the idea). So is the scale of the measuring device, which
 makes all lengths grow alike: positions are linear in all lengths L, so its column is the sum of
-L dp/dL.
+L dp/dL; and all that it may do to space besides (`device.py`).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ import numpy as np
 from scipy import special
 from scipy.linalg import lapack
 
-from calib_ros.identification.leastsquares import Normal, System, normal_equations
-from calib_ros.identification.levels import CONFIDENT, PRINTED, SCALE
-from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.considered import told_of
+from calib_ros.identification.leastsquares import Normal, System
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.shown import Shown
 
@@ -55,8 +55,6 @@ SPREAD = 10.0
 benchmarks/harm.py)."""
 TAILS = 3.0
 """Degrees of freedom of the prior (benchmarks/harm.py)."""
-CONSIDERED = ('eccentricity', 'gravity')
-"""Effects that any arm may have, fitted or not; couplings hardly show in moves of one joint."""
 SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
 """Logarithms of the ratio of probabilities beyond which effects show, and from which those of
 usual size are refuted."""
@@ -151,13 +149,6 @@ class Posterior(Shown):
         return variance / self.priors[name] ** 2 if name in self.priors else 0.0
 
 
-def considered(chain: Chain, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the effects that an arm may have besides those among the names."""
-    every = [name for group in CONSIDERED for name in effects.members(chain, group)]
-    every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
-    return tuple(name for name in every if name not in names)
-
-
 def posterior_of(
     chain: Chain,
     nominal: Chain,
@@ -180,73 +171,26 @@ def posterior_of(
     """
     chain = chain.with_effects(more)
     every = (*names, *more)
-    beside = [({name: 1.0}, std) for name, std in (doubts or {}).items() if name in names]
-    whole, lengths, scale = _lengths(chain, system) if more else (chain, {}, SCALE)
-    beside += [(lengths, scale)] if lengths else []
-    told = _told(whole, every, [parts for parts, _ in beside], system, at_the_fit) / noise**2
-    matrix = told[:-1, :-1]
-    offsets = np.zeros(len(matrix))
+    beside = {name: std for name, std in (doubts or {}).items() if name in names}
+    plain, bent = told_of(chain, every, system, noise, beside, bool(more), at_the_fit)
+    offsets = np.zeros(len(every))
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
-    vector = matrix @ offsets + told[:-1, -1]
-    groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
-    given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
-    evidence = _Evidence(matrix, vector, given, groups)
+    (matrix, vector), (other, along) = (
+        (each[:-1, :-1], each[:-1, :-1] @ offsets + each[:-1, -1]) for each in (plain, bent)
+    )
+    groups = [None if n in known else group_of(chain, n) for n in every]
+    given = np.array([known.get(n, np.inf) for n in every]) ** -2
+    evidence = _Evidence(other, along, given, groups)
     size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     near = evidence.near(size, slope) if judging else ()
     stds = evidence.stds(size)
-    priors = {name: std for name, std in zip(every, stds.tolist(), strict=False) if std < np.inf}
-    arm = np.s_[: len(every)]
-    mean, root = _solved(matrix[arm, arm], vector[arm], stds[arm] ** -2)
-    solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
-    doubted = tuple((w, there[arm], its[arm] @ its[arm].T) for w, there, its in solved)
-    shift, sizes = mean - offsets[arm], evidence.named(size)
-    return Posterior(chain, every, offsets[arm], shift, root @ root.T, priors, sizes, doubted)
-
-
-def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
-    """Return all lengths [m] that positions are made of, and how well their scale is known.
-
-    There are none by sockets and planes, which are where they are. The travel of a prismatic joint
-    grows by its ratio, which the chain returned has.
-    """
-    sets = [samples.observations for samples in system.sets]
-    if any(each.socket or each.plane for each in sets):
-        return chain, {}, SCALE
-    travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
-    chain = chain.with_effects(travels)
-    names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
-    names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
-    scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
-    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
-
-
-def _told(
-    chain: Chain,
-    names: Sequence[str],
-    beside: Sequence[Mapping[str, float]],
-    system: System,
-    known: Normal | None,
-) -> FloatArray:
-    """Return the products (K + 1, K + 1) of columns and residual, without priors.
-
-    Columns are those of the names, and sums of columns `beside` them. Of many samples every so
-    many are taken; `known` holds the products of all of them for the names alone.
-    """
-    columns = list(dict.fromkeys([*names, *(name for parts in beside for name in parts)]))
-    most = 10 * SOME_POSES
-    share = -(-system.count // most)
-    if known is None or share > 1 or beside:
-        few = replace(system.spread(most), prior=None)
-        known = normal_equations(chain, columns, few)
-    extra = np.column_stack(system.separation_rows(chain, columns))
-    mixing = np.eye(len(columns) + 1, len(names))
-    for parts in beside:
-        sums = [parts.get(name, 0.0) for name in columns]
-        mixing = np.column_stack([mixing, [*sums, 0.0]])
-    mixing = np.column_stack([mixing, np.eye(len(columns) + 1)[-1]])
-    products = known.products.sum(axis=0) + extra.T @ extra
-    return np.asarray(share * (mixing.T @ products @ mixing))
+    priors = {name: std for name, std in zip(every, stds.tolist(), strict=True) if std < np.inf}
+    mean, root = _solved(matrix, vector, stds**-2)
+    solved = [(w, *_solved(other, along, evidence.stds(those) ** -2)) for w, those in near]
+    doubted = tuple((w, there, its @ its.T) for w, there, its in solved)
+    shift, sizes = mean - offsets, evidence.named(size)
+    return Posterior(chain, every, offsets, shift, root @ root.T, priors, sizes, doubted)
 
 
 def _solved(

@@ -21,8 +21,9 @@ from calib_ros.errors import InputError
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.acceptance import Findings, refusals, remarks
 from calib_ros.identification.configurations import distinct
+from calib_ros.identification.considered import considered
 from calib_ros.identification.drift import chance_of_gain
-from calib_ros.identification.evidence import Posterior, considered
+from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.fitting import (
     SOME,
     Fitted,

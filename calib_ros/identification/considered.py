@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What may add to the errors that are fitted: effects left out, and what a device does to space.
+
+Neither is fitted. Effects that an arm may have are columns of the posterior with own sizes
+(`evidence.py`). What a device does has a known size s, so its columns N are taken out of the
+products of the others A: A^T A becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, which is as well
+as if V = 1 + s^2 N N^T were the covariance of the measurements (Schmidt 1966).
+
+A device may have a scale, which makes all lengths grow alike: positions are linear in all lengths
+L, so its column is the sum of L dp/dL. And it may bend space (`device.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.identification.device import bends
+from calib_ros.identification.leastsquares import Normal, System, normal_equations, stacked
+from calib_ros.identification.levels import PRINTED, SCALE
+from calib_ros.identification.observations import SOME_POSES
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+
+CONSIDERED = ('eccentricity', 'gravity')
+"""Effects that any arm may have, fitted or not; couplings hardly show in moves of one joint."""
+
+
+def considered(chain: Chain, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the effects that an arm may have besides those among the names."""
+    every = [name for group in CONSIDERED for name in effects.members(chain, group)]
+    every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
+    return tuple(name for name in every if name not in names)
+
+
+def told_of(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    noise: float,
+    doubts: Mapping[str, float],
+    by_device: bool,
+    known: Normal | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the products (P + 1, P + 1) of columns and residual, plain and with all in doubt.
+
+    In units of the `noise` [sigma given], without priors. `doubts` are standard deviations of what
+    else moves a parameter, and `by_device` tells whether devices may be wrong, too. Of many
+    samples every so many are taken; `known` holds the products of all of them for the names alone.
+    """
+    beside: list[tuple[Mapping[str, float], float]] = [({n: 1.0}, s) for n, s in doubts.items()]
+    if by_device:
+        chain, lengths, scale = _lengths(chain, system)
+        beside += [(lengths, scale)] if lengths else []
+    columns = list(dict.fromkeys([*names, *(name for parts, _ in beside for name in parts)]))
+    most = 10 * SOME_POSES
+    share = -(-system.count // most)
+    if known is not None and share == 1 and not beside and not by_device:
+        products = known.products.sum(axis=0)
+    else:
+        few = replace(system.spread(most), prior=None)
+        products = share * _products(chain, columns, few, bends(few.sets) if by_device else ())
+    extra = np.column_stack(system.separation_rows(chain, columns))
+    own = [*range(len(columns)), -1]
+    products[np.ix_(own, own)] += share * (extra.T @ extra)
+    others = np.zeros((len(products), len(beside)))
+    for k, (parts, std) in enumerate(beside):
+        others[: len(columns), k] = [std * parts.get(name, 0.0) for name in columns]
+    every = np.eye(len(products))
+    kept = np.append(np.arange(len(names)), len(products) - 1)
+    fields = every[:, len(columns) : -1]
+    mixing = np.column_stack([every[:, kept], others, fields])
+    mixed = mixing.T @ (products / noise**2) @ mixing
+    first, rest = np.s_[: len(kept)], np.s_[len(kept) :]
+    plain, cross, doubtful = mixed[first, first], mixed[first, rest], mixed[rest, rest]
+    if not len(doubtful):
+        return plain, plain
+    doubtful = doubtful + np.eye(len(doubtful))
+    return plain, plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
+
+
+def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
+    """Return all lengths [m] that positions are made of, and how well their scale is known.
+
+    There are none by sockets and planes, which are where they are. The travel of a prismatic joint
+    grows by its ratio, which the chain returned has.
+    """
+    sets = [samples.observations for samples in system.sets]
+    if any(each.socket or each.plane for each in sets):
+        return chain, {}, SCALE
+    travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
+    chain = chain.with_effects(travels)
+    names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
+    names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
+    scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
+    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
+
+
+def _products(
+    chain: Chain, columns: Sequence[str], system: System, fields: Sequence[FloatArray]
+) -> FloatArray:
+    """Return the products of columns, fields (K, c, N) of each set, and the residual."""
+    if not any(map(len, fields)):
+        return normal_equations(chain, columns, system).products.sum(axis=0)
+    wide = []
+    for rows, field in zip(system.rows_of(chain, columns), fields, strict=True):
+        bent = np.zeros((len(field), *rows.shape[1:]))
+        bent[:, : field.shape[1]] = field
+        wide.append(np.concatenate([rows[:-1], bent, rows[-1:]]))
+    matrix = stacked(wide)
+    return np.asarray(matrix.T @ matrix)
