@@ -107,7 +107,7 @@ def _products(
 ) -> FloatArray:
     """Return the products of columns, fields (K, c, N) of each set, and the residual."""
     if not any(map(len, fields)):
-        return normal_equations(chain, columns, system).products.sum(axis=0)
+        return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
     wide = []
     for rows, field in zip(system.rows_of(chain, columns), fields, strict=True):
         bent = np.zeros((len(field), *rows.shape[1:]))

@@ -57,7 +57,7 @@ def _place(seen: Observations) -> FloatArray:
     """Return where the device saw the targets (N, 3) [m], in its own axes."""
     if not seen.inverse:
         return seen.positions
-    return -np.einsum('nji,nj->ni', seen.rotations, seen.positions)
+    return np.asarray(-np.einsum('nji,nj->ni', seen.rotations, seen.positions))
 
 
 def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
@@ -81,7 +81,7 @@ def _rows(samples: Samples, waves: FloatArray) -> FloatArray:
     bent = np.einsum('mn,nia->main', waves, np.broadcast_to(axes, (samples.count, 3, 3)))
     bent = bent.reshape(-1, 3, samples.count)
     if samples.whitening is None:
-        return bent
+        return np.asarray(bent)
     covariance = seen.covariances(samples.sigmas)[:, :3, :3]
     sigma = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3.0))
-    return np.einsum('rsn,psn->prn', samples.whitening[:, :3], sigma * bent, optimize=True)
+    return np.asarray(np.einsum('rsn,psn->prn', samples.whitening[:, :3], sigma * bent))

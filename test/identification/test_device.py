@@ -35,9 +35,9 @@ def samples(observations, weights=None):
     return Samples(observations, SIGMA, 1e-3).weighted(weights)
 
 
-@pytest.mark.parametrize('name, seed', [('ur10', 5), ('puma560', 6), ('kuka_iiwa14', 4)])
+@pytest.mark.parametrize(('name', 'seed'), [('ur10', 5), ('puma560', 6), ('kuka_iiwa14', 4)])
 def test_the_errors_of_a_device_are_not_taken_for_those_of_an_arm(name, seed):
-    """Each joint alone moves far; the device is off by 1 mm, as its sigma says, the arm by none."""
+    """Each joint alone moves far; the device is off by 1 mm, its sigma, the arm by none."""
     arm, rng = load_chain(name), np.random.default_rng(seed)
     joints = len(arm.joints)
     each = 60 // joints
