@@ -42,3 +42,12 @@ def write_csv(path, rows):
         writer.writeheader()
         writer.writerows(rows)
     return path
+
+
+def bent(places, size, rng):
+    """Return places (N, 3) [m] as a device sees them that is off by so much (RMS)."""
+    x = (places - places.mean(axis=0)) / np.sqrt(places.var(axis=0).sum())
+    powers = [x[:, i] * x[:, k] for i in range(3) for k in range(i, 3)]
+    powers += [x[:, i] ** 2 * x[:, k] for i in range(3) for k in range(3)]
+    error = np.array(powers).T @ rng.normal(size=(len(powers), 3))
+    return places + size * error / np.sqrt((error**2).sum(axis=1).mean())

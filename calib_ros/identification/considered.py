@@ -4,8 +4,8 @@
 
 Neither is fitted. Effects that an arm may have are columns of the posterior with own sizes
 (`evidence.py`). What a device does has a known size s, so its columns N are taken out of the
-products of the others A: A^T A becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, which is as well
-as if V = 1 + s^2 N N^T were the covariance of the measurements (Schmidt 1966).
+products of the others A: A^T A becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 +
+s^2 N N^T were the covariance of the measurements (Schmidt 1966).
 
 A device may have a scale, which makes all lengths grow alike: positions are linear in all lengths
 L, so its column is the sum of L dp/dL. And it may bend space (`device.py`).
@@ -17,7 +17,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import linalg
 
 from calib_ros.identification.device import bends
 from calib_ros.identification.leastsquares import Normal, System, normal_equations, stacked
@@ -47,10 +46,11 @@ def told_of(
     doubts: Mapping[str, float],
     by_device: bool,
     known: Normal | None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return the products (P + 1, P + 1) of columns and residual, plain and with all in doubt.
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the products (P + 1, P + 1) of columns and residual, and those with what is in doubt.
 
-    In units of the `noise` [sigma given], without priors. `doubts` are standard deviations of what
+    The latter are A^T N (P + 1, K) and N^T N + 1 (K, K), N times its standard deviations. All are
+    in units of the `noise` [sigma given], without priors. `doubts` are standard deviations of what
     else moves a parameter, and `by_device` tells whether devices may be wrong, too. Of many
     samples every so many are taken; `known` holds the products of all of them for the names alone.
     """
@@ -79,10 +79,7 @@ def told_of(
     mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: len(kept)], np.s_[len(kept) :]
     plain, cross, doubtful = mixed[first, first], mixed[first, rest], mixed[rest, rest]
-    if not len(doubtful):
-        return plain, plain
-    doubtful = doubtful + np.eye(len(doubtful))
-    return plain, plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
+    return plain, cross, doubtful + np.eye(len(doubtful))
 
 
 def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:

@@ -9,9 +9,10 @@ tested with C = C_1 + C_2, d^T C^-1 d; the few that may have changed are looked 
 The difference of predicted positions, in the best frames, is a quadratic form of d; the limit is
 the quantile of its values for d ~ N(d, C).
 
-What neither model has shows in both calibrations, and differently where other poses were measured.
-The covariances of noise know nothing of it; the expected squares of errors do (`region.py`). A
-difference that is significant by the former only, is told as what it is.
+What neither model has shows in both calibrations, and differently where other poses were measured;
+so do smooth errors of a device that stands elsewhere (`device.py`). The covariances of noise know
+nothing of it; the expected squares of errors do (`region.py`). A difference that is significant by
+the former only, is told as what it is.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ class Difference(Shown):
 
     P parameters of the arm, `names`, differ by `change` (P,) with standard deviations `sigma` (P,)
     [m, rad]. `chance` is the probability of so large a difference by the noise of both, `beyond`
-    with what the models lack as well. Predicted positions differ by `rms` [m] over the joint
-    range in the best frames, by `limit` [m] at most (95 %); no parameters of the first model can
-    follow `left` [m] of it. `changed` is what has changed, each with what cannot be told apart
+    with what devices do and models lack as well. Predicted positions differ by `rms` [m] over the
+    joint range in the best frames, by `limit` [m] at most (95 %); no parameters of the first model
+    can follow `left` [m] of it. `changed` is what has changed, each with what cannot be told apart
     from it, `unexplained` the probability of what these leave.
     """
 
@@ -85,8 +86,9 @@ class Difference(Shown):
             return f'unchanged within {1e3 * self.limit:.3f} mm'
         if self.beyond > FALSE:
             return (
-                f'different by {size}, which noise does not explain, but what the models lack '
-                'does: were other poses measured? Measure the same ones to tell'
+                f'different by {size}, which noise does not explain, but smooth errors of the '
+                'device or what the models lack may: measure the same poses from the same place '
+                'to tell'
             )
         if self.changed and self.unexplained > FALSE:
             reasons = '; '.join(reason_in_words(each) for each in self.changed)
@@ -152,7 +154,8 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         if region is None:
             lacking += own
         else:
-            lacking += _in_names(region.chain, names, region.names, region.square)
+            either = region.square + region.device @ region.device.T
+            lacking += _in_names(region.chain, names, region.names, either)
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
     told = _told(names, change, lacking)

@@ -34,7 +34,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy import special
+from scipy import linalg, special
 from scipy.linalg import lapack
 
 from calib_ros.identification.considered import told_of
@@ -92,7 +92,9 @@ class Posterior(Shown):
     shift : (P,)
         The posterior mean less the fitted parameters.
     covariance : (P, P)
-        Of the posterior.
+        Of the posterior, for the device that measured.
+    device : (P, K)
+        Its product with itself is what the smooth errors of that device add to the covariance.
     priors : mapping of str to float
         Standard deviation [m or rad] of every parameter that has a prior.
     sizes : mapping of str to float
@@ -108,6 +110,7 @@ class Posterior(Shown):
     offsets: FloatArray
     shift: FloatArray
     covariance: FloatArray
+    device: FloatArray
     priors: Mapping[str, float]
     sizes: Mapping[str, float]
     doubted: tuple[tuple[float, FloatArray, FloatArray], ...]
@@ -138,6 +141,7 @@ class Posterior(Shown):
             offsets=np.append(self.offsets, 0.0),
             shift=np.append(self.shift, 0.0),
             covariance=np.pad(self.covariance, (0, 1)) + more,
+            device=np.pad(self.device, ((0, 1), (0, 0))),
             doubted=tuple(
                 (w, np.append(m, 0.0), np.pad(c, (0, 1)) + more) for w, m, c in self.doubted
             ),
@@ -172,25 +176,28 @@ def posterior_of(
     chain = chain.with_effects(more)
     every = (*names, *more)
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
-    plain, bent = told_of(chain, every, system, noise, beside, bool(more), at_the_fit)
+    plain, cross, doubtful = told_of(chain, every, system, noise, beside, bool(more), at_the_fit)
     offsets = np.zeros(len(every))
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
-    (matrix, vector), (other, along) = (
-        (each[:-1, :-1], each[:-1, :-1] @ offsets + each[:-1, -1]) for each in (plain, bent)
-    )
+    told = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
+    matrix, vector = told[:-1, :-1], told[:-1, :-1] @ offsets + told[:-1, -1]
     groups = [None if n in known else group_of(chain, n) for n in every]
     given = np.array([known.get(n, np.inf) for n in every]) ** -2
-    evidence = _Evidence(other, along, given, groups)
+    evidence = _Evidence(matrix, vector, given, groups)
     size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     near = evidence.near(size, slope) if judging else ()
     stds = evidence.stds(size)
     priors = {name: std for name, std in zip(every, stds.tolist(), strict=True) if std < np.inf}
-    mean, root = _solved(matrix, vector, stds**-2)
-    solved = [(w, *_solved(other, along, evidence.stds(those) ** -2)) for w, those in near]
+    mean, root = _solved(plain[:-1, :-1], plain[:-1, :-1] @ offsets + plain[:-1, -1], stds**-2)
+    covariance = root @ root.T
+    along = covariance @ cross[:-1]
+    left, axes = np.linalg.eigh(doubtful - cross[:-1].T @ along)
+    device = along @ axes / np.sqrt(np.maximum(left, 1.0))  # it is 1 and more but for rounding
+    solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
     doubted = tuple((w, there, its @ its.T) for w, there, its in solved)
     shift, sizes = mean - offsets, evidence.named(size)
-    return Posterior(chain, every, offsets, shift, root @ root.T, priors, sizes, doubted)
+    return Posterior(chain, every, offsets, shift, covariance, device, priors, sizes, doubted)
 
 
 def _solved(

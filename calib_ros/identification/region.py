@@ -50,7 +50,8 @@ class Region(Shown):
     """The joint values at which a calibration may be used.
 
     `chain` is the calibrated arm with the effects considered, `square` (P, P) the expected squares
-    of the errors of its parameters `names`. Predicted positions may be off by `limit` [m], which
+    of the errors of its parameters `names` for the device that measured it. Another one adds the
+    product of `device` (P, K) with itself. Predicted positions may be off by `limit` [m], which
     is infinite where the whole range of the joints is used; `share` is the share of it in use.
     `base` and `tool` are the frames between which it was measured.
     """
@@ -58,6 +59,7 @@ class Region(Shown):
     chain: Chain
     names: tuple[str, ...]
     square: FloatArray
+    device: FloatArray
     limit: float
     share: float
     base: str = 'base'
@@ -93,7 +95,7 @@ class Region(Shown):
         )
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain values: the squares by the rows of their Cholesky factor."""
+        """Return it as plain values, in text: a Cholesky factor, and rows of the device's."""
         return {
             'limit': None if self.whole else self.limit,
             'share': self.share,
@@ -101,6 +103,7 @@ class Region(Shown):
             'tool': self.tool,
             'names': list(self.names),
             'root': packed(self.square),
+            'device': [' '.join(f'{x:.9e}' for x in row) for row in self.device],
         }
 
 
@@ -126,6 +129,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             chain,
             names,
             unpacked(document['root'], len(names)),
+            _rows(document.get('device', [''] * len(names)), len(names)),
             np.inf if limit is None else float(limit),
             float(document['share']),
             str(document['base']),
@@ -144,6 +148,21 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
                 f'frame in {where}: calibration.region', frame, chain.frame_names
             )
     return region
+
+
+def _rows(rows: Sequence[str], count: int) -> FloatArray:
+    """Return the matrix (P, K) of rows of numbers.
+
+    Raises
+    ------
+    ValueError
+        When they are not so many, of different lengths, or not finite.
+
+    """
+    matrix = np.array([[float(part) for part in row.split()] for row in rows]).reshape(count, -1)
+    if len(rows) != count or not np.isfinite(matrix).all():
+        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
+    return matrix
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
@@ -175,6 +194,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         posterior.chain,
         posterior.names,
         posterior.square,
+        posterior.device,
         np.inf if share == 1.0 else limit,
         share,
         ends.base,

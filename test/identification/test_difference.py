@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured import bent
 from robots import DATA, needs_data
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -15,6 +16,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import gauged
 from calib_ros.identification.difference import difference
 from calib_ros.identification.identification import identify
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
@@ -54,6 +56,21 @@ def test_an_arm_that_has_not_changed_is_the_same_wherever_the_device_stands(nigh
         assert found.limit < 1e-4
         assert found.left < 1e-7
         assert found.in_words().startswith('unchanged within 0.0')
+
+
+@pytest.mark.parametrize(('name', 'seed'), [('ur10', 0), ('staubli_tx90l', 2)])
+def test_a_device_that_bends_space_elsewhere_is_no_change_of_the_arm(name, seed):
+    """Off by 0.1 mm, its sigma, and otherwise the second time."""
+    rng = np.random.default_rng(seed)
+    arm, found = load_chain(name), []
+    true = faulty(arm, Cell(), rng)
+    for _ in range(2):
+        q = arm.random_joints(150, rng)
+        places = bent(true.forward(q)[:, :3, 3], 1e-4, rng)
+        places = places + rng.normal(scale=2e-5, size=places.shape)
+        problem = Problem(arm, Observations.from_arrays(q, places), sigma_position=1e-4)
+        found.append(Calibration.of(identify(problem)))
+    assert 'measure the same poses from the same place' in difference(*found).in_words()
 
 
 def test_a_joint_that_was_bumped_is_named(nights):
