@@ -161,11 +161,11 @@ class Archive:
             write_files(partial, files)
         return folder
 
-    def note(self, text: str) -> Path | None:
+    def note(self, text: str, ending: str = '.txt') -> Path | None:
         """Write what came of the last identification beside the journal; return its path."""
-        path = self._path.with_suffix('.identified.txt')
+        path = self._path.with_suffix(f'.identified{ending}').absolute()
         try:
-            write_file(path, f'{text}\n', overwrite=True)
+            write_file(path, text, overwrite=True)
         except OSError:
             return None
         return path
