@@ -143,7 +143,8 @@ class Cell:
         """Return an answer of ~/identify in full: what stands beside the journal if it was cut."""
         _, cut, name = answer.message.partition(' ... all of it: ')
         folder = self.node._archive.folder
-        return (folder / name).read_text().rstrip() if cut else answer.message
+        text = (folder / name).with_suffix('.txt')
+        return text.read_text().rstrip() if cut else answer.message
 
     def set_parameters(self, values, node='/calibration_node'):
         """Set parameters of a node; return the results that the client receives."""

@@ -20,7 +20,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import standing, verification_report
+from calib_ros.report.verified import STANDINGS, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
@@ -62,7 +62,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     for warning in warnings:
         screen.warn(warning)
     show(found, screen)
-    status = common.NOT_ACCEPTED if standing(found)[0].state in ('bad', 'open') else 0
+    status = common.NOT_ACCEPTED if STANDINGS[found.verdict][0].state in ('bad', 'open') else 0
     if options.out is None:
         return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))
@@ -86,7 +86,7 @@ def show(found: Verification, screen: Screen) -> None:
     tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    state, steps = standing(found)
+    state, steps = STANDINGS[found.verdict]
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     screen.table(
         (

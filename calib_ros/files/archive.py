@@ -13,6 +13,7 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
+from urllib.parse import quote
 
 from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
@@ -26,8 +27,8 @@ CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
 class Archive:
     """Files ROBOT_TIME of one robot in a folder, which is made if there is none.
 
-    The robot's name tells it from others of its kind. `configuration` returns what to
-    write beside a journal.
+    The robot is CHAIN or CHAIN/NAME, which tells it from others of its kind. `configuration`
+    returns what to write beside a journal.
     """
 
     def __init__(
@@ -36,7 +37,7 @@ class Archive:
         self.folder = folder
         self.error = ''
         """Why poses are in memory only; empty while all are in the journal."""
-        self._robot = short_name(re.sub(r'/+|[^\w.-]', '_', robot))
+        self._robot = _file_name(robot)
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None
@@ -160,11 +161,11 @@ class Archive:
             write_files(partial, files)
         return folder
 
-    def note(self, text: str) -> Path | None:
+    def note(self, text: str, ending: str = '.txt') -> Path | None:
         """Write what came of the last identification beside the journal; return its path."""
-        path = self._path.with_suffix('.identified.txt')
+        path = self._path.with_suffix(f'.identified{ending}').absolute()
         try:
-            write_file(path, f'{text}\n', overwrite=True)
+            write_file(path, text, overwrite=True)
         except OSError:
             return None
         return path
@@ -196,3 +197,14 @@ class Archive:
         found = self.folder.glob(f'*{ending}')
         mine = [path for path in found if name.fullmatch(path.name)]
         return sorted(path for path in mine if path.stat().st_size)
+
+
+def _file_name(robot: str) -> str:
+    """Return how the files of a robot begin: no two names of a chain's robots alike.
+
+    What no file name may hold is quoted as in URLs.
+    """
+    parts = (
+        re.sub(r'[^\w.-]', lambda c: quote(c[0], safe=''), each) for each in robot.split('/', 1)
+    )
+    return short_name('_'.join(parts))

@@ -138,11 +138,15 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
     return found
 
 
-def columns_of(path: Path, data: bytes, told: Told = nobody) -> Columns:
-    """Return the columns of the content of a CSV; refuse what is no table, or is too large."""
+def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> Columns:
+    """Return the columns of the content of a CSV; refuse what is no table, or is too large.
+
+    `above` are lines of the file before it.
+    """
     if not data.isascii():
         data = decoded(data, str(path), InputError).encode()
-    return regular(path, data) or _irregular(path, data.decode(), told)
+    found = regular(path, data, above=above)
+    return found or _irregular(path, data.decode(), told, above)
 
 
 def regular(
@@ -188,13 +192,14 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
     return ends if (flat[ends[width::width]] == ord('\n')).all() else None
 
 
-def _irregular(path: Path, text: str, told: Told) -> MadeColumns:
+def _irregular(path: Path, text: str, told: Told, above: int) -> MadeColumns:
     """Return the columns of a text with quotes, or with rows that end early."""
     header: list[str] = []
     rows: list[Row] = []
     most = text.count('\n') + 1
     for line, row in csv_rows(path, text, strict=True):
         told(min(line / most, 1.0))
+        line += above
         if not (row and header):
             header = header or [name.strip() for name in row]
             continue

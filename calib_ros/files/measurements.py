@@ -175,6 +175,28 @@ class Measurements:
                 )
 
 
+def joined(parts: Sequence[Measurements]) -> Measurements:
+    """Return the rows of parts of one file, one part after the other."""
+    found: dict[str, object] = {}
+    sizes = [len(each.lines) for each in parts]
+    for item in fields(Measurements):
+        values = [getattr(each, item.name) for each in parts]
+        some = next((value for value in values if value is not None), None)
+        if isinstance(some, np.ndarray):
+            found[item.name] = np.concatenate(
+                [
+                    np.full((size, *some.shape[1:]), np.nan) if value is None else value
+                    for value, size in zip(values, sizes, strict=True)
+                ]
+            )
+        elif isinstance(some, tuple):
+            place, names = numbered([name for _, different in values for name in different])
+            begins = np.cumsum([0, *(len(different) for _, different in values)])
+            codes = [place[begin + value[0]] for begin, value in zip(begins, values, strict=False)]
+            found[item.name] = np.concatenate(codes), names
+    return replace(parts[0], **found)  # type: ignore[arg-type]
+
+
 def measurements(columns: Columns, joints: int) -> Measurements:
     """Return what the rows of a table say; whatever makes no sense is refused."""
     header = columns.header

@@ -100,8 +100,8 @@ class Row(Shown):
 
     @property
     def accepted(self) -> bool:
-        """Tell whether nothing speaks against what was found."""
-        return self.verdict in ('accepted', 'holds', 'PASS', 'JUDGED')
+        """Tell whether it is an identification that was accepted."""
+        return self.verdict == 'accepted'
 
     def corrected(self) -> Chain:
         """Return the corrected chain with its frames."""

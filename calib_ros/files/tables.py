@@ -32,6 +32,7 @@ from calib_ros.files.measurements import (
     SOCKET,
     Measurements,
     distinct,
+    joined,
     measurements,
 )
 from calib_ros.files.views import view_cell, view_of
@@ -42,7 +43,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.problems import Measured
 from calib_ros.sampling.sample import Frames, Sample, collect, lenses, sets_of, socket_pairs
-from calib_ros.texts import LARGEST_TABLE, csv_text, read_bytes
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes
 
 Sets = tuple[Observations, ...]
 
@@ -161,9 +162,32 @@ def _sets(
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-    """Return the samples of a journal, of which there may be none, and warnings."""
-    data, warnings = _read(path, columns(joints))
-    return tuple(_samples(measurements(columns_of(path, data), joints).kept())), warnings
+    """Return the samples of a journal, of which there may be none, and warnings.
+
+    What a node wrote may be of any length, for its samples were in memory before: it is read by
+    parts, and what is no journal is refused at its first part.
+    """
+    header = ','.join(columns(joints)).encode() + b'\n'
+    parts: list[Measurements] = []
+    lines, rest = 1, b''
+    try:
+        with path.open('rb') as file:
+            if file.read(len(header)) != header:  # cut off, or a table
+                data, warnings = _read(path, columns(joints))
+                made = measurements(columns_of(path, data), joints)
+                return tuple(_samples(made.kept())), warnings
+            while data := file.read(LARGEST_TEXT):
+                whole, end, rest = (rest + data).rpartition(b'\n')
+                if end:
+                    found = columns_of(path, header + whole + end, above=lines - 1)
+                    parts.append(measurements(found, joints))
+                    lines += whole.count(b'\n') + 1
+                if len(rest) > LARGEST_TEXT:
+                    raise InputError(f'{path}, line {lines + 1} has no end: is it a journal?')
+    except OSError as err:
+        raise InputError(f'cannot read {path}: {err.strerror or err}') from err
+    samples = tuple(_samples(joined(parts).kept())) if parts else ()
+    return samples, (_cut_off(path, lines + 1),) if rest else ()
 
 
 def _samples(made: Measurements) -> Iterator[Sample]:
@@ -251,8 +275,12 @@ def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
         whole = data[: data.rfind(b'\n') + 1]
     if len(whole) < len(data):
         line = whole.count(b'\n') + 1
-        return whole, (f'{path}: line {line} was cut off and is left out',)
+        return whole, (_cut_off(path, line),)
     return data, ()
+
+
+def _cut_off(path: Path, line: int) -> str:
+    return f'{path}: line {line} was cut off and is left out'
 
 
 def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Columns:

@@ -56,11 +56,6 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
 """Verdicts, and what to do next."""
 
 
-def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
-    """Return the verdict, and what to do; without a tolerance a calibration may be lost too."""
-    return STANDINGS['LOST' if found.tolerance is None and found.holds is False else found.verdict]
-
-
 def verification_report(
     chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
 ) -> Report:
@@ -72,7 +67,7 @@ def verification_report(
     ]
     if found.tolerance is not None:
         text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
-    state, steps = standing(found)
+    state, steps = STANDINGS[found.verdict]
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,

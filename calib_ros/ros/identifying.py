@@ -29,9 +29,6 @@ from calib_ros.ros.outputs import Published
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession
 
-ANSWER_LENGTH = LONGEST // 2
-"""Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
-
 
 class Snapshot(NamedTuple):
     """What an identification works on, and what it was called with."""
@@ -78,10 +75,11 @@ class Identifying:
         """What came of the last identification or ~/load, in words."""
         self.observability = ''
         self._advice = ''  # of the last identification, that on what is graver first
+        self._report: Path | None = None  # of the last identification, if it was refused
 
     def snapshot(self, topics: Sequence[str], serial: str) -> Snapshot:
         """Return the problem and all that goes with it, as they are now."""
-        session, self._advice = self._session, ''
+        session, self._advice, self._report = self._session, '', None
         problem = session.problem()
         samples = tuple(session.usable)
         origin = {
@@ -116,29 +114,44 @@ class Identifying:
                 self._node.get_clock().now().to_msg(),
             )
         )
+        page = partial(_page, given, result)
         if result.accepted:
             owners, sets = named(given.samples).owners, given.problem.sets
             found = Calibration.of(result, given.origin, owners, sets)
-            page = partial(_page, given, result)
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples
             )
-        elif self._session.calibration is not None:
-            self.last += '; the last good calibration stays'
+        else:
+            if self._session.calibration is not None:
+                self.last += '; the last good calibration stays'
+            self._keep_report(page)
         self.last += self._filer.identified(given.problem, result, self._session.settings)
         return result.accepted, self.last
 
+    def _keep_report(self, page: Callable[[], str | None]) -> None:
+        """Write the report of a refusal beside the journal: nobody will save it."""
+        try:
+            text = page()
+            self._report = (text and self._archive.note(text, '.html')) or None
+        except Exception as err:  # whatever is wrong with the page, the answer is sent
+            self._node.get_logger().warning(f'the report of the refusal is not written: {err}')
+        if self._report:
+            self.last += f'; report: {self._report}'
+
     def shortened(self, answer: Answer) -> Answer:
-        """Return an answer cut to a few lines: the verdict, and what to do first.
+        """Return an answer cut to the length of a message: the verdict, and what to do first.
 
         All of it is in the log, and beside the journal.
         """
         success, text = answer
-        if len(text) > ANSWER_LENGTH:
-            path = self._archive.note(text)
-            more = f' ... all of it: {path.name if path else "in the log"}'
+        if len(text) > LONGEST:
+            path = self._archive.note(f'{text}\n')
+            where = self._report or path or 'in the log'
+            if isinstance(where, Path) and len(str(where)) > LONGEST // 3:
+                where = where.name
+            more = f' ... all of it: {where}'
             before, advice, _ = text.partition(self._advice or text)
-            text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
+            text = _without_middle(before + advice, LONGEST - len(more)) + more
         return success, text
 
 

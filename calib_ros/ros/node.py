@@ -81,7 +81,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._boundary = Boundary(self.get_logger())
         self._archive = Archive(
             Path(given.data_dir or home / 'calib_ros').expanduser(),
-            f'{chain.name}/{given.serial or self.get_namespace()}'.rstrip('/'),
+            f'{chain.name}/{given.serial or self.get_namespace()[1:]}'.rstrip('/'),
             len(chain.joints),
             self._configuration,
         )

@@ -57,6 +57,17 @@ def test_robots_with_long_names_have_files_of_their_own(tmp_path):
     assert [stamps(tmp_path, robot) for robot in robots] == [[0], [1]]
 
 
+def test_robots_with_similar_names_have_files_of_their_own(tmp_path):
+    robots = [f'arm/{name}' for name in ('12_3', '12/3', '12//3', '12 3', '12%2F3', '12%203', 'ö')]
+    for k, robot in enumerate(robots):
+        archive = open_archive(tmp_path, robot)
+        archive.add(sample(k))
+        archive.close()
+    assert [stamps(tmp_path, robot) for robot in robots] == [[k] for k in range(len(robots))]
+    names = sorted(path.name.rpartition('_')[0] for path in tmp_path.glob('*Z.csv'))
+    assert {'arm_12_3', 'arm_12%2F3', 'arm_ö'} < set(names)
+
+
 def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
     first = open_archive(tmp_path)
     first.add(sample(1))

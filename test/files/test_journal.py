@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
+from calib_ros.files import tables
 from calib_ros.files.journal import Journal
 from calib_ros.files.tables import read_journal, read_table, table_text
 from calib_ros.kinematics import se3
@@ -144,6 +145,35 @@ def test_what_was_taken_back_is_left_out_and_can_be_taken_again(tmp_path):
     table = read_table(tmp_path / 'cell.csv', JOINTS)
     assert table.fitted[0].stamps_ns.tolist() == [1, 2]
     assert len((tmp_path / 'cell.csv').read_text().splitlines()) == 7
+
+
+@pytest.mark.parametrize('device', ['ball', 'a,b'])
+def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
+    """By parts, which are not seen: what is taken back, repeated, damaged or cut off is found."""
+    path = tmp_path / 'cell.csv'
+    many = [plain(k, device=device) for k in range(1, 30)]
+    many[7:9] = [plain(8, device='other'), replace(plain(9), covariance=covariance(9))]
+    written(path, many)
+    with path.open('ab') as file:
+        file.write(b'1,2')
+    monkeypatch.setattr(tables, 'LARGEST_TABLE', 1000)
+    monkeypatch.setattr(tables, 'LARGEST_TEXT', 700)
+    found, (warning,) = read_journal(path, JOINTS)
+    assert_equal(found, many)
+    assert 'line 31 was cut off' in warning
+    journal = Journal(path, JOINTS)
+    for number in (3, 29):
+        journal.add(many[number - 1], removed=True)
+    journal.close()
+    assert_equal(read_journal(path, JOINTS)[0], [*many[:2], *many[3:28]])
+    written(path, [many[0]])
+    with pytest.raises(InputError, match='line 33: stamp_ns 1 is there already'):
+        read_journal(path, JOINTS)
+    for damage, said in ((b'x,' * 40, 'line 34'), (bytes(2000), 'line 34 has no end')):
+        copy = tmp_path / 'copy.csv'
+        copy.write_bytes(path.read_bytes() + damage + b'\n' * (damage[:1] == b'x'))
+        with pytest.raises(InputError, match=said):
+            read_journal(copy, JOINTS)
 
 
 @pytest.mark.parametrize('name', ['ball', 'a,b', 'say "ball"', 'Kugel \u00e4\u2460'])

@@ -1,7 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from datetime import datetime, timezone
+
+import numpy as np
 import pytest
 
+from calib_ros.apply.simulation import measure
+from calib_ros.apply.verification import in_words, verify
+from calib_ros.files.rows import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.validation import ErrorFigures
@@ -21,3 +27,15 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
     ):
         assert told[0] == holds
         assert ('does not hold any more: RMS 0.160 mm' in told[1]) != holds
+
+
+@pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'JUDGED'), (5e-3, 'LOST')])
+def test_a_calibration_that_is_lost_is_filed_as_lost(bumped, verdict):
+    """Without a tolerance, too: a history tells no less than the screen."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(0)
+    seen = measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4)
+    seen.positions[:] += bumped
+    found = verify(Calibration(arm, arm, residual=1e-4), [seen], None)
+    row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
+    assert (row.verdict, row.accepted) == (verdict, False)
+    assert ('was the tracker' in in_words(found)) == (verdict == 'LOST')
