@@ -198,9 +198,9 @@ def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
     return [
         Refusal(
             k,
-            f'outside the region of the calibration, like {share:.0f} % of the program: expected '
-            f'error {1e3 * errors[k]:.3f} mm, at most {1e3 * region.limit:.3f} mm is allowed; '
-            'identify again with poses near it',
+            f'the calibration is not valid in {share:.0f} % of the program, as here: an error of '
+            f'{1e3 * errors[k]:.3f} mm is expected, where it is valid at most '
+            f'{1e3 * region.limit:.3f} mm; identify again with poses near it',
         )
         for k in outside.tolist()
     ]

@@ -52,7 +52,7 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
 
-Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED']
+Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 NEEDED = 1 + len(PLANE)
 """Configurations from which a verdict is given, those of a fitted frame not counted: the test
 poses of ISO 9283."""
@@ -96,7 +96,8 @@ class Verification(Shown):
         RMS position error [m] over poses like these, and its limits.
     freedom : float
         Degrees of freedom of that error.
-    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; 'JUDGED' where no error is wanted
+    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds' or 'does not hold'
+        'no verdict' where neither is known.
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
         even DECIDING would not.
@@ -198,12 +199,13 @@ def verify(
     numbers = np.unique(np.geomspace(len(moments), most, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    verdict = _decided(tolerance, lower, upper, numbers)
+    holds = arm.holds(rms)
+    verdict = _decided(tolerance, holds, lower, upper, numbers)
     common = 1.0
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, arm.holds(rms), arm.reused(sets))
+    known = (commanded is not None, fitted, holds, arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 
@@ -237,11 +239,15 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
 
 
 def _decided(
-    tolerance: float | None, lower: FloatArray, upper: FloatArray, numbers: NDArray[np.intp]
+    tolerance: float | None,
+    holds: bool | None,
+    lower: FloatArray,
+    upper: FloatArray,
+    numbers: NDArray[np.intp],
 ) -> tuple[Verdict, int | None]:
     """Return the verdict by the first limits, and which of the numbers of poses would decide."""
     if tolerance is None:
-        return 'JUDGED', None
+        return 'no verdict' if holds is None else 'holds' if holds else 'does not hold', None
     decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
     needed = int(numbers[decided[0]]) if decided.size else None
     if lower[0] <= tolerance < upper[0]:

@@ -101,7 +101,7 @@ class Row(Shown):
     @property
     def accepted(self) -> bool:
         """Tell whether nothing speaks against what was found."""
-        return self.verdict in ('accepted', 'holds', 'PASS', 'JUDGED')
+        return self.verdict in ('accepted', 'holds', 'PASS', 'no verdict')
 
     def corrected(self) -> Chain:
         """Return the corrected chain with its frames."""

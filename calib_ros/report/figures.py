@@ -59,8 +59,8 @@ def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> F
     return {'type': 'scatter', 'mode': mode, 'name': name, **points, **more}
 
 
-def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:
-    """Return the share of poses with at most a given position error (N,)."""
+def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figure:
+    """Return the share of poses, or other `things`, with at most a given position error (N,)."""
     share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
     data = [
         _curve('lines', name, np.quantile(errors, share), 100.0 * share, line=line)
@@ -71,7 +71,7 @@ def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:
     ]
     layout = {
         'xaxis': axis('position error [mm]', rangemode='tozero'),
-        'yaxis': axis('poses with at most this error [%]', range=[0, 100]),
+        'yaxis': axis(f'{things} with at most this error [%]', range=[0, 100]),
     }
     return {'data': data, 'layout': layout}
 

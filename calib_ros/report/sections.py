@@ -29,7 +29,7 @@ ISO_9283 = (
 )
 LABELS = (
     '',
-    'poses',
+    'measured',
     'RMS [mm]',
     '95 % interval',
     'mean [mm]',
@@ -105,7 +105,7 @@ def identity_of(
         ('Measuring device', origin.device),
         ('Operator', origin.operator),
         ('Measured', _measured(poses)),
-        ('Poses', '' if poses is None else f'{len(poses):,}'),
+        *(((poses.things.capitalize(), f'{len(poses):,}'),) if poses else ()),
         judged,
         ('Report made', datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC')),
         (
@@ -137,9 +137,9 @@ def distribution(poses: Poses) -> Section:
     )
     return Section(
         'cumulated',
-        'How many poses are within an error',
+        f'How many {poses.things} are within an error',
         ('Outliers are left out. The further left a curve, the better.',),
-        figures.cumulated(before, after),
+        figures.cumulated(before, after, poses.things),
         height=400,
     )
 

@@ -27,6 +27,7 @@ MOVED = (
     'Check that the measuring device, the target and the robot stand as they did for the '
     'calibration; if not, use --new-base or --new-tool.'
 )
+TOLERANCE = 'Give --tolerance with the RMS error [mm] that your task allows: PASS or FAIL.'
 STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     'PASS': (
         Verdict('good', 'PASS: the arm is within the tolerance'),
@@ -44,21 +45,19 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
         Verdict('open', 'UNDECIDED: too few measurements to tell'),
         (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
     ),
-    'LOST': (
+    'does not hold': (
         Verdict('bad', 'The calibration does not hold any more'),
         (MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
     ),
-    'JUDGED': (
-        Verdict('info', 'No verdict: --tolerance MM gives PASS or FAIL'),
-        ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
-    ),
+    'holds': (Verdict('good', 'The calibration holds: the error is as it was'), (TOLERANCE,)),
+    'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
 """Verdicts, and what to do next."""
 
 
 def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
-    """Return the verdict, and what to do; without a tolerance a calibration may be lost too."""
-    return STANDINGS['LOST' if found.tolerance is None and found.holds is False else found.verdict]
+    """Return the verdict, and what to do."""
+    return STANDINGS[found.verdict]
 
 
 def verification_report(
