@@ -177,11 +177,11 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
     text += (
-        f'; by the calibration, largest error {1e3 * result.position_before[kept].max():.3f} mm, '
+        f'; largest error by the calibration {1e3 * result.position_before[kept].max():.3f} mm, '
     )
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
-    text += f' -> {1e3 * result.position[kept].max():.6f} mm, '
-    text += f'{1e3 * result.orientation[kept].max():.6f} mrad'
+    text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
+    text += f'{1e3 * result.orientation[kept].max():.3f} mrad'
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'
     return text

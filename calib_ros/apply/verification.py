@@ -368,10 +368,12 @@ def in_words(found: Verification) -> str:
 
 def each_in_words(found: Verification) -> list[str]:
     """Return the lines of a table of the poses [mm], of which there may be none."""
-    lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
+    again = any(pose.repeatability is not None for pose in found.each)
+    head = '  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)'
+    lines = [head]
     for k, pose in enumerate(found.each, 1):
-        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
-        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
+        spread = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {spread}'
         lines.append(line.rstrip())
     return lines if found.each else []
 
@@ -380,7 +382,8 @@ def remarks(found: Verification) -> list[str]:
     """Return what to know besides the figures, and what to do."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if found.fitted:
-        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
+        frames = ' and '.join(found.fitted)
+        lines.append(f'fitted anew to these measurements, before and after alike: {frames}')
     if not found.by_program:
         lines.append(
             'this judges the calibration: give the program before its correction (--commanded) '

@@ -65,7 +65,7 @@ def identification_report(
         verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
         accuracy=accuracy_section(
-            f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
+            'Accuracy before and after' + ('' if result.accepted else ' what was tried'),
             (
                 *(() if result.validation else (UNPROVEN,)),
                 f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
@@ -75,6 +75,7 @@ def identification_report(
                 ISO_9283,
             ),
             judged,
+            poses.things,
             judged.figures_of_all[1] if judged.outliers else None,
         ),
         picture=distribution(poses),

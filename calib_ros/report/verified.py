@@ -75,11 +75,13 @@ def verification_report(
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
-        verdict=replace(state, text=tuple(text), gain=gain(found.comparison)),
+        verdict=replace(state, text=tuple(text), gain=gain(found.comparison, intervals=False)),
         accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
             found.comparison,
+            poses.things,
+            intervals=False,
         ),
         picture=distribution(poses),
         steps=steps,

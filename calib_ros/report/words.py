@@ -337,11 +337,15 @@ def cameras_in_words(result: Identification) -> list[str]:
     fitted = result.fitted.figures[1]
     if fitted.rms_px is not None:
         lines.append(f'RMS {fitted.rms_px:.3f} px on the corners fitted')
+    on_flange, other = ('camera', 'board') if 'tool' in cameras else ('board', 'camera')
+    about = {'base': f' (arm seen from the {other})', 'tool': f' ({on_flange} on the flange)'}
+    if len(chain.frame_names) > 2:  # of other devices, too
+        about = {}
     for name in chain.frame_names if cameras else ():
         frame = chain.frame(name)
         place = ' '.join(f'{x:.6f}' for x in frame.matrix[:3, 3].tolist())
         turn = ' '.join(f'{x:.6f}' for x in to_quat(frame.matrix[:3, :3]).tolist())
-        lines.append(f'{name}: xyz {place} m, quaternion xyzw {turn}')
+        lines.append(f'{name}{about.get(name, "")}: xyz {place} m, quaternion xyzw {turn}')
         if frame.lens is not None and not frame.lens.fixed:
             values = ', '.join(f'{kind} {x:.6g}' for kind, x in frame.lens.values.items())
             lines.append(f'{name}: {values}')
