@@ -252,7 +252,7 @@ def error_map(survey: Survey) -> Figure:
                 'hovertemplate': 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm<extra></extra>',
             }
         )
-        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{label}')
+        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{label.removesuffix(" by the calibration")}')
         layout[f'yaxis{end}'] = {} if k else axis('height [m]')
     layout['margin'] = _margin(60, 20, 70)
     return {'data': data, 'layout': layout}
@@ -270,7 +270,7 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
         data.append(_curve('lines+markers', name, count[known], 1e3 * errors[known], line=line))
     layout: Figure = {
         'xaxis': axis('poses measured'),
-        'yaxis': axis('predicted RMS error [mm]', type='log'),
+        'yaxis': axis('predicted RMS error [mm]', type='log', dtick='D2'),
     }
     if wanted_mm is not None:
         dotted = {'color': LIMIT, 'dash': 'dot'}

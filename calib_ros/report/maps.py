@@ -142,14 +142,13 @@ def plan_report(
             verdict = replace(verdict, state='open', heading=heading)
         steps = (
             'Drive to each pose, wait until the arm stands still, and measure.',
-            'Keep a few poses apart that are not fitted: they judge the result.',
             'Then identify: calib_ros identify.',
         )
     return Report(
         kind='Plan of a measurement',
         robot=chain.name,
         verdict=verdict,
-        remarks=tuple(line.strip() for line in words.splitlines() if not line.startswith(' ')),
+        remarks=tuple(x for x in words.splitlines() if not x.startswith((' ', 'predicted'))),
         steps=steps,
         identity=identity_of(chain, origin),
         sections=tuple(sections),

@@ -65,13 +65,12 @@ def identification_report(
         verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
         accuracy=accuracy_section(
-            'Accuracy before and after' + ('' if result.accepted else ' what was tried'),
+            'Accuracy before and after' if result.accepted else 'Accuracy of what was tried',
             (
                 *(() if result.validation else (UNPROVEN,)),
-                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
-                f'{result.validated_by}.',
+                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
                 'RMS (root mean square) is the usual size of the error; its interval is that over '
-                'poses like these. 1 mrad of orientation moves the tip of a tool of 1 m by 1 mm.',
+                'poses like these.',
                 ISO_9283,
             ),
             judged,
