@@ -252,9 +252,10 @@ def error_map(survey: Survey) -> Figure:
                 'hovertemplate': 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm<extra></extra>',
             }
         )
-        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{label.removesuffix(" by the calibration")}')
+        below = label.removesuffix(' by the calibration').replace(' to ', '<br>to ')
+        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{below}')
         layout[f'yaxis{end}'] = {} if k else axis('height [m]')
-    layout['margin'] = _margin(60, 20, 70)
+    layout['margin'] = _margin(60, 20, 85)
     return {'data': data, 'layout': layout}
 
 

@@ -153,7 +153,7 @@
         marker: { size: e.cells ? 5 : 3.5, color: errors(), colorscale: 'Viridis', reversescale: true, cmin: 0, cmax: e.largest,
           colorbar: { title: { text: 'error [mm]' }, thickness: 12, len: 0.7 } } },
       { type: 'scatter3d', mode: 'markers', name: 'outliers', ...at(outliers), text: outliers.map((i) => 'outlier, ' + words(i)),
-        customdata: outliers, hoverinfo: 'text', marker: { size: 5, symbol: 'x', color: OUT } },
+        customdata: outliers, hoverinfo: 'text', marker: { size: 5, symbol: 'diamond', color: OUT } },
       { ...wide, ...vectors(), line: { color: '#6e7781', width: 2 }, name: 'errors' },
       { ...wide, ...line, mode: 'lines+markers', line: { color: '#333', width: 10 }, marker: { size: 5, color: '#333' } },
       ...axes.map((axis, k) => ({ ...wide, ...axis, line: { color: ['#c00', '#070', '#03c'][k], width: 4 } })),
