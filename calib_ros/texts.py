@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -31,6 +32,7 @@ MOST_ROWS = LARGEST_TABLE // 500
 """Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""
 DEEPEST = 20
 """Levels of nested YAML."""
+NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
 """Values in a YAML document with its aliases written out; 20 characters count as one."""
 
@@ -82,6 +84,19 @@ def csv_lines(text: str, where: str) -> io.StringIO:
             f'{where} has a line of {longest} characters, more than {most}: is it a table?'
         )
     return io.StringIO(text, newline='')
+
+
+def dump_json(value: Any, indent: str = '') -> str:
+    """Return plain values as JSON: on one line what holds no other lists or mappings."""
+    inside = list(value.values()) if isinstance(value, Mapping) else value
+    if not isinstance(value, NESTED) or not any(isinstance(each, NESTED) for each in inside):
+        return json.dumps(value)
+    lines = [dump_json(each, f'{indent}  ') for each in inside]
+    first, last = '[]'
+    if isinstance(value, Mapping):
+        lines = [f'{json.dumps(name)}: {line}' for name, line in zip(value, lines, strict=True)]
+        first, last = '{}'
+    return ''.join([first, ','.join(f'\n{indent}  {line}' for line in lines), f'\n{indent}{last}'])
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:

@@ -177,11 +177,11 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
     text += (
-        f'; by the calibration, largest error {1e3 * result.position_before[kept].max():.3f} mm, '
+        f'; largest error by the calibration {1e3 * result.position_before[kept].max():.3f} mm, '
     )
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
-    text += f' -> {1e3 * result.position[kept].max():.6f} mm, '
-    text += f'{1e3 * result.orientation[kept].max():.6f} mrad'
+    text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
+    text += f'{1e3 * result.orientation[kept].max():.3f} mrad'
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'
     return text
@@ -198,9 +198,9 @@ def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
     return [
         Refusal(
             k,
-            f'outside the region of the calibration, like {share:.0f} % of the program: expected '
-            f'error {1e3 * errors[k]:.3f} mm, at most {1e3 * region.limit:.3f} mm is allowed; '
-            'identify again with poses near it',
+            f'the calibration is not valid in {share:.0f} % of the program, as here: an error of '
+            f'{1e3 * errors[k]:.3f} mm is expected, where it is valid at most '
+            f'{1e3 * region.limit:.3f} mm; identify again with poses near it',
         )
         for k in outside.tolist()
     ]

@@ -152,7 +152,8 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
     count = len(plan.joints)
     first = int(np.isfinite(plan.accuracy).sum())
     shown = np.unique(np.linspace(count - first + 1, count, min(first, 12)).round().astype(int))
-    lines = ['predicted RMS position error [mm]', ' poses   planned   random']
+    head = 'predicted RMS position error [mm], from measurement noise alone'
+    lines = [head, ' poses   planned   random']
     for number in shown.tolist():
         planned, random = (1e3 * each[number - 1] for each in (plan.accuracy, plan.at_random))
         by_chance = f'{random:8.4f}' if np.isfinite(random) else '       -'
@@ -164,12 +165,11 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
         text += f', at least {100.0 * plan.efficiency:.0f} % of what the best choice would bring'
     lines.append(f'{text}; moves take {plan.travel:.0f} s')
     if needed is not None:
-        lines.append(f'{wanted_mm:g} mm: {needed} poses')
+        lines.append(f'{needed} poses reach {wanted_mm:g} mm')
     if plan.lacking:
         lines.append(
             f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '
             'further and in more combinations, or fix these parameters. The figures leave out '
             'what these bring, and hold only where the joints move as in the candidates'
         )
-    lines.append('from measurement noise alone; errors of the model come on top')
     return '\n'.join(lines)

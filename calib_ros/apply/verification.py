@@ -52,7 +52,7 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
 
-Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'JUDGED', 'LOST']
+Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 NEEDED = 1 + len(PLANE)
 """Configurations from which a verdict is given, those of a fitted frame not counted: the test
 poses of ISO 9283."""
@@ -96,8 +96,8 @@ class Verification(Shown):
         RMS position error [m] over poses like these, and its limits.
     freedom : float
         Degrees of freedom of that error.
-    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; where no error is wanted 'JUDGED', or 'LOST' where
-        the calibration does not hold any more
+    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds' or 'does not hold'
+        'no verdict' where neither is known.
     needed : int or None
         Configurations of which the same RMS error would decide, where it is undecided; None where
         even DECIDING would not.
@@ -247,7 +247,7 @@ def _decided(
 ) -> tuple[Verdict, int | None]:
     """Return the verdict by the first limits, and which of the numbers of poses would decide."""
     if tolerance is None:
-        return 'LOST' if holds is False else 'JUDGED', None
+        return 'no verdict' if holds is None else 'holds' if holds else 'does not hold', None
     decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
     needed = int(numbers[decided[0]]) if decided.size else None
     if lower[0] <= tolerance < upper[0]:
@@ -368,10 +368,12 @@ def in_words(found: Verification) -> str:
 
 def each_in_words(found: Verification) -> list[str]:
     """Return the lines of a table of the poses [mm], of which there may be none."""
-    lines = ['  pose   measured   before    after   repeatability (mean + 3 sigma)']
+    again = any(pose.repeatability is not None for pose in found.each)
+    head = '  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)'
+    lines = [head]
     for k, pose in enumerate(found.each, 1):
-        again = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
-        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {again}'
+        spread = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
+        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {spread}'
         lines.append(line.rstrip())
     return lines if found.each else []
 
@@ -380,7 +382,8 @@ def remarks(found: Verification) -> list[str]:
     """Return what to know besides the figures, and what to do."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if found.fitted:
-        lines.append(f'fitted to these measurements, for both: {" and ".join(found.fitted)}')
+        frames = ' and '.join(found.fitted)
+        lines.append(f'fitted anew to these measurements, before and after alike: {frames}')
     if not found.by_program:
         lines.append(
             'this judges the calibration: give the program before its correction (--commanded) '
@@ -389,7 +392,7 @@ def remarks(found: Verification) -> list[str]:
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide')
-    if found.verdict == 'LOST':
+    if found.verdict == 'does not hold':
         lines.append(
             'the error is larger than it was when the calibration was made: was the tracker, the '
             'target or the robot moved?'

@@ -37,7 +37,7 @@ class Survey(Shown):
         """Return the errors (N,) [m] by their names: only what is removed, if no more is known."""
         found = {'removed by the calibration': self.removed}
         if not np.isnan(self.remaining).any():
-            found |= {'sigma of what remains': self.sigma, 'expected to remain': self.remaining}
+            found |= {'uncertainty of that': self.sigma, 'expected to remain': self.remaining}
         return found
 
     @property

@@ -178,7 +178,7 @@ def _add_verify(parser: argparse.ArgumentParser) -> None:
     add('--session', metavar='NAME', help='session of the table')
     common.add_moved(group)
     group = parser.add_argument_group('how to judge')
-    wanted = 'wanted RMS position error; if not given, errors only, without a verdict'
+    wanted = 'wanted RMS position error; if not given: does the calibration still hold?'
     common.add_each(
         group,
         float,

@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 from calib_ros.cli.given import calibration_of
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.cli.screen import Screen
 from calib_ros.identification.difference import difference
+from calib_ros.texts import dump_json
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -18,7 +18,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     with screen.work('comparing'):
         found = difference(*pair)
     if options.json:
-        screen.data(json.dumps(found.document(), indent=2))
+        screen.data(dump_json(found.document()))
     else:
         screen.title(found.in_words(), found.same)
         if not found.same:

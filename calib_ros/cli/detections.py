@@ -42,10 +42,11 @@ def detected(
             + (f'give --chain {POSED}' if posed else 'give the chain of the arm')
         )
     seen, warnings = observed(found, board, places, options.eye_in_hand)
-    more = []
+    more, by_line = [], True
     if options.csv is not None:
         rows = table(options, options.csv, chain, settings, screen)
         more, warnings = [*rows.fitted], (*warnings, *rows.warnings)
+        by_line = rows.by_line
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
@@ -68,4 +69,5 @@ def detected(
     refusals = (Reason(Rule.POSED, reason),) if posed else ()
     count = sum(map(len, problem.sets))
     samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
-    return Loaded(problem, samples, warnings, refusals=refusals, instead=posed)
+    images = dict(zip(found.lines, found.names, strict=True)) if by_line else {}
+    return Loaded(problem, samples, warnings, '', by_line, images, refusals, instead=posed)

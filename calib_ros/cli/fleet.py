@@ -30,7 +30,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)
-    with screen.work(f'{len(robots)} robots') as work, _tidied_up(screen):
+    with screen.work(f'{len(robots)} robot{"s" * (len(robots) > 1)}') as work, _tidied_up(screen):
         done = run(robots, history, cluster, options.out, work)
         work('comparing nights')
         found = standings(robots, history, done, options.years)

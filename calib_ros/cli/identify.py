@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 
 from calib_ros.cli import given, options as common
@@ -28,6 +27,7 @@ from calib_ros.files.rows import identified as row_of
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
 from calib_ros.settings import Settings
+from calib_ros.texts import dump_json
 
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
@@ -58,7 +58,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     for warning in (*found.loaded.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
-        screen.data(json.dumps(document(found, options.tolerance), indent=2))
+        screen.data(dump_json(document(found, options.tolerance)))
     else:
         show(found, screen, options.tolerance)
         if options.out is None:

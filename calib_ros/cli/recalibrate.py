@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable
 
 from calib_ros.cli import options as common
@@ -14,6 +13,7 @@ from calib_ros.cli.results import set_aside
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import Loaded
 from calib_ros.identification.recalibration import Recalibration, recalibrate, years_since
+from calib_ros.texts import dump_json
 
 FILES = ('calibration.yaml', 'result.json')
 
@@ -49,4 +49,4 @@ def _found(options: argparse.Namespace, loaded: Loaded, screen: Screen) -> Recal
 
 
 def _document(found: Recalibration) -> str:
-    return json.dumps(found.document(), indent=2) + '\n'
+    return dump_json(found.document()) + '\n'

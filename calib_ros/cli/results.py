@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,13 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.progress import share_of
 from calib_ros.report import words
-from calib_ros.report.advice import WRONG_ARM
+from calib_ros.report.advice import BRINGS
 from calib_ros.report.markdown import markdown
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import NOT_YET, identification_report, reasons_of, within_tolerance
 from calib_ros.settings import Settings
+from calib_ros.texts import dump_json
 
 RESULT_FILES = (
     'calibration.yaml',
@@ -74,7 +74,7 @@ def show(found: Identified, screen: Screen, tolerance: float | None = None) -> N
     elif (
         result.noise.position > 1.0
         and not result.noise.consistent
-        and {each.rule for each in result.refusals}.isdisjoint(WRONG_ARM)
+        and {each.rule for each in result.refusals}.isdisjoint(BRINGS)
     ):
         screen.bullet(words.scatter_in_words(result.noise))
     for line in words.cameras_in_words(result):
@@ -88,10 +88,10 @@ def _in_metres(tolerance: float | None) -> float | None:
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     before, after = (result.validation or result.fitted).figures
     proof = '' if result.validation else '; on the poses fitted, which proves nothing'
-    poses = f'{len(result.fitted.judged)} fitted'
+    measured = words.measured(result)
     if result.outliers:
-        poses += f', {len(result.outliers)} of them outliers without weight'
-    fitted = f'{result.rank} parameters'
+        measured += f', {len(result.outliers)} of them outliers without weight'
+    fitted = f'{result.rank} parameters fitted'
     if result.chain.effects:
         fitted += f', {len(result.chain.effects)} of them effects'
     second = ('largest error', f'{before.max_mm:.3f} -> {after.max_mm:.3f} mm')
@@ -104,8 +104,8 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     if result.accepted and result.region is not None:
         valid = result.region.in_words().removeprefix('valid ')
     return (
-        ('robot', f'{result.chain.name}, {fitted} fitted'),
-        ('poses', poses),
+        ('robot', f'{result.chain.name}, {fitted}'),
+        ('fitted to', measured),
         ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm{proof}'),
         second,
         ('judged by', result.validated_by),
@@ -137,9 +137,9 @@ def result_files(
     loaded, result = found.loaded, found.result
     with screen.work('writing the report') as work:
         work('residuals.csv, 1 of 3')
-        poses = poses_of(loaded.problem, result, loaded.lines)
+        poses = poses_of(loaded.problem, result, loaded.lines, loaded.images)
         contents: dict[str, str | bytes] = {
-            'result.json': json.dumps(document(found, tolerance), indent=2) + '\n',
+            'result.json': dump_json(document(found, tolerance)) + '\n',
             'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),
             'settings.yaml': found.origin.settings,
         }

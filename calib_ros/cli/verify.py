@@ -96,8 +96,7 @@ def show(found: Verification, screen: Screen) -> None:
             ('orientation error', orientation),
             (
                 f'{100.0 * found.confidence:g} % sure',
-                f'RMS over poses like these is above {1e3 * found.lower:.4f} and below '
-                f'{1e3 * found.upper:.4f} mm',
+                f'RMS {1e3 * found.lower:.4f} to {1e3 * found.upper:.4f} mm over poses like these',
             ),
             ('tolerance', tolerance),
         )

@@ -181,12 +181,16 @@ def _numbers(
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Corners found in images: `image` (N,) numbers the names, `corner` (N,), `pixels` (N, 2)."""
+    """Corners found in images: `image` (N,) numbers the names, `corner` (N,), `pixels` (N, 2).
+
+    `lines` are those of a table at which the images begin.
+    """
 
     names: tuple[str, ...]
     image: NDArray[np.intp]
     corner: NDArray[np.intp]
     pixels: FloatArray
+    lines: tuple[int, ...] = ()
 
     def as_csv(self) -> str:
         """Return the table of a row per corner."""
@@ -213,7 +217,9 @@ def read_detections(path: Path, board: Board) -> Detections:
         )
     order = np.argsort(image, kind='stable')
     pixels = found.block(('u', 'v'))
-    return Detections(tuple(names), image[order], corner[order], pixels[order])
+    first = np.unique(image, return_index=True)[1].tolist()
+    lines = tuple(int(found.lines[row]) for row in first)
+    return Detections(tuple(names), image[order], corner[order], pixels[order], lines)
 
 
 def posed_arm() -> Chain:
@@ -272,7 +278,10 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
 def observed(
     found: Detections, board: Board, places: Mapping[str, FloatArray], on_flange: bool
 ) -> tuple[Observations, tuple[str, ...]]:
-    """Return the corners of all images at which the arm's place is known, and warnings."""
+    """Return the corners of all images at which the arm's place is known, and warnings.
+
+    Stamps are the lines at which the images begin.
+    """
     known = np.array([name in places for name in found.names], dtype=bool)
     if not known.any():
         raise InputError(
@@ -286,4 +295,4 @@ def observed(
     joints = np.array([places[found.names[k]] for k in image.tolist()])
     points = board.corners[found.corner[kept]]
     seen = Observations.from_pixels(joints, found.pixels[kept], points, image, on_flange)
-    return seen, told
+    return seen.at(np.array(found.lines, dtype=np.int64)[image] * 10**9), told

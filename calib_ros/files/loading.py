@@ -30,8 +30,9 @@ class Loaded:
     """A problem, and what became of the input.
 
     `samples` are the counts of it, `read` says them in words; `lines` tells that stamps are the
-    lines of a table, `refusals` why a result must not be accepted whatever it is, `instead` that
-    these stand instead of its own; `owners` whose frame each is, of a bag.
+    lines of a table, `images` the names of images by theirs; `refusals` why a result must not be
+    accepted whatever it is, `instead` that these stand instead of its own; `owners` whose frame
+    each is, of a bag.
     """
 
     problem: Problem
@@ -39,6 +40,7 @@ class Loaded:
     warnings: tuple[str, ...] = ()
     read: str = ''
     lines: bool = False
+    images: Mapping[int, str] = field(default_factory=dict)
     refusals: tuple[Reason, ...] = ()
     instead: bool = False
     owners: Mapping[str, Owner] = field(default_factory=dict)

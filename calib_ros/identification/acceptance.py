@@ -126,8 +126,8 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
         )
     elif found.region is None:
         text = (
-            'too little is known of the arm for the correction to help: what it removes is not '
-            'larger than its own uncertainty, even at the poses measured'
+            'what the correction removes is not larger than its own uncertainty, even at the '
+            'poses measured'
         )
         if not found.sized:
             text += '; measure what tells how large the arm is: positions, or two sockets a known '

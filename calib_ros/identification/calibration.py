@@ -220,8 +220,8 @@ class Calibration(Shown):
             return '', ''
         shift, turn = self.sigma(joints), self.sigma_turned(joints)
         words = (
-            f'sigma of the calibration at these poses: {1e3 * shift.max(initial=0.0):.3f} mm '
-            f'where the target was, {1e3 * turn.max(initial=0.0):.3f} mrad at most'
+            f'the calibration knows these poses to {1e3 * shift.max(initial=0.0):.3f} mm at the '
+            f'target measured and {1e3 * turn.max(initial=0.0):.3f} mrad, or better (one sigma)'
         )
         if np.sum(turn**2) <= np.sum(turned**2):
             return words, ''

@@ -80,7 +80,7 @@ class Difference(Shown):
     def in_words(self) -> str:
         """Return what is different."""
         size = (
-            f'{1e3 * self.rms:.3f} mm RMS over the joint range (below {1e3 * self.limit:.3f} mm)'
+            f'{1e3 * self.rms:.3f} mm RMS over the joint range (at most {1e3 * self.limit:.3f} mm)'
         )
         if self.same:
             return f'unchanged within {1e3 * self.limit:.3f} mm'

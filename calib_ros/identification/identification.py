@@ -117,6 +117,8 @@ class Identification(Shown):
         What is suspicious though the figures are good, and what to do (`suspicions.py`).
     coupled : bool
         Whether couplings of the wrist that are not fitted explain most of what is left.
+    images : int
+        How many images of a board were fitted.
 
     """
 
@@ -146,6 +148,7 @@ class Identification(Shown):
     step: Step | None = None
     remarks: tuple[str, ...] = ()
     coupled: bool = False
+    images: int = 0
 
     @property
     def accepted(self) -> bool:
@@ -307,6 +310,7 @@ def _identified(
         step=found.step,
         remarks=remarks(problem, found.step, coarse),
         coupled=share > 0.0,
+        images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
     named = mistakes.remarked(problem, result)
     return suspicions.remarked(problem, named, another=named is result)

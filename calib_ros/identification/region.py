@@ -88,10 +88,10 @@ class Region(Shown):
         """Return where the calibration may be used."""
         if self.whole:
             return 'valid over the whole joint range'
-        where = f'{100.0 * self.share:.0f} % of the joint range' if self.share else ''
+        share = f'{min(100.0 * self.share, 99.0):.0f}' if self.share >= 0.01 else 'under 1'
         return (
-            f'valid near the measured poses only{", " * bool(where)}{where}: where the expected '
-            f'error is below {1e3 * self.limit:.3f} mm'
+            f'valid near the measured poses, in {share} % of the joint range; elsewhere it may '
+            'make the arm worse'
         )
 
     def document(self) -> dict[str, Any]:

@@ -49,11 +49,12 @@ LEAST_ASIDE = 3
 class Step:
     """What moved, when and by how much.
 
-    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `set`, `sample` and
-    `stamp_ns` are those of the first sample after it. `size` is the RMS change of positions ('m')
-    or, where it weighs more, of orientations ('rad'); of a joint that of its zero. `share` is what
-    it explains of the squares of the residuals beyond as many useless parameters. It is `outside`
-    if all that was measured on one side are outliers: the fit is not spoilt by it.
+    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `set`, `sample`, the
+    `image` of it and `stamp_ns` are those of the first sample after it. `size` is the RMS change
+    of positions ('m') or, where it weighs more, of orientations ('rad'); of a joint that of its
+    zero. `share` is what it explains of the squares of the residuals beyond as many useless
+    parameters. It is `outside` if all that was measured on one side are outliers: the fit is not
+    spoilt by it.
     """
 
     what: str
@@ -65,6 +66,7 @@ class Step:
     unit: str
     share: float
     outside: bool
+    image: int | None = None
 
     @property
     def harmful(self) -> bool:
@@ -81,8 +83,9 @@ class Step:
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         line, fraction = divmod(self.stamp_ns, 10**9)
         if line < 10**6 and not fraction:  # no clock, the numbers of rows
-            when = f'line {line}, without stamps the order of the rows is taken'
-        text = f'something moved at pose {self.sample + 1}'
+            when = f'line {line}; rows count in their order'
+        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
+        text = f'something moved at {where}'
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':
@@ -135,6 +138,7 @@ class _Scan:
     def __init__(self, problem: Problem, names: Sequence[str], robust: Robust) -> None:
         self._chain = robust.fit.chain
         self._groups = _groups(problem)
+        self._images = [None if s.pixels is None else s.images for s in problem.sets]
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
         self._names = [*names, *(name for name in self._added if name not in names)]
@@ -275,9 +279,10 @@ class _Scan:
         else:
             size, unit = shift, 'm'
         outside = not all(np.concatenate(side).any() for side in weights)
-        return Step(
-            group.what, group.kind, of_set, sample, stamp, size, unit, found.share, outside
-        )
+        images = self._images[of_set]
+        image = None if images is None else int(images[sample])
+        where = (of_set, sample, stamp)
+        return Step(group.what, group.kind, *where, size, unit, found.share, outside, image)
 
 
 def _groups(problem: Problem) -> list[_Group]:

@@ -205,7 +205,7 @@ def validate(
             comparison = replace(comparison, judged=judged)
         text = f'{len(comparison.judged)} held-out poses'
         if repeated.any():
-            text += f'; {repeated.sum()} of them decide nothing: measured at fitted poses again'
+            text += f'; the {repeated.sum()} that repeat fitted poses do not count for acceptance'
         return comparison, text
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):

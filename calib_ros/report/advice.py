@@ -52,7 +52,7 @@ def rules() -> Mapping[Rule, Advice]:
 
 
 def _unwrapped(text: str) -> str:
-    return ' '.join(text.split())
+    return ' '.join(text.replace('`', '').split())
 
 
 GOOD_ARM = Advice(
@@ -76,7 +76,7 @@ WRONG = {
 }
 """What a description that does not fit brings by itself."""
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
-    rule: {rule, Rule.OUTLIERS} for rule in (Rule.ENCODER, Rule.MOVED)
+    rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
 }
 """What each cause brings by itself; the first cause that is there counts."""
 

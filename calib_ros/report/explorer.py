@@ -54,6 +54,10 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'kinds': kinds,
         'number': (rows + 1).tolist() if many else None,
         'lines': poses.lines,
+        'things': poses.things,
+        'images': [poses.source(row) if poses.corner[row] else '' for row in rows.tolist()]
+        if poses.images
+        else [],
         'stamps': base64.b64encode(shown.stamps_ns.astype('<i8').tobytes()).decode(),
         'roles': list(ROLES.values()),
         'role': [list(ROLES).index(role) for role in shown.role.tolist()],

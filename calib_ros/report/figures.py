@@ -59,8 +59,8 @@ def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> F
     return {'type': 'scatter', 'mode': mode, 'name': name, **points, **more}
 
 
-def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:
-    """Return the share of poses with at most a given position error (N,)."""
+def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figure:
+    """Return the share of poses, or other `things`, with at most a given position error (N,)."""
     share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
     data = [
         _curve('lines', name, np.quantile(errors, share), 100.0 * share, line=line)
@@ -71,7 +71,7 @@ def cumulated(before_mm: FloatArray, after_mm: FloatArray) -> Figure:
     ]
     layout = {
         'xaxis': axis('position error [mm]', rangemode='tozero'),
-        'yaxis': axis('poses with at most this error [%]', range=[0, 100]),
+        'yaxis': axis(f'{things} with at most this error [%]', range=[0, 100]),
     }
     return {'data': data, 'layout': layout}
 
@@ -252,9 +252,10 @@ def error_map(survey: Survey) -> Figure:
                 'hovertemplate': 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm<extra></extra>',
             }
         )
-        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{label}')
+        below = label.removesuffix(' by the calibration').replace(' to ', '<br>to ')
+        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{below}')
         layout[f'yaxis{end}'] = {} if k else axis('height [m]')
-    layout['margin'] = _margin(60, 20, 70)
+    layout['margin'] = _margin(60, 20, 85)
     return {'data': data, 'layout': layout}
 
 
@@ -270,7 +271,7 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
         data.append(_curve('lines+markers', name, count[known], 1e3 * errors[known], line=line))
     layout: Figure = {
         'xaxis': axis('poses measured'),
-        'yaxis': axis('predicted RMS error [mm]', type='log'),
+        'yaxis': axis('predicted RMS error [mm]', type='log', dtick='D2'),
     }
     if wanted_mm is not None:
         dotted = {'color': LIMIT, 'dash': 'dot'}

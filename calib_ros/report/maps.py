@@ -31,7 +31,7 @@ def workspace_report(
     rest = 'What remains is not known: the file does not say how well its numbers are known.'
     if len(spreads) > 1:
         text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm at most.')
-        rest = 'Expected to remain: sigma and the RMS error on poses that were not fitted.'
+        rest = 'Expected to remain: that uncertainty and the RMS error on poses not fitted.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
     about = 'Radius: distance from the axis of the base. Height: above its origin.'
@@ -57,7 +57,7 @@ def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
     """Return where most is removed, and where what remains is known least."""
     titles = (
         'Where the most is removed by the calibration',
-        'Where the sigma of what remains is most',
+        'Where that is most uncertain',
     )
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
@@ -142,14 +142,13 @@ def plan_report(
             verdict = replace(verdict, state='open', heading=heading)
         steps = (
             'Drive to each pose, wait until the arm stands still, and measure.',
-            'Keep a few poses apart that are not fitted: they judge the result.',
             'Then identify: calib_ros identify.',
         )
     return Report(
         kind='Plan of a measurement',
         robot=chain.name,
         verdict=verdict,
-        remarks=tuple(line.strip() for line in words.splitlines() if not line.startswith(' ')),
+        remarks=tuple(x for x in words.splitlines() if not x.startswith((' ', 'predicted'))),
         steps=steps,
         identity=identity_of(chain, origin),
         sections=tuple(sections),

@@ -44,13 +44,15 @@ def before_after_png(result: Identification) -> bytes:
         left.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
         share = 100.0 * np.arange(1, len(errors) + 1) / len(errors)
         right.plot(np.sort(errors), share, color=colour, drawstyle='steps-post')
-    left.set(xlabel='pose', ylabel='position error [mm]', xlim=(0, len(before)))
+    thing = 'measurement' if result.images else 'pose'  # a corner, or one of both
+    left.set(xlabel=thing, ylabel='position error [mm]', xlim=(0, len(before)))
     left.set_ylim(bottom=0.0)
-    left.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
-    right.set(xlabel='position error [mm]', ylabel='poses with at most this error [%]')
+    beside = {'ncols': 2, 'fontsize': 'small', 'columnspacing': 1.0}
+    left.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False, **beside)
+    right.set(xlabel='position error [mm]', ylabel=f'{thing}s with at most this error [%]')
     right.set(xlim=(0, None), ylim=(0, 100))
     right.grid(alpha=0.3)
-    title = f'{one_line(result.chain.name)}, judged by {result.validated_by}'
+    title = f'{one_line(result.chain.name)}, judged by {result.validated_by.partition(";")[0]}'
     figure.suptitle(title, parse_math=False)
     return _png(figure)
 

@@ -8,8 +8,8 @@ share. Errors are measured minus predicted, of the judged poses by a fit that di
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,14 @@ from calib_ros.settings import Settings
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted; left out to judge; left out at a fitted configuration."""
 WHEN = ('before', 'after')
+NAMELESS: Mapping[int, str] = {}
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """N poses in the order of their stamps, which are the `lines` of a table, in seconds, or not.
+    """N poses, or corners of a board, in the order of their stamps.
 
+    Stamps are the `lines` of a table, in seconds, or not; there `images` have names.
     Errors of position [m] and orientation [rad] are in the arm's base: (error, 0, 0) of a
     distance, NaN where no orientation was measured.
     """
@@ -49,9 +51,11 @@ class Poses:
     role: NDArray[np.str_]  # FITTED, JUDGED or REPEATED
     outlier: NDArray[np.bool_]
     size: FloatArray  # of the residual in usual errors; NaN where the pose was not fitted
+    corner: NDArray[np.bool_]  # of a board in an image
     set: NDArray[np.intp]  # of observations, by its number
     tools: FloatArray  # (S, 4, 4) of the sets
     lines: bool = False
+    images: Mapping[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -71,9 +75,18 @@ class Poses:
         """Tell whether any orientation was measured."""
         return not bool(np.isnan(self.turned_after).all())
 
+    @property
+    def things(self) -> str:
+        """Return what a row is, in the plural."""
+        if not self.corner.any():
+            return 'poses'
+        return 'corners' if self.corner.all() else 'measurements'
+
     def source(self, row: int) -> str:
-        """Return where a pose comes from: the line of the table, or the stamp [s]."""
+        """Return where a row comes from: the image or the line of the table, or the stamp [s]."""
         stamp = int(self.stamps_ns[row])
+        if self.corner[row] and (name := self.images.get(stamp // 10**9)):
+            return name
         if self.lines:
             return f'line {stamp // 10**9}'
         return f'{stamp // 10**9}.{stamp % 10**9:09d} s'
@@ -83,9 +96,9 @@ class Poses:
         arrays = {
             name: getattr(self, name)[rows]
             for name in self.__dataclass_fields__
-            if name not in ('tools', 'lines')
+            if name not in ('tools', 'lines', 'images')
         }
-        return Poses(**arrays, tools=self.tools, lines=self.lines)
+        return Poses(**arrays, tools=self.tools, lines=self.lines, images=self.images)
 
     def table(self, told: Told = nobody) -> str:
         """Return a CSV: a row for each pose, in metres and radians."""
@@ -143,22 +156,30 @@ def _parts(
             'role': role[rows],
             'outlier': ~comparison.judged[rows],
             'size': sizes[rows],
+            'corner': np.full(len(each), each.pixels is not None),
             'tools': chain.frame(each.tool).matrix[np.newaxis],
         }
         first += len(each)
 
 
-def _joined(parts: Sequence[dict[str, NDArray[Any]]], lines: bool) -> Poses:
+def _joined(
+    parts: Sequence[dict[str, NDArray[Any]]], lines: bool, images: Mapping[int, str]
+) -> Poses:
     """Return all parts in the order of their stamps."""
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tools = arrays.pop('tools')
     arrays['set'] = np.repeat(np.arange(len(parts)), [len(part['joints']) for part in parts])
     order = np.argsort(arrays['stamps_ns'], kind='stable')
     ordered = {name: array[order] for name, array in arrays.items()}
-    return Poses(**ordered, tools=tools, lines=lines)
+    return Poses(**ordered, tools=tools, lines=lines, images=images)
 
 
-def poses_of(problem: Problem, result: Identification, lines: bool = False) -> Poses:
+def poses_of(
+    problem: Problem,
+    result: Identification,
+    lines: bool = False,
+    images: Mapping[int, str] = NAMELESS,
+) -> Poses:
     """Return all poses of an identification, those to judge on by what did not know them."""
     known = (result.chain, (problem.sigma_position, problem.sigma_orientation))
     sizes = np.concatenate(result.distances)
@@ -172,7 +193,7 @@ def poses_of(problem: Problem, result: Identification, lines: bool = False) -> P
         unknown = np.full(len(judged.judged), np.nan)
         role = np.where(judged.repeated, REPEATED, JUDGED)
         parts += _parts(*known, problem.judging, judged, role, unknown)
-    return _joined(parts, lines)
+    return _joined(parts, lines, images)
 
 
 def poses_to_verify(
@@ -182,4 +203,4 @@ def poses_to_verify(
     count = len(comparison.judged)
     role, sizes = np.full(count, JUDGED), np.full(count, np.nan)
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
-    return _joined([*_parts(chain, sigmas, sets, comparison, role, sizes)], lines)
+    return _joined([*_parts(chain, sigmas, sets, comparison, role, sizes)], lines, NAMELESS)

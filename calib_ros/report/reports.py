@@ -13,6 +13,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.linear_model import COMPARED
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.validation import Comparison
@@ -64,16 +65,16 @@ def identification_report(
         verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
         accuracy=accuracy_section(
-            f'Accuracy before and {"after" if result.accepted else "with what was tried"}',
+            'Accuracy before and after' if result.accepted else 'Accuracy of what was tried',
             (
                 *(() if result.validation else (UNPROVEN,)),
-                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone. Judged by '
-                f'{result.validated_by}.',
+                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
                 'RMS (root mean square) is the usual size of the error; its interval is that over '
-                'poses like these. 1 mrad of orientation moves the tip of a tool of 1 m by 1 mm.',
+                'poses like these.',
                 ISO_9283,
             ),
             judged,
+            poses.things,
             judged.figures_of_all[1] if judged.outliers else None,
         ),
         picture=distribution(poses),
@@ -192,7 +193,8 @@ def _steps(
     ]
     if result.region is not None and not result.region.whole:
         found.append(
-            'Use it near the measured poses. To use it elsewhere, measure poses there as well.'
+            'calib_ros compensate refuses poses where the calibration is not valid. To use it '
+            'there, measure poses there as well.'
         )
     return tuple(found)
 
@@ -229,16 +231,24 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
 
 
 def _effects(result: Identification) -> Section:
-    """Return what each effect beyond geometry brings."""
-    pays = {True: 'yes', False: 'no: does not pay for itself'}
+    """Return what each effect beyond geometry brings, in the order in which they were added."""
     return Section(
         'effects',
         'Errors beyond geometry',
-        ('RMS position error on poses left out, with and without each effect.',),
-        head=('effect', 'without [mm]', 'with it [mm]', 'used'),
+        (
+            'By how much each effect, on top of those used above it, changes the RMS position '
+            'error of poses left out. Used are those that help by more than chance.',
+            f'They are compared on {COMPARED:,} poses at most. The model chosen is fitted to all '
+            'poses and does better: its error stands at the top.',
+        ),
+        head=('effect', 'changes the error by', 'used'),
         rows=tuple(
-            (v.what, f'{v.rms_mm_before:.4f}', f'{v.rms_mm_after:.4f}', pays[v.pays])
-            for v in result.verdicts
+            (
+                each.what,
+                f'{100.0 * (each.rms_mm_after / each.rms_mm_before - 1.0):+.1f} %',
+                'yes' if each.pays else 'no',
+            )
+            for each in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before))
         ),
     )
 
@@ -267,12 +277,12 @@ def _outliers(poses: Poses, most: int = 50) -> Section:
     more = f' The {most} largest are shown.' if len(rows) > most else ''
     return Section(
         'outliers',
-        f'Outliers: {len(rows)} poses carry no or little weight',
+        f'Outliers: {len(rows)} {poses.things} carry no or little weight',
         (
             'They differ from all the others by more than errors of this arm and device do. '
             f'Measure them again, or look what happened there.{more}',
         ),
-        head=('where', 'pose', 'times the usual error', 'error after [mm]'),
+        head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
             for k in rows[:most].tolist()
@@ -329,12 +339,8 @@ def _parameters(result: Identification) -> Section:
             'Kept nominal are those of status "gauge" (by the build of the arm they show only '
             'together with others), "not excited" (the poses do not determine them) and "fixed" '
             '(held on request). Base and tool are placed by the fit: they have no offset.',
-            f'{result.rank} are fitted, in {result.iterations} iterations.',
-            *(
-                (f'{unlisted} are harmonics of gears: result.json lists them.',)
-                if unlisted
-                else ()
-            ),
+            f'{result.rank} are fitted'
+            + (f'; the {unlisted} harmonics of gears are in result.json.' if unlisted else '.'),
             *words.priors_in_words(result),
         ),
         head=('parameter', 'value', 'offset', 'std', '± (95 %)', 'unit', 'status'),
@@ -346,8 +352,8 @@ def _determined(result: Identification) -> Section:
     """Return how well the arm is known, and what no measurement at these poses can tell."""
     sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
     text = (
-        f'One sigma of predicted positions over the joint range: {sigma["median"]:.3f} mm '
-        f'(median), {sigma["max"]:.3f} mm at most.',
+        f'Expected error of positions predicted over the whole joint range: '
+        f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm at most.',
         f'Observability: {words.observability_in_words(result)}.',
         weak and f'Weakly determined (std above {1e3 * words.WEAK:g} mm or mrad): {weak}.',
     )
@@ -357,7 +363,7 @@ def _determined(result: Identification) -> Section:
         tuple(filter(None, text)),
         head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
         rows=tuple(
-            (name, ', '.join(partners) or 'no measured pose depends on it')
+            (name, ', '.join(some(partners)) or 'no measured pose depends on it')
             for name, partners in result.gauges.items()
         ),
     )
@@ -366,7 +372,8 @@ def _determined(result: Identification) -> Section:
 def _correlations(result: Identification) -> Section:
     """Return which parameters were found together rather than each."""
     strong = [f'{a} and {b} ({value:+.2f})' for a, b, value in result.correlated()]
-    shown = [k for k, name in enumerate(result.names) if group_of(name) != 'gear']
+    beyond = dict(result.chain.effects)
+    shown = [k for k, name in enumerate(result.names) if name not in beyond]
     return Section(
         'correlations',
         'Which parameters stand in for each other',
@@ -374,7 +381,7 @@ def _correlations(result: Identification) -> Section:
             'Two parameters of strong colour change together: the poses tell their '
             'combination better than each alone. Predictions of the arm are not harmed.',
             f'Strongest: {", ".join(some(strong))}.' if strong else 'None is above 0.9.',
-            *(('Harmonics of drives are not drawn.',) if len(shown) < result.rank else ()),
+            *(('Effects beyond geometry are not drawn.',) if beyond else ()),
         ),
         figures.correlations(
             [result.names[k] for k in shown], result.covariance[np.ix_(shown, shown)]
@@ -391,7 +398,8 @@ def _map(result: Identification) -> Section:
         'The error over the workspace',
         (
             f'At {SURVEYED:,} random poses of the whole joint range, by the distance from the '
-            'axis of the base and the height above it.',
+            'axis of the base and the height above it. More is expected to remain far from the '
+            'poses that were measured.',
         ),
         figures.error_map(found),
     )

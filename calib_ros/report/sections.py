@@ -28,8 +28,6 @@ ISO_9283 = (
     'repeatability is part of the figure.'
 )
 LABELS = (
-    '',
-    'poses',
     'RMS [mm]',
     '95 % interval',
     'mean [mm]',
@@ -38,14 +36,14 @@ LABELS = (
     'RMS [mrad]',
     'RMS [px]',
 )
-"""Rows of the table of accuracy."""
+"""Rows of the table of accuracy below its head and count."""
 
 
-def gain(which: Comparison) -> str:
-    """Return the errors before and after with their uncertainty."""
+def gain(which: Comparison, intervals: bool = True) -> str:
+    """Return the errors before and after, with their uncertainty if wanted."""
     parts = []
     for when, found in enumerate(which.figures):
-        between = _between(limits_of(which, when, INTERVAL))
+        between = _between(limits_of(which, when, INTERVAL)) if intervals else ''
         parts.append(f'{found.rms_mm:.3f} mm' + (f' ({between})' if between else ''))
     return f'RMS position error: {" → ".join(parts)}'
 
@@ -66,16 +64,19 @@ def accuracy_section(
     title: str,
     text: tuple[str, ...],
     judged: Comparison,
+    things: str,
     with_outliers: ErrorFigures | None = None,
+    intervals: bool = True,
 ) -> Section:
-    """Return the table of accuracy, before and after."""
+    """Return the table of accuracy, before and after; `things` are what is counted."""
     columns = [
-        _column(name, found, limits_of(judged, when, INTERVAL))
+        _column(name, found, limits_of(judged, when, INTERVAL) if intervals else None)
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
     ]
     if with_outliers is not None:
         columns.append(_column('after, with outliers', with_outliers))
-    head, *rows = (row for row in zip(LABELS, *columns, strict=True) if any(row[1:]))
+    labels = ('', things, *LABELS)
+    head, *rows = (row for row in zip(labels, *columns, strict=True) if any(row[1:]))
     return Section('accuracy', title, text, head=head, rows=tuple(rows))
 
 
@@ -105,7 +106,7 @@ def identity_of(
         ('Measuring device', origin.device),
         ('Operator', origin.operator),
         ('Measured', _measured(poses)),
-        ('Poses', '' if poses is None else f'{len(poses):,}'),
+        *(((poses.things.capitalize(), f'{len(poses):,}'),) if poses else ()),
         judged,
         ('Report made', datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC')),
         (
@@ -137,9 +138,9 @@ def distribution(poses: Poses) -> Section:
     )
     return Section(
         'cumulated',
-        'How many poses are within an error',
+        f'How many {poses.things} are within an error',
         ('Outliers are left out. The further left a curve, the better.',),
-        figures.cumulated(before, after),
+        figures.cumulated(before, after, poses.things),
         height=400,
     )
 

@@ -27,6 +27,7 @@ MOVED = (
     'Check that the measuring device, the target and the robot stand as they did for the '
     'calibration; if not, use --new-base or --new-tool.'
 )
+TOLERANCE = 'Give --tolerance with the RMS error [mm] that your task allows: PASS or FAIL.'
 STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     'PASS': (
         Verdict('good', 'PASS: the arm is within the tolerance'),
@@ -44,14 +45,12 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
         Verdict('open', 'UNDECIDED: too few measurements to tell'),
         (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
     ),
-    'LOST': (
+    'does not hold': (
         Verdict('bad', 'The calibration does not hold any more'),
         (MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
     ),
-    'JUDGED': (
-        Verdict('info', 'No verdict: --tolerance MM gives PASS or FAIL'),
-        ('Give --tolerance with the RMS error that your task allows, for a verdict.',),
-    ),
+    'holds': (Verdict('good', 'The calibration holds: the error is as it was'), (TOLERANCE,)),
+    'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
 """Verdicts, and what to do next."""
 
@@ -71,11 +70,13 @@ def verification_report(
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
-        verdict=replace(state, text=tuple(text), gain=gain(found.comparison)),
+        verdict=replace(state, text=tuple(text), gain=gain(found.comparison, intervals=False)),
         accuracy=accuracy_section(
             'Accuracy before and after the correction',
             (ISO_9283,),
             found.comparison,
+            poses.things,
+            intervals=False,
         ),
         picture=distribution(poses),
         steps=steps,

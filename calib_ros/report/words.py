@@ -22,7 +22,7 @@ from calib_ros.identification.validation import Comparison, ErrorFigures, Parame
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import to_quat
+from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 from calib_ros.texts import dump_yaml
@@ -43,7 +43,7 @@ def summary(
     measurements. `first` is what to do first about a refusal.
     """
     before, after = (result.validation or result.fitted).figures
-    text = f'{len(result.fitted.judged)} poses, RMS {before.rms_mm:.3f} -> '
+    text = f'{measured(result)}, RMS {before.rms_mm:.3f} -> '
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
@@ -63,6 +63,15 @@ def summary(
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {todo}{text}'
 
 
+def measured(result: Identification) -> str:
+    """Return what was fitted: poses, images with their corners, or both."""
+    seen = ~np.isnan(result.fitted.after.pixels[:, 0])
+    corners, poses = int(seen.sum()), int((~seen).sum())
+    parts = [f'{poses} poses'] if poses or not corners else []
+    parts += [f'{result.images} images with {corners} corners'] if corners else []
+    return ' and '.join(parts)
+
+
 def remarks(result: Identification) -> list[str]:
     """Return the remarks on a result that do not say the same as why it was refused."""
     return [each for each in result.remarks if each not in map(str, result.refusals)]
@@ -76,7 +85,7 @@ def notes(result: Identification) -> list[str]:
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
         found.append(f'with {len(result.chain.effects)} effects ({", ".join(groups)})')
-    given = set(result.priors) - set(result.weak)
+    given = set(result.priors) - set(result.weak) - {name for name, _ in result.chain.effects}
     if given:
         found.append(f'priors on {len(given)} parameters')
     if result.weak:
@@ -94,7 +103,7 @@ def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, in
         f'pose {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
         for each in largest
     ]
-    return ', '.join(some(words))
+    return ', '.join(some([*dict.fromkeys(words)]))
 
 
 def weakly_determined(result: Identification) -> tuple[str, ...]:
@@ -200,7 +209,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'chance_of_gain': result.chance,
         'outliers': [asdict(outlier) for outlier in result.outliers],
         'gauges': result.gauges,
-        'covariance': {'names': list(result.names), 'matrix': result.covariance.tolist()},
+        'covariance': {'names': list(result.names), 'lower': _lower(result.covariance)},
         'correlated': [list(pair) for pair in result.correlated()],
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),
@@ -218,6 +227,11 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'numpy': np.__version__,
         },
     }
+
+
+def _lower(square: FloatArray) -> list[list[float]]:
+    """Return the lower triangle (P, P) of a symmetric matrix row by row, in ten digits."""
+    return [[float(f'{x:.9e}') for x in row[: k + 1]] for k, row in enumerate(square.tolist())]
 
 
 def _parameter(p: ParameterRow) -> dict[str, Any]:
@@ -248,15 +262,16 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 
 def scatter_in_words(noise: Noise) -> str:
     """Return how much more is left than the device should leave."""
-    text = f'The error left is {noise.position:.2f} times the stated noise in position'
+    text = f'The error left is {noise.position:.2f} times the noise stated for the device'
     if noise.orientation is not None:
         text += f', {noise.orientation:.2f} times in orientation'
     if noise.consistent:
-        return f'{text}: consistent with it (chi-squared test).'
+        return f'{text}: nothing but that noise (chi-squared test).'
     if noise.position < 1.0:
-        return f'{text}: less than sigma_position and sigma_orientation say.'
+        return f'{text}: the device is better than stated.'
     return (
-        f'{text}: more than sigma_position and sigma_orientation say. The intervals allow for it.'
+        f'{text}: the device is worse than stated, or the model lacks an effect. The intervals '
+        'allow for it.'
     )
 
 
@@ -271,18 +286,21 @@ def neighbours_in_words(noise: Noise) -> str:
     if not noise.shared:
         return 'Neighbouring poses share no error that a test would find.'
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
-    return (
+    text = (
         f'The errors of poses {" and ".join(parts)} are alike (correlation in brackets): the '
-        'device drifts, or the model lacks an effect. So each pose counts for less, and standard '
-        f'deviations are {noise.widened:.2f} times those of independent errors.'
+        'device drifts, or the model lacks an effect.'
     )
+    if (times := f'{noise.widened:.2f}') != '1.00':
+        text += f' So standard deviations are {times} times those of independent errors.'
+    return text
 
 
 def chance_in_words(chance: float) -> str:
     """Return how well the gain stands against errors in succession."""
+    share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'below 0.1'
     return (
-        f'The chance that the improvement is only drift of the device is {100.0 * chance:.1f} % '
-        '(share of time-shifted residuals explained just as well).'
+        f'The chance that the improvement is only drift of the device is {share} % (share of '
+        'time-shifted residuals explained just as well).'
     )
 
 
@@ -291,7 +309,7 @@ def priors_in_words(result: Identification) -> list[str]:
     known = dict(result.chain.effects)
     why = dict.fromkeys(result.weak, ', because the poses hardly determine it')
     lines = [
-        f'prior on {name}: {sigma:.3g} {Parameter(name).unit}{why.get(name, "")}'
+        f'prior on {name}: {_in_thousandths(name, sigma)}{why.get(name, "")}'
         for name, sigma in result.priors.items()
         if name not in known
     ]
@@ -299,9 +317,16 @@ def priors_in_words(result: Identification) -> list[str]:
     for name in known:
         groups.setdefault(effects.group_of(name), []).append(name)
     for group, names in groups.items():
-        sigma, of = result.priors[names[0]], Parameter(names[0]).unit
-        lines.append(f'prior on {len(names)} parameters of {group}: {sigma:g} {of}')
+        size = _in_thousandths(names[0], result.priors[names[0]])
+        lines.append(f'prior on {len(names)} parameters of {group}: {size}')
     return lines
+
+
+def _in_thousandths(name: str, sigma: float) -> str:
+    parameter = Parameter(name)
+    if parameter.of_lens:
+        return f'{sigma:.3g} {parameter.unit}'
+    return f'{1e3 * sigma:.3g} m{parameter.unit}'
 
 
 def cameras_in_words(result: Identification) -> list[str]:
@@ -312,11 +337,15 @@ def cameras_in_words(result: Identification) -> list[str]:
     fitted = result.fitted.figures[1]
     if fitted.rms_px is not None:
         lines.append(f'RMS {fitted.rms_px:.3f} px on the corners fitted')
+    on_flange, other = ('camera', 'board') if 'tool' in cameras else ('board', 'camera')
+    about = {'base': f' (arm seen from the {other})', 'tool': f' ({on_flange} on the flange)'}
+    if len(chain.frame_names) > 2:  # of other devices, too
+        about = {}
     for name in chain.frame_names if cameras else ():
         frame = chain.frame(name)
         place = ' '.join(f'{x:.6f}' for x in frame.matrix[:3, 3].tolist())
         turn = ' '.join(f'{x:.6f}' for x in to_quat(frame.matrix[:3, :3]).tolist())
-        lines.append(f'{name}: xyz {place} m, quaternion xyzw {turn}')
+        lines.append(f'{name}{about.get(name, "")}: xyz {place} m, quaternion xyzw {turn}')
         if frame.lens is not None and not frame.lens.fixed:
             values = ', '.join(f'{kind} {x:.6g}' for kind, x in frame.lens.values.items())
             lines.append(f'{name}: {values}')

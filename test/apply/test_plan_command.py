@@ -107,11 +107,11 @@ def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
         'plan', '--chain', 'ur10e', '--accuracy', 0.1, '--out', 'plan.csv', '--draw', 200
     )
     count = len(read_joints(tmp_path / 'plan.csv', load_chain('ur10e')))
-    assert f'0.1 mm: {count} poses' in out
+    assert f'{count} poses reach 0.1 mm' in out
     assert 18 <= count <= 26
     _, out, _ = run('plan', '--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 200)
-    assert f'0.1 mm: {count} poses' in out
-    assert out.splitlines()[-5].split()[0] == '10'
+    assert f'{count} poses reach 0.1 mm' in out
+    assert out.splitlines()[-4].split()[0] == '10'
 
 
 def test_plan_with_too_few_poses_says_so(run):

@@ -267,11 +267,13 @@ def test_limits_hold_where_some_places_are_worse_than_others():
 
 
 def test_a_session_is_judged_without_a_tolerance(arm, cell):
-    found = verify(arm, [measured(cell[0], UR.random_joints(10, np.random.default_rng(0)))], None)
-    assert (found.verdict, found.needed, found.tolerance) == ('JUDGED', None, None)
-    words = in_words(found)
-    assert 'wanted is' not in words
-    assert '\nthe RMS error over poses like these is below 0.' in words
+    seen = [measured(cell[0], UR.random_joints(10, np.random.default_rng(0)))]
+    found = verify(arm, seen, None)
+    assert (found.verdict, found.needed, found.tolerance) == ('holds', None, None)
+    verdicts = [verify(replace(arm, residual=x), seen, None).verdict for x in (1e-6, None)]
+    assert verdicts == ['does not hold', 'no verdict']
+    assert 'wanted is' not in in_words(found)
+    assert '\nthe RMS error over poses like these is below 0.' in in_words(found)
 
 
 def test_measurements_that_were_fitted_prove_nothing(cell, arm, folder, capsys):
@@ -356,7 +358,7 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
             assert main([*judge, calibration, '--tolerance', tolerance]) == status
             out = capsys.readouterr().out
             assert out.startswith(f'{word}: ')
-            assert 'RMS over poses like these is above 0.' in out
+            assert 'mm over poses like these' in out
             assert 'about the calibration' not in out
             assert '15 times at 5 poses' in out
             assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5

@@ -233,7 +233,7 @@ def test_a_program_that_the_calibration_does_not_know_is_told(rng):
         seen = simulation.measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4, oriented)
         arm = Calibration.of(identify(Problem(UR, seen)))
         words, warning = arm.knowledge(UR.random_joints(5, rng), np.full(5, 1e-3))
-        assert words.startswith('sigma of the calibration at these poses: 0.')
+        assert words.startswith('the calibration knows these poses to 0.')
         assert ('does not know the orientation' in warning) is not known
     alone = replace(arm, names=(), covariance=None)
     assert alone.knowledge(UR.random_joints(5, rng), np.full(5, 1e-3)) == ('', '')

@@ -14,6 +14,7 @@ from calib_ros.apply import simulation
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.cli.results import RESULT_FILES
+from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
 
@@ -58,7 +59,13 @@ def assert_same_result(found, expected, tolerance):
 
 def test_json_is_one_document_with_all_the_keys(written):
     out, document = written
-    assert document == json.loads((out / 'result.json').read_text())
+    text = (out / 'result.json').read_text()
+    assert document == json.loads(text)
+    assert text.count('\n') < 200  # a row of the covariance on a line
+    found = load_calibration(out, UR)
+    lower = [x for row in document['covariance']['lower'] for x in row]
+    known = found.covariance[np.tril_indices(30)]
+    np.testing.assert_allclose(lower, known, rtol=1e-6, atol=1e-9 * np.max(known))
     assert document['accepted'] is True
     assert document['converged'] is True
     assert document['rank'] == 30
@@ -101,7 +108,7 @@ def test_a_result_is_a_verdict_and_six_rows(run, table):
     lines = out.splitlines()
     assert lines[0].startswith('accepted: ')
     assert [line[:20].strip() for line in lines[1:7]] == [
-        *('robot', 'poses', 'position error', 'orientation error', 'judged by', 'valid')
+        *('robot', 'fitted to', 'position error', 'orientation error', 'judged by', 'valid')
     ]
     assert f'{TEST} held-out poses' in lines[5]
     assert max(map(len, lines)) <= 80

@@ -33,7 +33,7 @@ def test_identify_and_verify_are_filed(folder, capsys):
     assert [main([*verify, '--tolerance', '0.5']), main(verify)] == [0, 0]
     rows = History('history').rows('0042')
     assert [row.kind for row in rows] == ['identify', 'verify', 'verify']
-    assert {row.verdict for row in rows} == {'accepted', 'PASS', 'JUDGED'}
+    assert {row.verdict for row in rows} == {'accepted', 'PASS', 'holds'}
     result = json.loads((folder / 'result/result.json').read_text())
     assert rows[0].rms_mm == result['validation']['after']['rms_mm']
     assert rows[0].time == plants.when(0)

@@ -91,7 +91,7 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     assert (second.robot.serial, second.state) == ('B', 'fine')
     for number, rms in enumerate((0.1, 0.1, 0.5)):
         errors = {'rms_mm': rms, 'rms_freedom': 30.0}
-        history.file(Row('B', 'verify', plants.when(number), 'JUDGED', str(number), 's', **errors))
+        history.file(Row('B', 'verify', plants.when(number), 'holds', str(number), 's', **errors))
     worst = standings(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)

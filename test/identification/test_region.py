@@ -62,6 +62,9 @@ def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
     assert found.region.whole
     assert found.region.covers(UR10E.random_joints(50, np.random.default_rng(1))).all()
     assert 'valid over the whole joint range' in summary(found)
+    for share, text in ((0.0, 'under 1'), (0.4, '40'), (0.999, '99')):
+        part = replace(found.region, limit=1e-3, share=share).in_words()
+        assert f'in {text} % of the joint range; elsewhere it may make the arm worse' in part
     assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
 
 
@@ -208,6 +211,6 @@ def test_programs_are_corrected_inside_the_region_only(local, folder):
         assert not result.refusals
         assert missed(result.joints, inside) < 0.2 * missed(inside, inside)
         result = compensate(compensator, np.concatenate([inside, outside]))
-        refused.append([each.sample for each in result.refusals if 'outside' in each.reason])
-        assert any('like 25 % of the program' in each.reason for each in result.refusals)
+        refused.append([each.sample for each in result.refusals if 'not valid' in each.reason])
+        assert any('not valid in 25 % of the program' in each.reason for each in result.refusals)
     assert refused == [list(range(15, 20))] * 2

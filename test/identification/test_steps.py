@@ -191,8 +191,7 @@ def test_without_stamps_the_order_of_the_rows_is_said():
     true, seen = session(3)
     result = identify(Problem(UR10E, moved(seen, true, 'tool', 8e-4), **SIGMAS))
     assert result.refusals[0].startswith(
-        'something moved at pose 27 (line 27, without stamps the order of the rows is taken): '
-        'the target (tool, 0.8'
+        'something moved at pose 27 (line 27; rows count in their order): the target (tool, 0.8'
     )
 
 

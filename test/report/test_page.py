@@ -237,7 +237,7 @@ def test_a_refused_page_says_why_and_what_to_do():
     page = page_of(report_of(problem, result))
     where = [
         page.text.index(words)
-        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy before')
+        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of what')
     ]
     assert where == sorted(where)
     for each in advice.advice(result.refusals):

@@ -29,7 +29,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
         assert ('does not hold any more: RMS 0.160 mm' in told[1]) != holds
 
 
-@pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'JUDGED'), (5e-3, 'LOST')])
+@pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])
 def test_a_calibration_that_is_lost_is_filed_as_lost(bumped, verdict):
     """Without a tolerance, too: a history tells no less than the screen."""
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
@@ -38,4 +38,4 @@ def test_a_calibration_that_is_lost_is_filed_as_lost(bumped, verdict):
     found = verify(Calibration(arm, arm, residual=1e-4), [seen], None)
     row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
     assert (row.verdict, row.accepted) == (verdict, False)
-    assert ('was the tracker' in in_words(found)) == (verdict == 'LOST')
+    assert ('was the tracker' in in_words(found)) == (verdict == 'does not hold')

@@ -36,7 +36,10 @@
     waiting.set(id, work);
     watcher.observe(place);
   }
-  window.addEventListener('beforeprint', () => [...waiting.keys()].forEach(draw));
+  window.addEventListener('beforeprint', () => {
+    [...waiting.keys()].forEach(draw);
+    document.querySelectorAll('details').forEach((each) => { each.open = true; });
+  });
   for (const [id, figure] of Object.entries(data.figures)) {
     later(id, () => {
       const layout = Object.assign(base(), figure.layout);
@@ -54,6 +57,7 @@
   const stamps = new BigInt64Array(unpacked(e.stamps)), count = stamps.length;
   const number = (i) => (e.number ? e.number[i] : i + 1);
   const source = (i) => {
+    if (e.images[i]) return e.images[i];
     const seconds = String(stamps[i] / 1000000000n);
     return e.lines ? 'line ' + seconds : `${seconds}.${String(stamps[i] % 1000000000n).padStart(9, '0')} s`;
   };
@@ -136,7 +140,7 @@
   });
   const dots = () => (e.cells
     ? { x: e.cells.position.map((p) => p[0]), y: e.cells.position.map((p) => p[1]), z: e.cells.position.map((p) => p[2]),
-        text: e.cells.count.map((c, i) => `${c} poses, RMS ${fixed(e.cells.rms_before[i])} mm before, ${fixed(e.cells.rms_after[i])} mm after`) }
+        text: e.cells.count.map((c, i) => `${c} ${e.things}, RMS ${fixed(e.cells.rms_before[i])} mm before, ${fixed(e.cells.rms_after[i])} mm after`) }
     : { ...at(good), text: good.map(words), customdata: good });
   const [POINTS, OUTLIERS, VECTORS, ARM, AXES, PICKED] = [0, 1, 2, 3, 4, 7];
 
@@ -145,11 +149,11 @@
     const [line, axes] = count ? arm(state.picked < 0 ? Math.floor(count / 2) : state.picked) : [none, [none, none, none]];
     const wide = { type: 'scatter3d', hoverinfo: 'skip', mode: 'lines', showlegend: false };
     const traces = [
-      { type: 'scatter3d', mode: 'markers', name: 'poses', ...dots(), hoverinfo: 'text',
+      { type: 'scatter3d', mode: 'markers', name: e.things, ...dots(), hoverinfo: 'text',
         marker: { size: e.cells ? 5 : 3.5, color: errors(), colorscale: 'Viridis', reversescale: true, cmin: 0, cmax: e.largest,
           colorbar: { title: { text: 'error [mm]' }, thickness: 12, len: 0.7 } } },
       { type: 'scatter3d', mode: 'markers', name: 'outliers', ...at(outliers), text: outliers.map((i) => 'outlier, ' + words(i)),
-        customdata: outliers, hoverinfo: 'text', marker: { size: 5, symbol: 'x', color: OUT } },
+        customdata: outliers, hoverinfo: 'text', marker: { size: 5, symbol: 'diamond', color: OUT } },
       { ...wide, ...vectors(), line: { color: '#6e7781', width: 2 }, name: 'errors' },
       { ...wide, ...line, mode: 'lines+markers', line: { color: '#333', width: 10 }, marker: { size: 5, color: '#333' } },
       ...axes.map((axis, k) => ({ ...wide, ...axis, line: { color: ['#c00', '#070', '#03c'][k], width: 4 } })),
@@ -196,7 +200,7 @@
 
   // The list
   const SIZE = 12;
-  const head = ['pose', 'from', 'used', 'before [mm]', 'after [mm]', ...(e.oriented ? ['before [mrad]', 'after [mrad]'] : []), 'times usual', ...e.joints];
+  const head = [e.things.slice(0, -1), 'from', 'used', 'before [mm]', 'after [mm]', ...(e.oriented ? ['before [mrad]', 'after [mrad]'] : []), 'times usual', ...e.joints];
   function cell(row, text, number = true) {
     const td = row.insertCell();
     td.textContent = text;
@@ -219,7 +223,7 @@
       const button = document.createElement('button');
       button.type = 'button';
       button.textContent = number(i);
-      button.setAttribute('aria-label', `Show pose ${number(i)} in the figure`);
+      button.setAttribute('aria-label', `Show ${e.things.slice(0, -1)} ${number(i)} in the figure`);
       button.addEventListener('click', () => { pick(i, true); byId('rows').querySelector('.picked button').focus(); });
       cell(row, '', false).append(button);
       cell(row, source(i), false);
@@ -280,7 +284,7 @@
   });
   function drawSession() {
     const layout = base();
-    layout.xaxis = { title: { text: 'pose in the order of measurement' } };
+    layout.xaxis = { title: { text: e.things + ' in the order of measurement' } };
     layout.yaxis = { title: { text: label() }, zeroline: true };
     Plotly.react('session', series(number, 'session', {}), layout, plain).then(() => byId('session').removeAllListeners && (byId('session').removeAllListeners('plotly_click'), clicks('session')));
   }

@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is told of images of a board is told in images, corners and lines of the user's tables."""
+
+import json
+
+import numpy as np
+import pytest
+from pages import Page
+
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
+from calib_ros.cli.main import main
+from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.files.waypoints import csv_of
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.texts import csv_text, dump_yaml
+
+UR, CAMERA = load_chain('ur10e'), Camera()
+POINTS = np.array([(0.03 * i, 0.03 * j, 0.0) for j in range(1, 5) for i in range(1, 7)])
+SLIPPED = 13
+
+
+@pytest.fixture(scope='module')
+def photographs(tmp_path_factory):
+    """Return a folder with the tables of 30 images; in `slipped.csv` a joint lost its zero."""
+    folder, rng = tmp_path_factory.mktemp('camera'), np.random.default_rng(5)
+    true = before_camera(faulty(UR, Cell(), rng), CAMERA, POINTS, True, rng)
+    seen = photograph(true, CAMERA, POINTS, True, 30, rng, noise=0.1)
+    board = {'type': 'charuco', 'columns': 7, 'rows': 5, 'square': 0.03, 'marker': 0.022}
+    (folder / 'board.yaml').write_text(dump_yaml(board | {'dictionary': 'DICT_5X5_250'}))
+    fx, fy, cx, cy, *bent = CAMERA.lens.values.values()
+    lens = {'k': [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], 'd': bent}
+    (folder / 'camera.yaml').write_text(dump_yaml(lens))
+    pairs = zip(seen.images.tolist(), seen.pixels.tolist(), strict=True)
+    rows = [(f'{image}.png', n % len(POINTS), u, v) for n, (image, (u, v)) in enumerate(pairs)]
+    (folder / 'corners.csv').write_text(csv_text([('image', 'corner', 'u', 'v'), *rows]))
+    names = [f'{image}.png' for image in range(30)]
+    joints = seen.joints[:: len(POINTS)].copy()
+    for name in ('places', 'slipped'):
+        table = csv_of([f'q{k}' for k in range(1, 7)], joints).splitlines()
+        lines = [f'{a},{b}' for a, b in zip(['image', *names], table, strict=True)]
+        (folder / f'{name}.csv').write_text('\n'.join(lines))
+        joints[SLIPPED:, 2] += 3e-3
+    return folder
+
+
+@pytest.fixture
+def identified(photographs, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(photographs)
+
+    def identified(places):
+        words = ['identify', '--chain', 'ur10e', '--eye-in-hand', '--sigma-pixel', '0.1']
+        words += ['--detections', 'corners.csv', '--board', 'board.yaml', '--places', places]
+        status = main([*words, '--intrinsics', 'camera.yaml', '--out', str(tmp_path / 'out')])
+        return status, ' '.join(capsys.readouterr().out.split()), tmp_path / 'out'
+
+    return identified
+
+
+def test_a_result_counts_images_and_corners(identified):
+    status, told, out = identified('places.csv')
+    assert status == 0
+    assert 'fitted to 30 images with 720 corners position error' in told
+    page = Page((out / 'report.html').read_text())
+    for text in ('Corners one by one', 'How many corners are within', 'Corners 720'):
+        assert text in page.text
+    assert page.data['explorer']['images'][24] == '1.png'
+    assert page.data['explorer']['things'] == 'corners'
+
+
+def test_a_slip_is_told_by_its_image_and_line(identified):
+    status, told, out = identified('slipped.csv')
+    assert status == NOT_ACCEPTED
+    line = 2 + SLIPPED * len(POINTS)
+    assert f'something moved at image {SLIPPED + 1} (line {line}; ' in told
+    assert json.loads((out / 'result.json').read_text())['step']['image'] == SLIPPED
+    assert '1. Measure more poses' not in told  # which would not help
+    rows = (out / 'residuals.csv').read_text().splitlines()
+    assert rows[0].startswith('line,')
+    assert rows[len(POINTS)].startswith('2,')
+    assert rows[len(POINTS) + 1].startswith(f'{2 + len(POINTS)},')
