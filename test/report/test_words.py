@@ -30,7 +30,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])
-def test_a_calibration_that_is_lost_is_filed_as_lost(bumped, verdict):
+def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     """Without a tolerance, too: a history tells no less than the screen."""
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
     seen = measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4)
