@@ -139,6 +139,30 @@ def test_a_device_with_a_scale_does_not_calibrate_a_healthy_arm(name):
     assert as_document(found, {})['region'] is None
 
 
+def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
+    """The ellipsoids hold 95 % of the positions, also where the prior alone tells the errors."""
+    held, ratios = [], []
+    for seed in range(18):
+        rng = np.random.default_rng(seed)
+        q = UR10E.random_joints(20, rng)
+        q[:, 1 + seed % 4] = HOME[1 + seed % 4] + rng.uniform(-3e-3, 3e-3, len(q))
+        true = arm(seed)
+        found = identified(true, q, seed)
+        other = UR10E.random_joints(300, rng)
+        used = other[found.region.covers(other)]
+        if not len(used):
+            continue
+        error = (found.chain.forward(used) - true.forward(used))[:, :3, 3]
+        axes = found.confidence_ellipsoid(used)
+        along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
+        held.append(((along**2).sum(axis=1) <= 1.0).mean())
+        ratios.append((error**2).sum(axis=1).mean() / (found.region.sigma(used) ** 2).mean())
+    assert len(held) > 12
+    print(np.mean(held), np.mean(ratios))
+    assert np.mean(held) > 0.9
+    assert np.mean(ratios) < 1.25
+
+
 def test_the_region_is_kept_with_the_calibration(local, folder):
     q = UR10E.random_joints(400, np.random.default_rng(3))
     covered = local.region.covers(q)
