@@ -30,9 +30,9 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
-from calib_ros.identification.evidence import SPREAD
 from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -37,10 +37,11 @@ from calib_ros.identification.changes import (
     reasons_document,
     reasons_of,
 )
-from calib_ros.identification.evidence import TYPICAL, group_of
+from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.sizes import TYPICAL
 from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -20,6 +20,10 @@ others, as of a motor that was put in wrongly: the prior has the tails of Studen
 degrees of freedom, as a normal one with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 +
 V_ii) / s^2).
 
+Where an arm is judged, variances are means over all that is not known: over w, whose inverse has
+the mean (TAILS + (x^2 + V_ii) / s^2) / (TAILS - 1), so that a parameter of which the data tell
+nothing has the variance of Student's t, TAILS / (TAILS - 2) s^2; and over the sizes.
+
 Effects that a model leaves out are *considered*: they are columns of the same posterior with sizes
 of their own, so that the arm as it may be, effects included, can be held against the one that was
 fitted (`region.py`; Schmidt 1966 has the idea). So is the scale of the measuring device, which
@@ -34,34 +38,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy import linalg, special
-from scipy.linalg import lapack
+from scipy import linalg
 
 from calib_ros.identification.considered import told_of
 from calib_ros.identification.leastsquares import Normal, System
-from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.sizes import TYPICAL, Evidence, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
-
-TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'coupling': 1e-3}
-TYPICAL |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
-"""Size [m, rad] of the errors that arms have, by group."""
-SPREAD = 10.0
-"""Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
-benchmarks/harm.py)."""
-TAILS = 3.0
-"""Degrees of freedom of the prior (benchmarks/harm.py)."""
-SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
-"""Logarithms of the ratio of probabilities beyond which effects show, and from which those of
-usual size are refuted."""
-SETTLED = 0.02
-"""Change of the logarithm of a size from which on it stands still."""
-LEAST_SIZE = SPREAD**-3
-"""Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 
 
 def group_of(chain: Chain, name: str) -> str | None:
@@ -92,7 +79,8 @@ class Posterior(Shown):
     shift : (P,)
         The posterior mean less the fitted parameters.
     covariance : (P, P)
-        Of the posterior, for the device that measured.
+        Of the posterior, for the device that measured; where it is judged, over all sizes that may
+        as well be.
     device : (P, K)
         Its product with itself is what the smooth errors of that device add to the covariance.
     priors : mapping of str to float
@@ -181,155 +169,29 @@ def posterior_of(
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
     told = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
-    matrix, vector = told[:-1, :-1], told[:-1, :-1] @ offsets + told[:-1, -1]
+    alone, matrix = plain[:-1, :-1], told[:-1, :-1]
+    vector = matrix @ offsets + told[:-1, -1]
     groups = [None if n in known else group_of(chain, n) for n in every]
     given = np.array([known.get(n, np.inf) for n in every]) ** -2
-    evidence = _Evidence(matrix, vector, given, groups)
+    evidence = Evidence(matrix, vector, given, groups)
     size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     near = evidence.near(size, slope) if judging else ()
-    stds = evidence.stds(size)
-    priors = {name: std for name, std in zip(every, stds.tolist(), strict=True) if std < np.inf}
-    mean, root = _solved(plain[:-1, :-1], plain[:-1, :-1] @ offsets + plain[:-1, -1], stds**-2)
-    covariance = root @ root.T
-    along = covariance @ cross[:-1]
+    known_by = zip(every, evidence.precision(size).tolist(), strict=True)
+    priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
+    if judging:
+        evidence.widen(size)
+    weights = [weight for weight, _ in near] or [1.0]
+    precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
+    own = [solved(alone, alone @ offsets + plain[:-1, -1], each) for each in precisions]
+    mean = np.average([each for each, _ in own], axis=0, weights=weights)
+    covariance = np.average([root @ root.T for _, root in own], axis=0, weights=weights)
+    covariance += np.cov([each for each, _ in own], rowvar=False, ddof=0, aweights=weights)
+    root = solved(alone, vector, evidence.precision(size))[1]
+    along = root @ (root.T @ cross[:-1])
     left, axes = np.linalg.eigh(doubtful - cross[:-1].T @ along)
     device = along @ axes / np.sqrt(np.maximum(left, 1.0))  # it is 1 and more but for rounding
-    solved = [(w, *_solved(matrix, vector, evidence.stds(other) ** -2)) for w, other in near]
-    doubted = tuple((w, there, its @ its.T) for w, there, its in solved)
+    wider = [solved(matrix, vector, each) for each in precisions if near]
+    parts = zip(weights, wider, strict=False)
+    doubted = tuple((w, there, its @ its.T) for w, (there, its) in parts)
     shift, sizes = mean - offsets, evidence.named(size)
     return Posterior(chain, every, offsets, shift, covariance, device, priors, sizes, doubted)
-
-
-def _solved(
-    matrix: FloatArray, vector: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean (P,) and a root (P, P) of the covariance."""
-    scaled, scale = _scaled(matrix, precision)
-    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
-    if failed:
-        raise np.linalg.LinAlgError('singular posterior')
-    inverse = lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
-    inverse *= scale
-    return inverse.T @ (inverse @ vector), inverse.T
-
-
-def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return matrices (..., P, P) of unit diagonal with precisions (..., P) added, and scales."""
-    size = np.arange(len(matrix))
-    diagonal = matrix[size, size] + precision
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
-    scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
-    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # which cannot make it singular
-    return scaled, scale
-
-
-class _Evidence:
-    """How probable sizes of the errors make the data."""
-
-    def __init__(
-        self,
-        matrix: FloatArray,
-        vector: FloatArray,
-        given: FloatArray,
-        groups: Sequence[str | None],
-    ) -> None:
-        self._matrix, self._vector, self._given = matrix, vector, given
-        self._names = [*dict.fromkeys(group for group in groups if group is not None)]
-        rows = [[group == name for group in groups] for name in self._names]
-        self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
-        self._typical = np.log([TYPICAL[name] for name in self._names])
-        self._own = np.array([group in ('length', 'angle') for group in groups])
-        self._tails = np.ones(len(groups))
-
-    def told(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
-        """Return the logarithm of the size of each group (G,), and the curvature (G,) there.
-
-        Effects that are only considered are of no size where the data would show the usual ones,
-        and do not show any.
-        """
-        size, width = self._typical.copy(), np.log(SPREAD) ** -2
-        if self._own.sum() == self._member.sum():
-            free = self._given + self._weight(size - np.log(LEAST_SIZE)).sum(axis=0)
-            mean, root = _solved(self._matrix, self._vector, free)
-            surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt((root**2).sum(axis=1)), 0.0)
-            self._lengthen(surely**2, 1.0, size)
-        for _ in range(ROUNDS):
-            weight = self._weight(size)
-            mean, root = _solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
-            variance = (root**2).sum(axis=1)
-            told = (self._member - weight * variance).sum(axis=1)
-            slope = weight @ mean**2 - told - width * (size - self._typical)
-            step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
-            size = self._within(size + step)
-            self._lengthen(mean**2 + variance, 0.0, size)
-            if np.abs(step).max(initial=0.0) < SETTLED:
-                break
-        for k, name in enumerate(self._names):
-            if name in considered:
-                tried = np.tile(size, (3, 1))
-                tried[1:, k] = self._typical[k] + np.log(LEAST_SIZE), self._typical[k]
-                here, without, usual = self._of(tried).tolist()
-                if not here - without > SHOWN and without - usual > REFUTED:
-                    size = tried[1]
-        return size, 2.0 * np.maximum(told, 0.0) + width
-
-    def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
-        """Return sizes that may as well be, with their weights, by the curvature (G,) there.
-
-        One group differs at a time, up and down, by as much as makes means right to the second
-        order (the unscented transform, Julier and Uhlmann 1997); the evidence weighs both. What
-        is of no size stays so.
-        """
-        some = np.flatnonzero(size > self._typical + np.log(LEAST_SIZE))
-        if not len(some):
-            return [(1.0, size)]
-        steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
-        tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
-        told = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
-            axis=1
-        )
-        upper = special.expit(told[::2] - told[1::2])
-        weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
-        return list(zip(weights.tolist(), tried, strict=True))
-
-    def _within(self, size: FloatArray) -> FloatArray:
-        """Return sizes (G,) no further from the typical ones than any that are looked for."""
-        return self._typical + np.clip(
-            size - self._typical, np.log(LEAST_SIZE), -np.log(LEAST_SIZE)
-        )
-
-    def stds(self, size: FloatArray) -> FloatArray:
-        """Return the standard deviation (P,) of each parameter for sizes (G,), by logarithms."""
-        precision = self._given + self._weight(size).sum(axis=0)
-        with np.errstate(divide='ignore'):
-            return np.asarray(1.0 / np.sqrt(precision))
-
-    def named(self, size: FloatArray) -> dict[str, float]:
-        """Return the size [m, rad] of each group, given by their logarithms (G,)."""
-        return dict(zip(self._names, np.exp(size).tolist(), strict=True))
-
-    def _lengthen(self, squares: FloatArray, more: float, size: FloatArray) -> None:
-        """Give offsets of expected squares (P,), larger by `more` sizes, the tails of the prior.
-
-        Effects have none: what a drive does is a matter of its make.
-        """
-        far = self._member.T @ np.exp(-2.0 * size) * squares + more
-        self._tails = np.where(self._own, (TAILS + 1.0) / (TAILS + far), 1.0)
-
-    def _weight(self, size: FloatArray) -> FloatArray:
-        """Return (G, P) the inverse variances of the parameters of each group."""
-        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
-
-    def _of(self, sizes: FloatArray) -> FloatArray:
-        """Return the logarithm of the evidence of sizes (S, G), given by their logarithms."""
-        weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
-        scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
-        # the last row of the factor of [A b; b^T c] is L^-1 b
-        wide = np.zeros((len(sizes), scaled.shape[1] + 1, scaled.shape[1] + 1))
-        wide[:, :-1, :-1] = scaled
-        wide[:, -1, :-1] = scale * self._vector
-        wide[:, -1, -1] = 1e300  # more than any square
-        factor = np.linalg.cholesky(wide)
-        volume = 2.0 * np.log(scale / np.einsum('spp->sp', factor)[:, :-1]).sum(axis=1)
-        fit = (factor[:, -1, :-1] ** 2).sum(axis=1)
-        return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))

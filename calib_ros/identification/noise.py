@@ -24,8 +24,9 @@ from calib_ros.kinematics.se3 import FloatArray
 class Noise:
     """Size of the residuals in units of the sigma given, for position and orientation.
 
-    `consistent` tells whether a chi-squared test lets the sigmas pass; then they are taken as they
-    are for the standard deviations, else those found.
+    `consistent` tells whether a chi-squared test lets the sigmas pass. Then standard deviations
+    are those of the larger, the sigmas given or found, for a test of few residuals would let
+    through too small ones, and either of them may be right; else those of the sigmas found.
 
     `successive` and `near` are the correlations of the residuals of configurations that follow
     each other and that are near each other in joint space; `shared` names which of them a test
@@ -76,14 +77,16 @@ def noise_of(
         neighbours.found,
     )
     together = joint_sums / np.maximum(sums, 1e-300)
-    sizes = np.where(together > SUSPICIOUS, together, 1.0) * (1.0 if consistent else variances)
+    alone = np.maximum(variances, 1.0) if consistent else variances
+    sizes = np.where(together > SUSPICIOUS, together, 1.0) * alone
     middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
     extra, _ = system.extra_rows(fit.chain, names)
     if system.prior is not None:
         extra[: len(names)] *= system.prior.noise
     alike = neighbours.middles
     estimated = np.array([not consistent or sizes[k] != 1.0 or k in alike for k in (0, 1)])
-    freedom = np.maximum(np.minimum(counts, joint_counts) - taken, 1.0)
+    seen = np.where(together > SUSPICIOUS, joint_counts, counts)
+    freedom = np.maximum(seen - taken, 1.0)
     freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
     if not estimated.any():
         return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))

@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from calib_ros.identification.evidence import TYPICAL, group_of
+from calib_ros.identification.evidence import group_of
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.sizes import TYPICAL
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray

@@ -28,13 +28,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import special
 
-from calib_ros.identification.evidence import SPREAD, TYPICAL
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
 from calib_ros.identification.levels import NEARER, SCALE, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import SUSPICIOUS
+from calib_ros.identification.sizes import SPREAD, TYPICAL
 from calib_ros.identification.start import likened
 from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects

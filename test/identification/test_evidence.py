@@ -8,11 +8,11 @@ from fits import NO_PRIOR, UR10E, arm, rms
 
 from calib_ros.apply.simulation import measure
 from calib_ros.identification.considered import considered
-from calib_ros.identification.evidence import TYPICAL
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
+from calib_ros.identification.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import UR10E, fitted, measured_arm, worst_prediction
+from fits import NO_PRIOR, UR10E, fitted, measured_arm, worst_prediction
 from hypothesis import given, settings, strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -257,3 +257,16 @@ def test_standard_deviations_follow_the_noise_that_is_there(position, orientatio
         assert not result.noise.consistent
         scores += scores_of(result, true)
     assert np.std(scores) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize('factor', [1.0, 1.5])
+def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given(factor):
+    """No test of so few residuals would find the sigmas wrong."""
+    inside = []
+    for seed in range(30):
+        _, true, seen = measured_arm(seed, 9, (factor * 1e-4, factor * 1e-4 / 0.3))
+        rows = fitted(Problem(UR10E, seen, priors=NO_PRIOR)).parameters
+        inside += [
+            abs(row.value - true.value(row.name)) < row.half_width() for row in rows if row.std
+        ]
+    assert np.mean(inside) > 0.935

@@ -95,13 +95,19 @@ def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
     assert row.offset == pytest.approx(0.0, abs=1e-6)
     assert result.rank == plain.rank + 1
     assert 'wrist_3_joint.d' not in result.gauges
-    # the poses do not know of it: predictions and their uncertainty stay as they are
+    # the poses do not know of it: predictions and their uncertainty stay as they are, but for the
+    # size of the noise, which is the median over one parameter more
     unseen = UR10E.random_joints(50, rng)
     np.testing.assert_allclose(
         result.chain.forward(unseen), plain.chain.forward(unseen), rtol=0, atol=1e-8
     )
+    sizes = [(each.noise.size / each.noise.position) ** 2 for each in (result, plain)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
     np.testing.assert_allclose(
-        result.pose_covariance(unseen), plain.pose_covariance(unseen), rtol=0, atol=1e-13
+        result.pose_covariance(unseen) / result.noise.size**2,
+        plain.pose_covariance(unseen) / plain.noise.size**2,
+        rtol=0,
+        atol=1e-13,
     )
 
 

@@ -91,11 +91,14 @@ def test_a_coupling_that_hardly_shows_near_a_posture_is_not_fitted_for_elsewhere
     name = 'wrist_3_joint.coupling_wrist_2_joint'
     true = arm(seed, 0.1).with_effects([name]).with_offsets({name: -1e-2})
     rng = np.random.default_rng(seed)
-    found = identified(true, rng.uniform(-1.5, 1.5, 6) + rng.uniform(-0.4, 0.4, (60, 6)))
+    posture = rng.uniform(-1.5, 1.5, 6)
+    found = identified(true, posture + rng.uniform(-0.4, 0.4, (60, 6)))
     assert found.accepted
-    other = np.random.default_rng(3).uniform(-2.5, 2.5, (2000, 6))
-    used = other[found.region.covers(other)]
-    assert len(used) > 200
+    rng = np.random.default_rng(3)
+    other = [rng.uniform(-2.5, 2.5, (2000, 6)), posture + rng.uniform(-0.8, 0.8, (500, 6))]
+    used, near = (each[found.region.covers(each)] for each in other)
+    assert len(near) > 200
+    used = np.concatenate([used, near])
     assert rms(found.chain, true, used) < rms(found.before, true, used)
 
 
@@ -140,6 +143,30 @@ def test_a_device_with_a_scale_does_not_calibrate_a_healthy_arm(name):
     assert not found.accepted
     assert found.region is None
     assert as_document(found, {})['region'] is None
+
+
+def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
+    """The ellipsoids hold 95 % of the positions, also where the prior alone tells the errors."""
+    held, ratios = [], []
+    for seed in range(18):
+        rng = np.random.default_rng(seed)
+        q = UR10E.random_joints(20, rng)
+        q[:, 1 + seed % 4] = HOME[1 + seed % 4] + rng.uniform(-3e-3, 3e-3, len(q))
+        true = arm(seed)
+        found = identified(true, q, seed)
+        other = UR10E.random_joints(300, rng)
+        used = other[found.region.covers(other)]
+        if not len(used):
+            continue
+        error = (found.chain.forward(used) - true.forward(used))[:, :3, 3]
+        axes = found.confidence_ellipsoid(used)
+        along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
+        held.append(((along**2).sum(axis=1) <= 1.0).mean())
+        ratios.append((error**2).sum(axis=1).mean() / (found.region.sigma(used) ** 2).mean())
+    assert len(held) > 12
+    print(np.mean(held), np.mean(ratios))
+    assert np.mean(held) > 0.9
+    assert np.mean(ratios) < 1.25
 
 
 def test_the_region_is_kept_with_the_calibration(local, folder):

@@ -62,11 +62,11 @@ def test_independent_errors_stay_independent(order):
     """At 99 %: of 30 sessions with nothing shared three are said to share once in 300 times."""
     found = [run(seed, 48, order)[1] for seed in range(30)]
     assert sum(bool(result.noise.shared) for result in found) <= 2
-    # and then standard deviations are those of the Cramer-Rao bound
+    # and then standard deviations are those of the Cramer-Rao bound, by the noise given or found
     quiet = [result for result in found if not result.noise.shared and result.noise.consistent]
     assert len(quiet) > 25
     assert all(result.noise.widened == 1.0 for result in quiet)
-    assert all(np.isinf(p.freedom) for result in quiet for p in result.parameters if p.std)
+    assert all(p.freedom > 100 for result in quiet for p in result.parameters if p.std)
 
 
 def test_intervals_hold_the_truth_though_the_tracker_drifts():

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How large errors of one kind are: the sizes that make the data most probable (`evidence.py`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+from scipy.linalg import lapack
+
+from calib_ros.identification.levels import CONFIDENT
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'coupling': 1e-3}
+TYPICAL |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
+"""Size [m, rad] of the errors that arms have, by group."""
+SPREAD = 10.0
+"""Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
+benchmarks/harm.py)."""
+TAILS = 3.0
+"""Degrees of freedom of the prior (benchmarks/harm.py)."""
+SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
+"""Logarithms of the ratio of probabilities beyond which effects show, and from which those of
+usual size are refuted."""
+SETTLED = 0.02
+"""Change of the logarithm of a size from which on it stands still."""
+LEAST_SIZE = SPREAD**-3
+"""Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
+
+
+def solved(
+    matrix: FloatArray, vector: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (P,) and a root (P, P) of the covariance."""
+    scaled, scale = _scaled(matrix, precision)
+    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError('singular posterior')
+    inverse = lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
+    inverse *= scale
+    return inverse.T @ (inverse @ vector), inverse.T
+
+
+def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return matrices (..., P, P) of unit diagonal with precisions (..., P) added, and scales."""
+    size = np.arange(len(matrix))
+    diagonal = matrix[size, size] + precision
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
+    scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
+    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # which cannot make it singular
+    return scaled, scale
+
+
+class Evidence:
+    """How probable sizes of the errors make the data."""
+
+    def __init__(
+        self,
+        matrix: FloatArray,
+        vector: FloatArray,
+        given: FloatArray,
+        groups: Sequence[str | None],
+    ) -> None:
+        self._matrix, self._vector, self._given = matrix, vector, given
+        self._names = [*dict.fromkeys(group for group in groups if group is not None)]
+        rows = [[group == name for group in groups] for name in self._names]
+        self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
+        self._typical = np.log([TYPICAL[name] for name in self._names])
+        self._own = np.array([group in ('length', 'angle') for group in groups])
+        self._tails = np.ones(len(groups))
+
+    def told(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
+        """Return the logarithm of the size of each group (G,), and the curvature (G,) there.
+
+        Effects that are only considered are of no size where the data would show the usual ones,
+        and do not show any.
+        """
+        size, width = self._typical.copy(), np.log(SPREAD) ** -2
+        if self._own.sum() == self._member.sum():
+            mean, variance = self._means(size - np.log(LEAST_SIZE))
+            surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt(variance), 0.0)
+            self._lengthen(surely**2, 1.0, size)
+        for _ in range(ROUNDS):
+            weight = self._weight(size)
+            mean, variance = self._means(size)
+            told = (self._member - weight * variance).sum(axis=1)
+            slope = weight @ mean**2 - told - width * (size - self._typical)
+            step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
+            size = self._within(size + step)
+            self._lengthen(mean**2 + variance, 0.0, size)
+            if np.abs(step).max(initial=0.0) < SETTLED:
+                break
+        for k, name in enumerate(self._names):
+            if name in considered:
+                tried = np.tile(size, (3, 1))
+                tried[1:, k] = self._typical[k] + np.log(LEAST_SIZE), self._typical[k]
+                here, without, usual = self._of(tried).tolist()
+                if not here - without > SHOWN and without - usual > REFUTED:
+                    size = tried[1]
+        return size, 2.0 * np.maximum(told, 0.0) + width
+
+    def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
+        """Return sizes that may as well be, with their weights, by the curvature (G,) there.
+
+        One group differs at a time, up and down, by as much as makes means right to the second
+        order (the unscented transform, Julier and Uhlmann 1997); the evidence weighs both. What
+        is of no size stays so.
+        """
+        some = np.flatnonzero(size > self._typical + np.log(LEAST_SIZE))
+        if not len(some):
+            return [(1.0, size)]
+        steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
+        tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
+        told = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
+            axis=1
+        )
+        upper = special.expit(told[::2] - told[1::2])
+        weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
+        return list(zip(weights.tolist(), tried, strict=True))
+
+    def _within(self, size: FloatArray) -> FloatArray:
+        """Return sizes (G,) no further from the typical ones than any that are looked for."""
+        return self._typical + np.clip(
+            size - self._typical, np.log(LEAST_SIZE), -np.log(LEAST_SIZE)
+        )
+
+    def widen(self, size: FloatArray) -> None:
+        """Give offsets the variances that the prior's tails have in the mean, for sizes (G,)."""
+        for _ in range(ROUNDS):
+            mean, variance = self._means(size)
+            last = self._tails
+            self._lengthen(mean**2 + variance, 0.0, size, TAILS - 1.0)
+            if np.abs(np.log(self._tails / last)).max(initial=0.0) < SETTLED:
+                break
+
+    def _means(self, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return means and variances (P,) for sizes (G,), by logarithms."""
+        mean, root = solved(self._matrix, self._vector, self.precision(size))
+        return mean, (root**2).sum(axis=1)
+
+    def precision(self, size: FloatArray) -> FloatArray:
+        """Return what the priors of the parameters (P,) tell for sizes (G,), by logarithms."""
+        return np.asarray(self._given + self._weight(size).sum(axis=0))
+
+    def named(self, size: FloatArray) -> dict[str, float]:
+        """Return the size [m, rad] of each group, given by their logarithms (G,)."""
+        return dict(zip(self._names, np.exp(size).tolist(), strict=True))
+
+    def _lengthen(
+        self, squares: FloatArray, more: float, size: FloatArray, freedom: float = TAILS + 1.0
+    ) -> None:
+        """Give offsets of expected squares (P,), larger by `more` sizes, the tails of the prior.
+
+        Effects have none: what a drive does is a matter of its make.
+        """
+        far = self._member.T @ np.exp(-2.0 * size) * squares + more
+        self._tails = np.where(self._own, freedom / (TAILS + far), 1.0)
+
+    def _weight(self, size: FloatArray) -> FloatArray:
+        """Return (G, P) the inverse variances of the parameters of each group."""
+        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
+
+    def _of(self, sizes: FloatArray) -> FloatArray:
+        """Return the logarithm of the evidence of sizes (S, G), given by their logarithms."""
+        weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
+        scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
+        # the last row of the factor of [A b; b^T c] is L^-1 b
+        wide = np.zeros((len(sizes), scaled.shape[1] + 1, scaled.shape[1] + 1))
+        wide[:, :-1, :-1] = scaled
+        wide[:, -1, :-1] = scale * self._vector
+        wide[:, -1, -1] = 1e300  # more than any square
+        factor = np.linalg.cholesky(wide)
+        volume = 2.0 * np.log(scale / np.einsum('spp->sp', factor)[:, :-1]).sum(axis=1)
+        fit = (factor[:, -1, :-1] ** 2).sum(axis=1)
+        return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))
