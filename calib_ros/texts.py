@@ -73,7 +73,9 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
     try:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as err:
-        raise error(f'{where} is no text in UTF-8: is it the right file?') from err
+        raise error(
+            f'{where} is no text in UTF-8: save it as UTF-8, or is it another file?'
+        ) from err
 
 
 def csv_lines(text: str, where: str) -> io.StringIO:

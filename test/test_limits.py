@@ -300,6 +300,24 @@ def test_too_many_devices_are_refused(tmp_path):
         read_table(path, 2)
 
 
+@pytest.mark.parametrize(
+    ('content', 'said'),
+    [
+        ('q1,x,y,z\n0,1,2,3\n'.encode('utf-16'), 'no text in UTF-8, line 1 has zero bytes'),
+        ('q1,é\n0,1\n'.encode('latin-1'), 'no text in UTF-8: save it as UTF-8'),
+        (
+            b'q1,x,y,z\n0,1,2,3\n' + bytes(5000),
+            'line 3 has zero bytes: .* Save it as UTF-8$',
+        ),
+        (b'q1,x,y,z\n0,1,2,3\n"0,1,2,3\n0,1,2,3\n', 'from line 3: .* quotation marks in pairs'),
+    ],
+)
+def test_a_table_that_is_no_text_is_refused_with_what_to_do(tmp_path, content, said):
+    (tmp_path / 'table.csv').write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        read_table(tmp_path / 'table.csv', 1)
+
+
 def test_a_pipe_with_nobody_at_its_other_end_is_refused(tmp_path):
     for name in ('table.csv', 'chain.yaml'):
         os.mkfifo(tmp_path / name)

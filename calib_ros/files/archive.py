@@ -42,7 +42,6 @@ class Archive:
         self._configuration = configuration
         self._journal: Journal | None = None
         self._waiting: list[tuple[Sample, bool]] = []
-        self._path = self._new_path(JOURNAL)
         self._due = False
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -53,6 +52,7 @@ class Archive:
                 f'poses cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
                 'in which files can be written'
             ) from err
+        self._path = self._new_path(JOURNAL)
 
     @property
     def trouble(self) -> str:
@@ -188,15 +188,22 @@ class Archive:
         return words
 
     def _new_path(self, ending: str) -> Path:
-        moment = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S%fZ')
-        return self.folder / f'{self._robot}_{moment}{ending}'
+        """Return a path that sorts behind all others, also where the clock was set back since."""
+        now = f'{datetime.now(timezone.utc):%Y%m%d%H%M%S%f}'
+        last = max((digits for digits, _, _ in self._dated()), default='0')
+        digits = max(now, f'{int(last) + 1:020}')
+        return self.folder / f'{self._robot}_{digits[:8]}T{digits[8:]}Z{ending}'
+
+    def _dated(self) -> list[tuple[str, str, Path]]:
+        """Return the digits of the times of this robot's files, their endings and paths."""
+        name = re.compile(rf'{re.escape(self._robot)}_([0-9]{{8}})T([0-9]{{12}})Z(.*)')
+        found = ((name.fullmatch(path.name), path) for path in self.folder.glob('*'))
+        return [(match[1] + match[2], match[3], path) for match, path in found if match]
 
     def _files(self, ending: str) -> list[Path]:
         """Return the files of this robot that hold anything, the oldest first."""
-        name = re.compile(rf'{re.escape(self._robot)}_\d{{8}}T\d{{12}}Z{re.escape(ending)}')
-        found = self.folder.glob(f'*{ending}')
-        mine = [path for path in found if name.fullmatch(path.name)]
-        return sorted(path for path in mine if path.stat().st_size)
+        mine = (path for _, ends, path in sorted(self._dated()) if ends == ending)
+        return [path for path in mine if path.stat().st_size]
 
 
 def _file_name(robot: str) -> str:

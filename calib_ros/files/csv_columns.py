@@ -143,6 +143,12 @@ def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> 
 
     `above` are lines of the file before it.
     """
+    if (place := data.find(b'\0')) >= 0:
+        line = above + 1 + data.count(b'\n', 0, place)
+        raise InputError(
+            f'{path} is no text in UTF-8, line {line} has zero bytes: is it damaged? Save it as '
+            'UTF-8'
+        )
     if not data.isascii():
         data = decoded(data, str(path), InputError).encode()
     found = regular(path, data, above=above)
@@ -222,13 +228,16 @@ def csv_rows(
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the lines at which rows of a text end, and their cells."""
     reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
+    line = 0
     try:
         for row in reader:
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
-            yield reader.line_num, row
+            yield (line := reader.line_num), row
     except csv.Error as err:
-        raise InputError(f'cannot read {path}: {err}') from err
+        raise InputError(
+            f'cannot read {path} from line {line + 1}: {err}: are its quotation marks in pairs?'
+        ) from err
 
 
 def refuse_separator(path: Path, header: Sequence[str]) -> None:

@@ -18,7 +18,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, trouble
 from calib_ros.ros.arguments import NODE, typed, usage
 
 
@@ -51,6 +51,9 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
         pass
     except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
         print(f'calibration_node: {err}', file=sys.stderr)
+        status = 1
+    except OSError as err:  # a journal of another user, say
+        print(f'calibration_node: {trouble(err)}', file=sys.stderr)
         status = 1
     finally:
         _handle_signals(signal.SIG_IGN)  # a second one must not interrupt the clean-up

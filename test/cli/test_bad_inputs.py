@@ -67,7 +67,7 @@ def bad_inputs():
         ('compare', 'good.csv', 'none'),
         'is a table, but compare takes',
     )
-    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no text in UTF-8: is it the'
+    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no text in UTF-8: save it'
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
     yield (
         'a result as a table',

@@ -68,6 +68,24 @@ def test_robots_with_similar_names_have_files_of_their_own(tmp_path):
     assert {'arm_12_3', 'arm_12%2F3', 'arm_ö'} < set(names)
 
 
+def test_the_newest_journal_is_resumed_when_the_clock_was_set_back(tmp_path):
+    """As that of a computer without a battery: what is written later sorts later all the same."""
+    archive = open_archive(tmp_path)
+    archive.add(sample(1))
+    archive.save('of the first night', 'settings: 1')
+    archive.close()
+    for path in tmp_path.glob('*Z.*'):
+        path.rename(tmp_path / f'arm_99901231T235959999999Z.{path.name.partition("Z.")[2]}')
+    archive = open_archive(tmp_path)
+    archive.add(sample(2))
+    archive.save('of the second night', 'settings: 2')
+    archive.begin_anew()
+    archive.add(sample(3))
+    archive.close()
+    assert stamps(tmp_path) == [3]
+    assert open_archive(tmp_path).newest_calibration().read_text() == 'of the second night'
+
+
 def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
     first = open_archive(tmp_path)
     first.add(sample(1))
