@@ -130,6 +130,11 @@ def table_of(
 def check_table(made: MadeColumns) -> None:
     """Refuse columns that no table may hold: of any sessions, for as many joints as there are."""
     joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.header)
+    if not joints:
+        raise InputError(
+            f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
+            'chain whose joints they are called like (--chain), or their own table (--joints)'
+        )
     table_of(made, joints, tuple(dict.fromkeys(made.words.get('session', ()))))
 
 

@@ -48,10 +48,10 @@ def summary(
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
     if result.outliers and numbers is None:
-        text += f'; {len(result.outliers)} outliers named in the report carry no weight'
+        text += f'; {_counted(result.outliers)} no weight, see the report'
     elif numbers is not None and result.outliers:
         named = _outliers_in_words(result.outliers, numbers)
-        text += f'; {len(result.outliers)} outliers carry no weight: {named}'
+        text += f'; {_counted(result.outliers)} no weight: {named}'
     if result.region is not None:
         text += f'; {result.region.in_words()}'
     text = '; '.join((text, *notes(result)))
@@ -94,6 +94,10 @@ def notes(result: Identification) -> list[str]:
     if weak:
         found.append(f'weakly determined: {", ".join(weak)}')
     return found
+
+
+def _counted(outliers: Sequence[Outlier]) -> str:
+    return '1 outlier carries' if len(outliers) == 1 else f'{len(outliers)} outliers carry'
 
 
 def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:

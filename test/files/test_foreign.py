@@ -327,6 +327,13 @@ def test_faults_are_named(read, text, layout, said):
         read(text, **layout)
 
 
+def test_a_table_without_joint_values_is_refused(tmp_path, capsys):
+    (tmp_path / 'cell.csv').write_text('x,y,z\n1,2,3\n')
+    given = ['import', str(tmp_path / 'cell.csv'), '--out', str(tmp_path / 'out.csv')]
+    assert main(given) == 1
+    assert 'cell.csv has no joint values: name their columns' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('row', ['1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5'])
 def test_a_table_of_semicolons_says_what_to_give(tmp_path, row):
     path = tmp_path / 'cell.csv'
