@@ -309,7 +309,7 @@ def test_a_command_tells_how_much_is_left(cell, shown, monkeypatch, command, lea
     class Heard(Work):
         def __call__(self, at):
             super().__call__(at)
-            shares.extend([] if isinstance(at, str) else [(id(self), at)])
+            shares.extend([] if isinstance(at, str) else [(self, at)])
 
     monkeypatch.setattr(screen, 'Work', Heard)
     (cell / 'NEW').mkdir()
@@ -319,8 +319,8 @@ def test_a_command_tells_how_much_is_left(cell, shown, monkeypatch, command, lea
     assert len(shares) >= least
     last = {}
     for work, share in shares:
-        assert last.get(work, 0.0) <= share <= 1.0
-        last[work] = share
+        assert last.get(id(work), 0.0) <= share <= 1.0
+        last[id(work)] = share
     assert max(last.values()) > 0.6
 
 
