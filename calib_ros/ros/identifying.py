@@ -29,6 +29,9 @@ from calib_ros.ros.outputs import Published
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession
 
+ANSWER_LENGTH = LONGEST // 2
+"""Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
+
 
 class Snapshot(NamedTuple):
     """What an identification works on, and what it was called with."""
@@ -139,19 +142,17 @@ class Identifying:
             self.last += f'; report: {self._report}'
 
     def shortened(self, answer: Answer) -> Answer:
-        """Return an answer cut to the length of a message: the verdict, and what to do first.
+        """Return an answer cut to a few lines: the verdict, and what to do first.
 
         All of it is in the log, and beside the journal.
         """
         success, text = answer
-        if len(text) > LONGEST:
+        if len(text) > ANSWER_LENGTH:
             path = self._archive.note(f'{text}\n')
-            where = self._report or path or 'in the log'
-            if isinstance(where, Path) and len(str(where)) > LONGEST // 3:
-                where = where.name
-            more = f' ... all of it: {where}'
+            path = self._report or path
+            more = f' ... all of it: {path.name if path else "in the log"}'
             before, advice, _ = text.partition(self._advice or text)
-            text = _without_middle(before + advice, LONGEST - len(more)) + more
+            text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
         return success, text
 
 

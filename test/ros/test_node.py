@@ -114,7 +114,7 @@ def test_what_looks_wrong_is_told_live_and_of_a_bag(
         cell.play(topics(recording))
         answer = cell.call('identify')
         assert answer.success == accepted
-        assert len(answer.message) <= 400
+        assert len(answer.message) <= 200
         assert status in answer.message
         assert said in cell.in_full(answer)
         cell.spin_until(lambda: words and status in words[-1].data)
