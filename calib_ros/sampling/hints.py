@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib_ros.identification.configurations import configurations, distinct
+from calib_ros.identification.configurations import SCATTER, configurations, distinct
 from calib_ros.identification.levels import NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -27,7 +27,16 @@ class Hint(NamedTuple):
 
 
 def restless(needed: float, still: float) -> Hint:
-    """Tell that joints stand, but hardly ever within `still`; how much is `needed` [rad or m]."""
+    """Tell that joints stand, but hardly ever within `still`; how much is `needed` [rad or m].
+
+    No encoder is as noisy as different configurations are apart: then there are two arms.
+    """
+    if needed > SCATTER:
+        return Hint(
+            'joint values jump to and fro: do two robots publish them?',
+            f'the joint values jump to and fro by {needed:.2g}: do two robots publish joints of '
+            'the same names? Give each a topic of its own, and set joint_topics to that of this',
+        )
     return Hint(
         f'joints hardly ever rest within still: set still to {needed:.2g}',
         f'the joints hardly ever rest within still ({still:g}), though the arm stands: their '

@@ -105,6 +105,17 @@ def test_joints_that_hardly_rest_within_still_are_told_and_what_to_set(rate, mod
     assert told(better) == ()
 
 
+def test_two_robots_on_one_topic_are_told_and_no_still_to_set():
+    """The joint values of two arms of the same names in turn look like noise, of 0.3 rad say."""
+    made = heard(tour(15), 29.5, 50.0, noise=0.3)
+    assert len(told(made)) == 1
+    made.finish()
+    assert made.samples == []
+    (warning,) = told(made)
+    assert 'do two robots publish joints of the same names?' in warning
+    assert 'set still' not in warning
+
+
 @pytest.mark.parametrize(
     ('motion', 'noise'),
     [
