@@ -179,7 +179,9 @@ def posterior_of(
     vector = matrix @ offsets + told[:-1, -1]
     groups = [None if n in known else group_of(chain, n) for n in every] + [None] * len(beside)
     given = np.array([known.get(n, np.inf) for n in every] + [std for _, std in beside]) ** -2
-    evidence = Evidence(matrix, vector, given, groups)
+    if lengths:
+        groups[-1], given[-1] = 'scale', 0.0
+    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
     size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     near = evidence.near(size, slope) if judging else ()
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)

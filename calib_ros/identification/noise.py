@@ -24,9 +24,9 @@ from calib_ros.kinematics.se3 import FloatArray
 class Noise:
     """Size of the residuals in units of the sigma given, for position and orientation.
 
-    `consistent` tells whether a chi-squared test lets the sigmas pass. Then standard deviations are
-    those of the larger, the sigmas given or found, for a test of few residuals would let through
-    too small ones, and either of them may be right; else those of the sigmas found.
+    `consistent` tells whether a chi-squared test lets the sigmas pass. Then standard deviations
+    are those of the larger, the sigmas given or found, for a test of few residuals would let
+    through too small ones, and either of them may be right; else those of the sigmas found.
 
     `successive` and `near` are the correlations of the residuals of configurations that follow
     each other and that are near each other in joint space; `shared` names which of them a test
