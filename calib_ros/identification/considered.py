@@ -2,13 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """What may add to the errors that are fitted: effects left out, and what a device does to space.
 
-Neither is fitted. Effects that an arm may have are columns of the posterior with own sizes
-(`evidence.py`). What a device does has a known size s, so its columns N are taken out of the
+Neither is fitted. Effects that an arm may have, and the scale of a device, are columns of the
+posterior with own sizes (`evidence.py`). What a device does besides (`device.py`), and joint
+values that were rounded, have known sizes s: their columns N are taken out of the
 products of the others A: A^T A becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 +
 s^2 N N^T were the covariance of the measurements (Schmidt 1966).
 
-A device may have a scale, which makes all lengths grow alike: positions are linear in all lengths
-L, so its column is the sum of L dp/dL. And it may bend space (`device.py`).
+The scale of a device makes all lengths grow alike: positions are linear in all lengths L, so its
+column is the sum of L dp/dL.
 """
 
 from __future__ import annotations
@@ -44,24 +45,22 @@ def told_of(
     system: System,
     noise: float,
     doubts: Mapping[str, float],
+    lengths: Mapping[str, float],
     by_device: bool,
     known: Normal | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the products (P + 1, P + 1) of columns and residual, and those with what is in doubt.
 
     The latter are A^T N (P + 1, K) and N^T N + 1 (K, K), N times its standard deviations. All are
-    in units of the `noise` [sigma given], without priors. `doubts` are standard deviations of what
-    else moves a parameter, and `by_device` tells whether devices may be wrong, too. Of many
-    samples every so many are taken; `known` holds the products of all of them for the names alone.
+    in units of the `noise` [sigma given], without priors. The column of the scale follows those of
+    the names if there are `lengths` that grow. `doubts` are standard deviations of what else moves
+    a parameter, and `by_device` tells whether devices may bend space. Of many samples every so
+    many are taken; `known` holds the products of all of them for the names alone.
     """
-    beside: list[tuple[Mapping[str, float], float]] = [({n: 1.0}, s) for n, s in doubts.items()]
-    if by_device:
-        chain, lengths, scale = _lengths(chain, system)
-        beside += [(lengths, scale)] if lengths else []
-    columns = list(dict.fromkeys([*names, *(name for parts, _ in beside for name in parts)]))
+    columns = list(dict.fromkeys([*names, *lengths]))
     most = 10 * SOME_POSES
     share = -(-system.count // most)
-    if known is not None and share == 1 and not beside and not by_device:
+    if known is not None and share == 1 and not lengths and not by_device:
         products = known.products.sum(axis=0)
     else:
         few = replace(system.spread(most), prior=None)
@@ -69,20 +68,21 @@ def told_of(
     extra = np.column_stack(system.separation_rows(chain, columns))
     own = [*range(len(columns)), -1]
     products[np.ix_(own, own)] += share * (extra.T @ extra)
-    others = np.zeros((len(products), len(beside)))
-    for k, (parts, std) in enumerate(beside):
-        others[: len(columns), k] = [std * parts.get(name, 0.0) for name in columns]
     every = np.eye(len(products))
-    kept = np.append(np.arange(len(names)), len(products) - 1)
+    row = {str(name): k for k, name in enumerate(columns)}
+    grown = every[:, [row[str(name)] for name in lengths]] * [*lengths.values()]
+    grown = grown.sum(axis=1)[:, np.newaxis][:, : len(lengths)]  # none without lengths
+    doubted = every[:, [row[str(name)] for name in doubts]] * [*doubts.values()]
     fields = every[:, len(columns) : -1]
-    mixing = np.column_stack([every[:, kept], others, fields])
+    kept = np.column_stack([every[:, : len(names)], grown, every[:, -1]])
+    mixing = np.column_stack([kept, doubted, fields])
     mixed = mixing.T @ (products / noise**2) @ mixing
-    first, rest = np.s_[: len(kept)], np.s_[len(kept) :]
+    first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
     plain, cross, doubtful = mixed[first, first], mixed[first, rest], mixed[rest, rest]
     return plain, cross, doubtful + np.eye(len(doubtful))
 
 
-def _lengths(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
+def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
     """Return all lengths [m] that positions are made of, and how well their scale is known.
 
     There are none by sockets and planes, which are where they are. The travel of a prismatic joint

@@ -40,8 +40,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy import linalg
 
-from calib_ros.identification.considered import told_of
+from calib_ros.identification.considered import lengths_of, told_of
 from calib_ros.identification.leastsquares import Normal, System
+from calib_ros.identification.levels import SCALE
 from calib_ros.identification.sizes import TYPICAL, Evidence, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -164,34 +165,61 @@ def posterior_of(
     chain = chain.with_effects(more)
     every = (*names, *more)
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
-    plain, cross, doubtful = told_of(chain, every, system, noise, beside, bool(more), at_the_fit)
-    offsets = np.zeros(len(every))
+    whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
+    plain, cross, doubtful = told_of(
+        whole, every, system, noise, beside, lengths, bool(more), at_the_fit
+    )
+    offsets = np.zeros(len(plain) - 1)
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
     told = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
     alone, matrix = plain[:-1, :-1], told[:-1, :-1]
     vector = matrix @ offsets + told[:-1, -1]
-    groups = [None if n in known else group_of(chain, n) for n in every]
-    given = np.array([known.get(n, np.inf) for n in every]) ** -2
-    evidence = Evidence(matrix, vector, given, groups)
+    also = ['scale'] if lengths else []
+    groups = [*(None if n in known else group_of(chain, n) for n in every), *also]
+    given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2
+    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
     size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
     near = evidence.near(size, slope) if judging else ()
-    known_by = zip(every, evidence.precision(size).tolist(), strict=True)
+    known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
     if judging:
         evidence.widen(size)
     weights = [weight for weight, _ in near] or [1.0]
     precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
-    own = [solved(alone, alone @ offsets + plain[:-1, -1], each) for each in precisions]
+    arm = np.s_[: len(every)]
+    own = [
+        solved(alone[arm, arm], (alone @ offsets + plain[:-1, -1])[arm], p[arm])
+        for p in precisions
+    ]
     mean = np.average([each for each, _ in own], axis=0, weights=weights)
     covariance = np.average([root @ root.T for _, root in own], axis=0, weights=weights)
     covariance += np.cov([each for each, _ in own], rowvar=False, ddof=0, aweights=weights)
-    root = solved(alone, vector, evidence.precision(size))[1]
-    along = root @ (root.T @ cross[:-1])
-    left, axes = np.linalg.eigh(doubtful - cross[:-1].T @ along)
-    device = along @ axes / np.sqrt(np.maximum(left, 1.0))  # it is 1 and more but for rounding
+    device = _device(alone, cross[:-1], doubtful, evidence.precision(size), len(every))
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
-    doubted = tuple((w, there, its @ its.T) for w, (there, its) in parts)
-    shift, sizes = mean - offsets, evidence.named(size)
-    return Posterior(chain, every, offsets, shift, covariance, device, priors, sizes, doubted)
+    doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
+    shift, sizes = mean - offsets[arm], evidence.named(size)
+    return Posterior(chain, every, offsets[arm], shift, covariance, device, priors, sizes, doubted)
+
+
+def _device(
+    matrix: FloatArray, cross: FloatArray, doubtful: FloatArray, precision: FloatArray, count: int
+) -> FloatArray:
+    """Return (P, K) what another device adds to the covariance of the first `count` columns (P).
+
+    By the products of columns (P, P), the scale's after those, with what it may do (Woodbury).
+    """
+    arm, scale = np.s_[:count], np.s_[count:]
+    std = precision[scale, np.newaxis] ** -0.5
+    beside = np.column_stack([matrix[arm, scale] * std.T, cross[arm]])
+    own = np.block(
+        [
+            [std * matrix[scale, scale] * std.T + np.eye(len(std)), std * cross[scale]],
+            [(std * cross[scale]).T, doubtful],
+        ]
+    )
+    root = solved(matrix[arm, arm], np.zeros(count), precision[arm])[1]
+    along = root @ (root.T @ beside)
+    left, axes = np.linalg.eigh(own - beside.T @ along)
+    return np.asarray(along @ axes / np.sqrt(np.maximum(left, 1.0)))  # 1 but for rounding

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy import special
@@ -62,12 +62,13 @@ class Evidence:
         vector: FloatArray,
         given: FloatArray,
         groups: Sequence[str | None],
+        typical: Mapping[str, float],
     ) -> None:
         self._matrix, self._vector, self._given = matrix, vector, given
         self._names = [*dict.fromkeys(group for group in groups if group is not None)]
         rows = [[group == name for group in groups] for name in self._names]
         self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
-        self._typical = np.log([TYPICAL[name] for name in self._names])
+        self._typical = np.log([typical[name] for name in self._names])
         self._own = np.array([group in ('length', 'angle') for group in groups])
         self._tails = np.ones(len(groups))
 
@@ -106,17 +107,18 @@ class Evidence:
 
         One group differs at a time, up and down, by as much as makes means right to the second
         order (the unscented transform, Julier and Uhlmann 1997); the evidence weighs both. What
-        is of no size stays so.
+        is of no size stays so, and so does the scale of the device, which is no group.
         """
-        some = np.flatnonzero(size > self._typical + np.log(LEAST_SIZE))
+        arms = np.array([name in TYPICAL for name in self._names])
+        some = np.flatnonzero(arms & (size > self._typical + np.log(LEAST_SIZE)))
         if not len(some):
             return [(1.0, size)]
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
         tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
-        told = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
+        likely = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
             axis=1
         )
-        upper = special.expit(told[::2] - told[1::2])
+        upper = special.expit(likely[::2] - likely[1::2])
         weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
         return list(zip(weights.tolist(), tried, strict=True))
 

@@ -169,6 +169,17 @@ def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
     assert np.mean(ratios) < 1.25
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_a_device_out_of_scale_does_not_spoil_an_arm_of_small_errors(seed):
+    """A scale of 0.8 per mille is the device's, not eight lengths all too long by chance."""
+    rng = np.random.default_rng(seed)
+    seen = measure(arm(seed, 0.1), UR10E.random_joints(40, rng), rng, 5e-5, 2e-4)
+    found = identify(Problem(UR10E, replace(seen, positions=seen.positions * (1.0 + 8e-4))))
+    assert not found.accepted
+    assert found.posterior.sizes['scale'] == pytest.approx(8e-4, rel=0.3)
+    assert identify(Problem(UR10E, seen)).accepted
+
+
 def test_the_region_is_kept_with_the_calibration(local, folder):
     q = UR10E.random_joints(400, np.random.default_rng(3))
     covered = local.region.covers(q)
