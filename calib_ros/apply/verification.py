@@ -53,6 +53,7 @@ from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
+HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None: 'no verdict'}
 NEEDED = 1 + len(PLANE)
 """Configurations from which a verdict is given, those of a fitted frame not counted: the test
 poses of ISO 9283."""
@@ -200,7 +201,9 @@ def verify(
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     holds = arm.holds(rms)
-    verdict = _decided(tolerance, holds, lower, upper, numbers)
+    verdict: tuple[Verdict, int | None] = HOLDS[holds], None
+    if tolerance is not None:
+        verdict = _decided(tolerance, lower, upper, numbers)
     common = 1.0
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
@@ -239,15 +242,9 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
 
 
 def _decided(
-    tolerance: float | None,
-    holds: bool | None,
-    lower: FloatArray,
-    upper: FloatArray,
-    numbers: NDArray[np.intp],
+    tolerance: float, lower: FloatArray, upper: FloatArray, numbers: NDArray[np.intp]
 ) -> tuple[Verdict, int | None]:
     """Return the verdict by the first limits, and which of the numbers of poses would decide."""
-    if tolerance is None:
-        return 'no verdict' if holds is None else 'holds' if holds else 'does not hold', None
     decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
     needed = int(numbers[decided[0]]) if decided.size else None
     if lower[0] <= tolerance < upper[0]:
@@ -369,12 +366,10 @@ def in_words(found: Verification) -> str:
 def each_in_words(found: Verification) -> list[str]:
     """Return the lines of a table of the poses [mm], of which there may be none."""
     again = any(pose.repeatability is not None for pose in found.each)
-    head = '  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)'
-    lines = [head]
+    lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
-        spread = '' if pose.repeatability is None else f'{pose.repeatability:8.4f}'
-        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f} {spread}'
-        lines.append(line.rstrip())
+        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
+        lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
     return lines if found.each else []
 
 
@@ -382,8 +377,7 @@ def remarks(found: Verification) -> list[str]:
     """Return what to know besides the figures, and what to do."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if found.fitted:
-        frames = ' and '.join(found.fitted)
-        lines.append(f'fitted anew to these measurements, before and after alike: {frames}')
+        lines.append(f'fitted anew, before and after alike: {" and ".join(found.fitted)}')
     if not found.by_program:
         lines.append(
             'this judges the calibration: give the program before its correction (--commanded) '

@@ -69,8 +69,7 @@ def identification_report(
             (
                 *(() if result.validation else (UNPROVEN,)),
                 f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
-                'RMS (root mean square) is the usual size of the error; its interval is that over '
-                'poses like these.',
+                'RMS (root mean square) is the usual size of the error over poses like these.',
                 ISO_9283,
             ),
             judged,
@@ -232,6 +231,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
 
 def _effects(result: Identification) -> Section:
     """Return what each effect beyond geometry brings, in the order in which they were added."""
+    used = {True: 'yes', False: 'no'}
     return Section(
         'effects',
         'Errors beyond geometry',
@@ -243,12 +243,8 @@ def _effects(result: Identification) -> Section:
         ),
         head=('effect', 'changes the error by', 'used'),
         rows=tuple(
-            (
-                each.what,
-                f'{100.0 * (each.rms_mm_after / each.rms_mm_before - 1.0):+.1f} %',
-                'yes' if each.pays else 'no',
-            )
-            for each in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before))
+            (v.what, f'{100.0 * (v.rms_mm_after / v.rms_mm_before - 1.0):+.1f} %', used[v.pays])
+            for v in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before))
         ),
     )
 
@@ -397,9 +393,8 @@ def _map(result: Identification) -> Section:
         'map',
         'The error over the workspace',
         (
-            f'At {SURVEYED:,} random poses of the whole joint range, by the distance from the '
-            'axis of the base and the height above it. More is expected to remain far from the '
-            'poses that were measured.',
+            f'At {SURVEYED:,} random poses, by the distance from the axis of the base and the '
+            'height above it. More is expected to remain far from the poses measured.',
         ),
         figures.error_map(found),
     )

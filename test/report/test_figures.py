@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What figures show, from values that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pages import page_of, problem_of, report_of
@@ -9,6 +11,7 @@ from plotly import graph_objects
 
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.effects import Verdict
 from calib_ros.report.figures import drives
 from calib_ros.report.plots import drawing
 
@@ -39,6 +42,18 @@ def test_errors_of_drives_are_shown_where_they_were_measured(rng):
 def test_an_arm_without_such_errors_has_no_such_figure(rng):
     arm = UR10E.with_effect_values({'elbow_joint.ratio': 1e-4})
     assert drives(arm, rng.uniform(-1.0, 1.0, (9, 6))) is None
+
+
+def test_effects_are_compared_by_changes_in_their_order():
+    verdicts = (
+        Verdict('ratio', 0.3, 0.3003, pays=False),
+        Verdict('eccentricity', 0.4, 0.3, pays=True),
+        Verdict('gravity', 0.5, 0.4, pays=True),
+    )
+    problem = problem_of()
+    page = page_of(report_of(problem, replace(identify(problem), verdicts=verdicts)))
+    words = ' '.join(page.text.split())
+    assert 'gravity -20.0 % yes eccentricity -25.0 % yes ratio +0.1 % no' in words
 
 
 def test_harmonics_of_gears_are_drawn_and_counted_but_not_listed():
