@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
@@ -209,3 +210,19 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
 def lines_in_words(lines: Sequence[int]) -> str:
     """Return which lines of a file, the first ones by their numbers."""
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
+
+
+def distinct(codes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the different rows of (N, C) in order of appearance, and which (N,) each row is."""
+    if not codes.any():
+        return codes[:1], np.zeros(len(codes), dtype=np.intp)
+    sizes = [int(size) + 1 for size in codes.max(axis=0)]
+    if math.prod(sizes) < 2**62:
+        joined = np.ravel_multi_index(tuple(codes.T), sizes)
+        _, first, number = np.unique(joined, return_index=True, return_inverse=True)
+    else:
+        _, first, number = np.unique(codes, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.intp)
+    rank[order] = np.arange(len(order))
+    return codes[first[order]], rank[number.reshape(-1)]

@@ -19,6 +19,7 @@ from calib_ros.files.columns import (
     Columns,
     Lines,
     check_quaternions,
+    distinct,
     lines_in_words,
     numbered,
 )
@@ -389,19 +390,3 @@ def _covariance(
         raise InputError(f'{columns.path}, line {line}: c11 ... c66: {faults[k]}')
     full[~given | ~full.any(axis=(1, 2))] = np.nan
     return None if np.isnan(full).all() else full
-
-
-def distinct(codes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the different rows of (N, C) in order of appearance, and which (N,) each row is."""
-    if not codes.any():
-        return codes[:1], np.zeros(len(codes), dtype=np.intp)
-    sizes = [int(size) + 1 for size in codes.max(axis=0)]
-    if math.prod(sizes) < 2**62:
-        joined = np.ravel_multi_index(tuple(codes.T), sizes)
-        _, first, number = np.unique(joined, return_index=True, return_inverse=True)
-    else:
-        _, first, number = np.unique(codes, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty(len(order), dtype=np.intp)
-    rank[order] = np.arange(len(order))
-    return codes[first[order]], rank[number.reshape(-1)]

@@ -21,7 +21,7 @@ import numpy as np
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.escapes import to_cell
-from calib_ros.files.columns import Columns, MadeColumns
+from calib_ros.files.columns import Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
@@ -31,7 +31,6 @@ from calib_ros.files.measurements import (
     POSE,
     SOCKET,
     Measurements,
-    distinct,
     joined,
     measurements,
 )

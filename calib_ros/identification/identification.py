@@ -33,12 +33,12 @@ from calib_ros.identification.fitting import (
 )
 from calib_ros.identification.leastsquares import Fit, System, minimise, normal_equations
 from calib_ros.identification.levels import KNOWN
-from calib_ros.identification.misfits import arms_own
+from calib_ros.identification.misfits import Outlier, arms_own, outliers_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import Region, region_of
-from calib_ros.identification.robust import OUTLIER, Robust
+from calib_ros.identification.robust import Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import Step, find_step
 from calib_ros.identification.validation import (
@@ -56,16 +56,6 @@ from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown, as_frame, as_html
 
 __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
-
-
-@dataclass(frozen=True)
-class Outlier:
-    """A sample of gross error: where it is found, and its size in units of the usual error."""
-
-    set: int
-    sample: int
-    stamp_ns: int
-    size: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -295,7 +285,7 @@ def _identified(
         validated_by=validated_by,
         noise=fitted.noise,
         distances=robust.distances,
-        outliers=_outliers(problem, robust),
+        outliers=outliers_of(problem, robust),
         gauges=_gauges(problem, chain, names),
         observability=identifiability.observability(fitted.factor, robust.system.count),
         priors=_priors(problem),
@@ -399,14 +389,3 @@ def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, l
     few = problem.system([each.spread(SOME) for each in problem.sets])
     normal = normal_equations(chain, free, System(few.sets))
     return identifiability.trades(normal.matrix, free, names)
-
-
-def _outliers(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
-    if problem.loss == 'none':
-        return ()
-    found = []
-    for number, (each, distances) in enumerate(zip(problem.sets, robust.distances, strict=True)):
-        for sample in np.flatnonzero(distances > OUTLIER):
-            stamp = int(each.stamps_ns[sample])
-            found.append(Outlier(number, int(sample), stamp, float(distances[sample])))
-    return tuple(found)

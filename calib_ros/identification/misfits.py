@@ -13,6 +13,8 @@ the arm's own behaviour where
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
@@ -31,6 +33,28 @@ ADVICE = (
     'what a device does wrong knows nothing of the joints, the arm does what the model lacks. Look'
     ' for effects (model auto), or fit them with the others (loss none)'
 )
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A sample of gross error: where it is found, and its size in units of the usual error."""
+
+    set: int
+    sample: int
+    stamp_ns: int
+    size: float
+
+
+def outliers_of(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
+    """Return the samples that a robust fit has given up."""
+    if problem.loss == 'none':
+        return ()
+    found = []
+    for number, (each, distances) in enumerate(zip(problem.sets, robust.distances, strict=True)):
+        for sample in np.flatnonzero(distances > OUTLIER):
+            stamp = int(each.stamps_ns[sample])
+            found.append(Outlier(number, int(sample), stamp, float(distances[sample])))
+    return tuple(found)
 
 
 def arms_own(problem: Problem, robust: Robust) -> str | None:
