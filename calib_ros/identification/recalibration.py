@@ -41,7 +41,7 @@ from calib_ros.identification.leastsquares import (
     normal_equations,
     products_of,
 )
-from calib_ros.identification.levels import chance_of
+from calib_ros.identification.levels import ALIKE, chance_of
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
@@ -66,7 +66,8 @@ class Recalibration(Shown):
     `changed` is what has changed, one after the other: the best explanation of each change, and
     those that cannot be told apart from it; `unexplained` is the probability of residuals as large
     as those that are left. `before` and `after` are errors of the new poses by the earlier
-    calibration, and by what the other poses tell. `reused` is the share of the poses that the
+    calibration, and by what the other poses tell; `anew` tells whether there are new frames, which
+    are fitted to all of the new poses for `before`. `reused` is the share of the poses that the
     earlier calibration was fitted to: they would count twice.
     """
 
@@ -76,11 +77,12 @@ class Recalibration(Shown):
     before: ErrorFigures
     after: ErrorFigures
     reused: float = 0.0
+    anew: bool = False
 
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
-        better = self.after.rms_mm <= self.before.rms_mm
+        better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
         return self.unexplained > FALSE and bool(agrees) and not self.reused
 
@@ -106,6 +108,11 @@ class Recalibration(Shown):
         if self.unexplained <= FALSE:
             return (
                 f'NOT accepted: no few parameters explain what has changed; identify anew. {text}'
+            )
+        if not self.accepted and self.anew:
+            return (
+                'NOT accepted: the earlier calibration, in new frames, fits the new poses better; '
+                f'keep it, or identify anew from more poses. {text}'
             )
         if not self.accepted:
             return f'NOT accepted: the new poses contradict each other; measure more. {text}'
@@ -182,6 +189,7 @@ def recalibrate(
         before,
         after,
         previous.reused(sets),
+        bool(names),
     )
 
 
@@ -277,15 +285,12 @@ def _judged(
     folds = [numbers % count for numbers in groups]
     chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
     chains = []
-    for part in products_of(chain, arm.names, system, folds).sum(axis=1):
-        matrix, gradient = part[:-1, :-1], part[:-1, -1]
-        rest = Told(
-            arm.names,
-            found.told.information - matrix,
-            found.told.vector - gradient - matrix @ found.change,
-        )
+    parts = products_of(chain, arm.names, system, folds).sum(axis=1)
+    for products in parts.sum(axis=0) - parts:
+        information = products[:-1, :-1]
+        rest = Told(arm.names, information, products[:-1, -1] + information @ found.change)
         change = dict(zip(arm.names, rest.mean(arm.square)[0], strict=True))
-        chains.append((previous.chain, _applied(previous, arm.chain, change)))
+        chains.append((_applied(previous, arm.chain, {}), _applied(previous, arm.chain, change)))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
     return before.figures(every), after.figures(every)
