@@ -43,7 +43,7 @@ from scipy import linalg
 from calib_ros.identification.considered import lengths_of, told_of
 from calib_ros.identification.leastsquares import Normal, System
 from calib_ros.identification.levels import SCALE
-from calib_ros.identification.sizes import TYPICAL, Evidence, solved
+from calib_ros.identification.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -188,13 +188,10 @@ def posterior_of(
     weights = [weight for weight, _ in near] or [1.0]
     precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
     arm = np.s_[: len(every)]
-    own = [
-        solved(alone[arm, arm], (alone @ offsets + plain[:-1, -1])[arm], p[arm])
-        for p in precisions
-    ]
-    mean = np.average([each for each, _ in own], axis=0, weights=weights)
-    covariance = np.average([root @ root.T for _, root in own], axis=0, weights=weights)
-    covariance += np.cov([each for each, _ in own], rowvar=False, ddof=0, aweights=weights)
+    along = (alone @ offsets + plain[:-1, -1])[arm]
+    mean, covariance = mixed(
+        [solved(alone[arm, arm], along, each[arm]) for each in precisions], weights
+    )
     device = _device(alone, cross[:-1], doubtful, evidence.precision(size), len(every))
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)

@@ -43,6 +43,16 @@ def solved(
     return inverse.T @ (inverse @ vector), inverse.T
 
 
+def mixed(
+    solutions: Sequence[tuple[FloatArray, FloatArray]], weights: Sequence[float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (P,) and covariance (P, P) over means and roots that may as well be."""
+    means = np.array([mean for mean, _ in solutions])
+    covariance = np.average([root @ root.T for _, root in solutions], axis=0, weights=weights)
+    spread = np.cov(means, rowvar=False, ddof=0, aweights=weights)
+    return np.average(means, axis=0, weights=weights), covariance + spread
+
+
 def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return matrices (..., P, P) of unit diagonal with precisions (..., P) added, and scales."""
     size = np.arange(len(matrix))
