@@ -201,10 +201,8 @@ def verify(
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     holds = arm.holds(rms)
-    verdict: tuple[Verdict, int | None] = HOLDS[holds], None
-    if tolerance is not None:
-        verdict = _decided(tolerance, lower, upper, numbers)
-    common = 1.0
+    decided = None if tolerance is None else _decided(tolerance, lower, upper, numbers)
+    verdict, common = decided or (HOLDS[holds], None), 1.0
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)

@@ -265,8 +265,7 @@ def minimise(
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
-    damping, growth = 0.0, 2.0
-    patience = PATIENCE
+    damping, growth, patience = 0.0, 2.0, PATIENCE
     stalled, least_cost, least_left = 0, np.inf, np.inf
     iteration = 0
     while iteration < iterations and stalled < ROUNDS:
@@ -288,8 +287,7 @@ def minimise(
         normal = normal_equations(chain, names, system)
         gain = best.cost - normal.cost
         if gain >= -1e-12 * best.cost:
-            best, best_chain = normal, chain
-            growth = 2.0
+            best, best_chain, growth = normal, chain, 2.0
             if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
             else:

@@ -181,13 +181,11 @@ def recalibrate(
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
-    before, after = _judged(previous, arm, found, system, sets)
     return Recalibration(
         _updated(previous, arm, found, problem, tuple(changed)),
         tuple(changed),
         found.unexplained(arm.square, system.rows, previous.freedom),
-        before,
-        after,
+        *_judged(previous, arm, found, system, sets),
         previous.reused(sets),
         bool(names),
     )
