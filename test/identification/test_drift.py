@@ -62,13 +62,16 @@ def test_a_drift_is_no_gain_of_the_arm(kind):
 
 
 def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
-    """One of eight may be refused: 0.3 mm of drift in a narrow path leave its risk above 2 %."""
+    """One of eight may be refused: 0.3 mm of drift in a narrow path leave its risk above 2 %.
+
+    So does an arm whose lengths err alike by chance: the device may have a scale.
+    """
     accepted = 0
-    for seed, kind in product(range(2), DRIFTS):
+    for seed, kind in product(range(4), DRIFTS):
         accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
         shuffled = session(seed, 0.3, kind, width=None, shuffled=True)
         accepted += identify(Problem(UR10E, shuffled, **SIGMAS)).accepted
-    assert accepted >= 14
+    assert accepted >= 28
 
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
