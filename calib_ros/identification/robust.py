@@ -15,8 +15,9 @@ Clean data keep the weight 1 throughout, so nothing is lost against least square
 
 Gross errors that agree with each other, as from a target that was bumped, are a second model that
 the first fit may settle between or even at. Where it names outliers, or leaves more than the
-sigmas given explain, the fit is repeated from the best half of the samples (`trimmed.py`), and
-counts when half of the residuals shrink by it.
+sigmas given explain, the fit is repeated from the best half of the samples (`trimmed.py`). It
+counts when half of the residuals shrink by it, and what it leaves out is more than chance leaves
+out of few samples.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ from scipy import special
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, minimise
-from calib_ros.identification.levels import ALIKE
-from calib_ros.identification.trimmed import trimmed_start, trimmed_sum
+from calib_ros.identification.levels import ALIKE, SURE
+from calib_ros.identification.trimmed import trimmed_start, trimmed_sum, unknown
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 
@@ -91,9 +92,32 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
         return first
     second = reweighted(trimmed_start(chain, names, system), names, system, loss)
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
-    if sums[0] > ALIKE**2 * sums[1]:  # another fit, not a detail of the first
+    another = sums[0] > ALIKE**2 * sums[1]  # not a detail of the first
+    if another and _chance(names, system, first, second) < 1.0 - SURE:
         return replace(second, iterations=first.iterations + second.iterations)
     return first
+
+
+def _chance(names: Sequence[str], system: System, first: Robust, second: Robust) -> float:
+    """Return the most by which errors of one size would let a fit leave so many samples out.
+
+    The F test of a shift of each of them (Cook and Weisberg 1982), times the number of ways to
+    choose them. Its tail is bounded as by Chernoff (1952), for it may be too small for a float.
+    """
+    out = int(second.outliers.sum())
+    if not out:
+        return 0.0
+    least = minimise(first.fit.chain, names, system, tolerance=1e-3).normal.cost
+    share = second.fit.normal.cost / max(least, 1e-300)
+    shifts = 0.5 * system.rows * out / system.count
+    spare = 0.5 * (system.rows - unknown(names, system)) - shifts
+    if spare <= 0.0 or share >= spare / (spare + shifts):
+        return 1.0
+    mean = spare / (spare + shifts)
+    ways = -special.betaln(out + 1.0, system.count - out + 1.0) - np.log(system.count + 1.0)
+    tail = spare * np.log(max(share, 1e-300) / mean)
+    tail += shifts * np.log((1.0 - share) / (1.0 - mean))
+    return float(np.exp(min(tail + ways, 0.0)))
 
 
 def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:

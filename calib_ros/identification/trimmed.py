@@ -75,6 +75,12 @@ def trimmed_sum(chain: Chain, system: System) -> float:
     return total
 
 
+def unknown(names: Sequence[str], system: System) -> int:
+    """Return the number of parameters without a prior."""
+    known = {} if system.prior is None else system.prior.sigmas
+    return sum(name not in known for name in names)
+
+
 def _thinned(system: System) -> System:
     """Return SOME_POSES evenly spread over all samples, of each set a tenth of them at least."""
     most = SOME_POSES // min(len(system.sets), 10)
@@ -83,14 +89,12 @@ def _thinned(system: System) -> System:
 
 def _need(names: Sequence[str], system: System) -> float:
     """Return parameters per equation: those without a prior, and one sample a configuration."""
-    known = {} if system.prior is None else system.prior.sigmas
-    unknown = sum(name not in known for name in names)
     rows = sum(
         samples.rows / samples.count * (samples.observations.configurations.max() + 1)
         for samples in system.sets
         if samples.count
     )
-    return float(unknown / rows)
+    return float(unknown(names, system) / rows)
 
 
 class _Halves:
