@@ -80,7 +80,7 @@ def main():
         }
         single = hits.mean(axis=0)
         found['coverage_of_single_parameters'][kind] = [float(single.min()), float(single.max())]
-    rows = [one_run(nominal, seed, *FEW) for seed in range(runs // 10)]
+    rows = [one_run(nominal, seed, *FEW) for seed in range(runs // 2)]
     _, hits, positions = (np.array(column) for column in zip(*rows, strict=True))
     found['few_unknown_noise'] = {
         'runs': len(rows),
