@@ -19,7 +19,7 @@ what they leave. A drift is no step: a few cosines over the session explain it b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -158,7 +158,7 @@ class _Scan:
         number[order] = stops(np.concatenate([each.joints for each in sets])[order])
         self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
         self.stops = int(number.max(initial=-1)) + 1
-        extra, offset = few.extra_rows(self._chain, names)
+        extra, offset = replace(few, separations=()).extra_rows(self._chain, names)
         whole = np.array([_product(rows) for rows in self._rows])
         matrix = whole.sum(axis=0)[: self._fitted]
         normal = matrix[:, : self._fitted] + extra.T @ extra

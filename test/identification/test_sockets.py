@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -124,6 +125,25 @@ def test_sockets_alone_and_in_rows_of_three_make_a_place_each():
     assert difference(result.chain, true) < 1e-8
     # the two of place 0, places 1 and 2 together, and place 3
     assert result.validated_by == 'leaving out one of 4 places at a time'
+
+
+@pytest.mark.parametrize('slip', [0.0, 5e-3])
+def test_known_distances_that_the_arm_does_not_keep_are_no_step(slip):
+    """Eccentric joints bend space, so that the sockets seem to be elsewhere from the start."""
+    true, problem = cell(2, noise=5e-5)
+    places = {each.base: true.forward(each.joints[:1])[0, :3, 3] for each in problem.sets}
+    apart = [
+        (first, second, float(np.linalg.norm(places[first] - places[second])))
+        for first, second in combinations(places, 2)
+    ]
+    late = np.arange(30)[:, np.newaxis] >= 15
+    sets = []
+    for each in problem.sets:
+        q = each.joints - 1e-3 * np.sin(each.joints)
+        sets.append(replace(each, joints=q + slip * late * (np.arange(7) == 3)))
+    problem = replace(problem, observations=sets[0], more=sets[1:], separations=apart)
+    step = identify(problem).step
+    assert (step and (step.what, step.sample)) == (('joint_4', 15) if slip else None)
 
 
 def test_only_sockets_are_a_known_distance_apart():
