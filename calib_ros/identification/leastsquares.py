@@ -253,8 +253,9 @@ def minimise(
 
     Gauss-Newton with columns scaled to unit length. A step may raise the cost for a moment, as
     it must to get through a curved valley (watchdog; Chamberlain et al. 1982); when PATIENCE
-    steps have not brought it below the best, the fit goes back there and steps are damped
-    (Levenberg 1944, Marquardt 1963), by the ratio of the gain to the one foreseen (Nielsen 1999).
+    steps have not brought it far enough below the best (Armijo 1966), for they may go to and fro,
+    the fit goes back there and steps are damped (Levenberg 1944, Marquardt 1963), by the ratio of
+    the gain to the one foreseen (Nielsen 1999).
     It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
     It ends as well, not converged, where ROUNDS iterations bring no progress (a thousandth of the
     cost, or half of the step left to go), where numbers end, or after so many `iterations`; curved
@@ -265,7 +266,7 @@ def minimise(
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
-    damping, growth, patience = 0.0, 2.0, PATIENCE
+    damping, growth, patience, promised = 0.0, 2.0, PATIENCE, 0.0
     stalled, least_cost, least_left = 0, np.inf, np.inf
     iteration = 0
     while iteration < iterations and stalled < ROUNDS:
@@ -284,14 +285,19 @@ def minimise(
         if best.cost < 0.999 * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
         foreseen = float(step @ (2.0 * normal.gradient - normal.matrix @ step))
+        promised = foreseen if normal is best else promised
         normal = normal_equations(chain, names, system)
         gain = best.cost - normal.cost
         if gain >= -1e-12 * best.cost:
             best, best_chain, growth = normal, chain, 2.0
             if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
-            else:
+            elif gain > 1e-4 * promised:
                 damping, patience = 0.0, PATIENCE
+            elif patience > 0:
+                patience -= 1
+            else:
+                damping = HALF_THE_DIGITS
         elif patience > 0 and np.isfinite(normal.cost):
             patience -= 1
         elif damping > 1e12:  # nothing lowers the cost

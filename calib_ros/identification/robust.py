@@ -171,14 +171,16 @@ def reweighted(
     distances = judged(chain)
     iterations = 0
     settled = False
+    last: list[FloatArray] = []
     weights: list[FloatArray] = []
     for _ in range(ROUNDS):
-        last, weights = weights, [weights_of(d, loss) for d in distances]
-        settled = bool(last) and all(
-            np.allclose(w, b, rtol=0, atol=1e-4) for w, b in zip(weights, last, strict=True)
+        found = [weights_of(d, loss) for d in distances]
+        settled = bool(weights) and all(
+            np.allclose(f, w, rtol=0, atol=1e-4) for f, w in zip(found, weights, strict=True)
         )
         if settled:
             break
+        last, weights = weights, _steadied(found, weights, last)
         system = system.weighted(weights)
         fit = minimise(chain, names, system, tolerance)
         chain, iterations = fit.chain, iterations + fit.iterations
@@ -189,6 +191,19 @@ def reweighted(
         fit = minimise(chain, names, system)
         iterations += fit.iterations
     return Robust(fit, system, distances, settled, iterations, loss)
+
+
+def _steadied(
+    found: list[FloatArray], last: list[FloatArray], before: list[FloatArray]
+) -> list[FloatArray]:
+    """Return the weights found (N,) set by set, half way back if they swing about the last ones.
+
+    A sample at the edge may lose weight for its distance and come nearer for its lost weight, for
+    ever. Empty lists are weights that have not been found yet.
+    """
+    steps = zip(found, last, before, strict=True) if before else ()
+    swings = sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0
+    return [0.5 * (f + b) for f, b in zip(found, last, strict=True)] if swings else found
 
 
 def weights_of(distance: FloatArray, loss: str) -> FloatArray:

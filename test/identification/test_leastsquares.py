@@ -73,6 +73,23 @@ def test_a_long_curved_valley_is_followed_to_its_end():
     assert left @ again.gradient < 1e-9 * again.cost
 
 
+def test_steps_that_go_to_and_fro_are_damped(monkeypatch):
+    """Undamped steps on x^2 + (1 + 0.6 x^2)^2 end in going from x to -x and back."""
+    start, names, system = still_joint('ur10e', 0)
+    real = normal_equations(start, names[:1], system)
+
+    def equations(chain, *_):
+        x = chain.offset(names[0], start) + 0.5
+        left, slope = 1.0 + 0.6 * x**2, 1.2 * x
+        matrix, gradient = np.array([[1.0 + slope**2]]), np.array([-x - left * slope])
+        return replace(real, matrix=matrix, gradient=gradient, cost=x**2 + left**2)
+
+    monkeypatch.setattr(leastsquares, 'normal_equations', equations)
+    fit = minimise(start, names[:1], system)
+    assert fit.converged
+    assert fit.chain.offset(names[0], start) == pytest.approx(-0.5, abs=1e-4)
+
+
 def test_a_fit_without_progress_ends_and_says_so(monkeypatch):
     start, names, system = still_joint('ur10e', 0)
     stuck = normal_equations(start, names, system)

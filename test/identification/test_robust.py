@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NO_PRIOR, NOISE, UR10E, fitted, measured_arm, rms
+from fits import NO_PRIOR, NOISE, SIGMAS, UR10E, fitted, measured_arm, rms
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import UnknownNameError
+from calib_ros.identification import robust
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.robust import LOSSES, OUTLIER
+from calib_ros.identification.leastsquares import minimise
+from calib_ros.identification.robust import INNER, LOSSES, OUTLIER
 from calib_ros.kinematics import se3
 
 POSES = 80
@@ -183,10 +185,10 @@ def test_clean_data_lose_nothing(oriented, scale):
     plain, *others = (fit(seen, scale=scale, loss=loss) for loss in sorted(LOSSES, key=len))
     assert plain.outliers == ()
     assert len(others) == 2
-    for robust in others:
-        assert robust.outliers == ()
-        np.testing.assert_array_equal(robust.chain.forward(unseen), plain.chain.forward(unseen))
-        np.testing.assert_array_equal(robust.covariance, plain.covariance)
+    for other in others:
+        assert other.outliers == ()
+        np.testing.assert_array_equal(other.chain.forward(unseen), plain.chain.forward(unseen))
+        np.testing.assert_array_equal(other.covariance, plain.covariance)
 
 
 @pytest.mark.parametrize(('share', 'limit'), [(0.1, 1.5), (0.3, 15.0)])
@@ -295,6 +297,29 @@ def test_an_unknown_loss_is_named():
     with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
         Problem(UR10E, seen, loss='hubert')
     assert caught.value.alternatives == LOSSES
+
+
+def test_weights_that_swing_come_to_rest(monkeypatch):
+    """A pose that comes near without weight, and goes far with it, has no rest at either end."""
+    _, true, seen = measured_arm(0, 40)
+    system = Problem(UR10E, seen, **SIGMAS).system([seen])
+    weight = 1.0
+
+    def minimised(chain, names, weighted, *_):
+        nonlocal weight
+        weight = float(weighted.sets[0].weights[0]) ** 2
+        return minimise(chain, names, weighted)
+
+    def far(*_):
+        distances = np.ones(40)
+        distances[0] = INNER + 2.0 * weight
+        return (distances,)
+
+    monkeypatch.setattr(robust, 'minimise', minimised)
+    monkeypatch.setattr(robust, 'distances_of', far)
+    found = robust.reweighted(true, ['tool.x'], system, 'redescending')
+    assert found.settled
+    assert weight == pytest.approx(0.5, abs=1e-3)
 
 
 @pytest.mark.parametrize('seed', [10, 11, 17])
