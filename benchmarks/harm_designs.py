@@ -7,6 +7,7 @@ from zlib import crc32
 
 import numpy as np
 from cell_simulator import RIPPLE, Arm, bent, poses, resized
+from harm_sensors import SENSORS, in_view
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.observations import Observations
@@ -92,6 +93,11 @@ DESIGNS = (
     ),
     Design('scale of 500 ppm', 40, what='scale', size=5e-4),
     Design('scale of 1 %', 40, what='scale', size=1e-2),
+    *(
+        Design(f'by {what}', 60, errors=SIZES, what=what, bends=('', 'ripple', 'soft', 'wavy'))
+        for what in SENSORS
+    ),
+    Design('board 0.3 % too large', 60, errors=SIZES, what='camera on the flange', size=3e-3),
     Design('auto', 40, ORDERS, model='auto'),
     Design('auto, bent', 40, ('local', 'half', 'path'), bends=('soft', 'wavy'), model='auto'),
     Design('auto, targets', 20, ORDERS, what='targets', bends=('', 'ripple'), model='auto'),
@@ -145,6 +151,9 @@ def session(design, number):
 def measured_by(design, arm, q, rng):
     """Return the arm in the end, and what makes a problem of the chain."""
     what, size = design.what, design.size
+    if what in SENSORS:
+        (seen, *more), options = SENSORS[what](arm, rng, size)
+        return arm, lambda chain: Problem(in_view(chain, what), seen, more=more, **options)
     oriented = rng.random() > 1.0 / 3.0
     options = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
     if what in ('test repeats', 'repeats'):
