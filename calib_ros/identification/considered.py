@@ -14,6 +14,7 @@ column is the sum of L dp/dL.
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -32,10 +33,15 @@ CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, fitted or not; couplings hardly show in moves of one joint."""
 
 
-def considered(chain: Chain, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the effects that an arm may have besides those among the names."""
+def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the effects that an arm may have besides those among the names.
+
+    So are DH parameters of these patterns: what is held at its nominal value may be off as well.
+    """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
+    held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
+    every += [name for name in chain.parameter_names if name in held and name.of_dh]
     return tuple(name for name in every if name not in names)
 
 

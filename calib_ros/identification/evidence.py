@@ -162,7 +162,7 @@ def posterior_of(
     else than the arm moves as well, with its standard deviation; `at_the_fit` are the last normal
     equations, if they are known. Nothing is `doubted` unless `judging` where it may be used.
     """
-    chain = chain.with_effects(more)
+    chain = chain.with_effects([name for name in more if not Parameter(name).of_dh])
     every = (*names, *more)
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)

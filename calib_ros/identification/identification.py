@@ -272,7 +272,7 @@ def _identified(
     coarse = rounded(problem)
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
-    posterior = fitted.posterior(size, considered(chain, names), doubts)
+    posterior = fitted.posterior(size, considered(chain, names, problem.fixed), doubts)
     found = _findings(fitted, before, posterior, validation, parameters, coarse)
     result = Identification(
         chain=chain,

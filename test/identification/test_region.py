@@ -68,6 +68,22 @@ def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
     assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_what_is_held_nominal_is_not_known(seed):
+    true, q = arm(seed), with_a_still_joint(seed, 0.0)
+    seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
+    still = identify(Problem(UR10E, seen)).not_excited
+    assert still
+    found = identify(Problem(UR10E, seen, fixed=still))
+    assert found.accepted
+    assert not found.region.whole
+    everywhere = UR10E.random_joints(500, np.random.default_rng(1))
+    near = everywhere[found.region.covers(everywhere)]
+    assert rms(found.chain, true, near) < rms(found.before, true, near)
+    left = found.chain.forward(near)[:, :3, 3] - true.forward(near)[:, :3, 3]
+    assert np.mean((left**2).sum(axis=1) / found.region.sigma(near) ** 2) < 2.0
+
+
 @pytest.mark.parametrize('errors', [0.1, 1.0, 10.0])
 @pytest.mark.parametrize('reach', [3e-4, 1e-3, 1e-2])
 def test_a_joint_that_hardly_moved_is_no_worse_where_it_may_be_used(reach, errors):
