@@ -26,6 +26,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -112,11 +114,18 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
         validation.after.configurations[judged],
     )
     if not gain > limit:
-        yield Reason(
-            Rule.GAIN,
-            f'no gain on held-out poses beyond chance (RMS {before.rms_mm:.3f} mm '
-            f'before, {after.rms_mm:.3f} mm after)',
+        text = (
+            f'no gain on held-out poses beyond chance (RMS {before.rms_mm:.3f} mm before, '
+            f'{after.rms_mm:.3f} mm after)'
         )
+        if gain > 0.0:
+            count = len(np.unique(validation.after.configurations[judged]))
+            kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
+            text += (
+                f': it differs so much between the {count} {kind} that chance alone may bring '
+                f'{before.rms_mm * np.exp(-limit):.3f} mm'
+            )
+        yield Reason(Rule.GAIN, text)
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
