@@ -60,6 +60,7 @@ from std_srvs.srv import Trigger
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.messages import NO_STAMP
 from calib_ros.sampling.sample import Sample
 
 LEG = 1.2
@@ -255,7 +256,7 @@ def run(options, seconds, folder):
     same = ('--namespace', options.namespace, '--frames', options.frames)
     idle = Process(__file__, '--role', 'empty', *same)
     flood = Process(__file__, '--role', 'publisher', '--rates', *options.rates, *same)
-    probes = ('dropped joints: zero stamp', 'dropped measurements: zero stamp')
+    probes = tuple(f'dropped {kind}: {NO_STAMP}' for kind in ('joints', 'measurements'))
     try:
         spin_until(lambda: all(name in values() for name in probes))
         spin_until(identify.service_is_ready)

@@ -92,7 +92,7 @@ def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
             type=kind,
             action='append' if many else 'store',
             default=[] if many else item.default,
-            metavar={float: 'X', int: 'N'}.get(kind, 'NAME'),
+            metavar='NAME,...' if many else {float: 'X', int: 'N'}.get(kind, 'NAME'),
             help=item.metadata['text'],
         )
 

@@ -203,7 +203,7 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
     for row in np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)[:1].tolist():
         raise InputError(
             f'{columns.where(row, "quaternion")} qx qy qz qw has length {lengths[row]:.6g}, '
-            'expected 1'
+            'expected 1: normalise it, and check the order of the columns'
         )
 
 

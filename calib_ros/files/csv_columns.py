@@ -211,7 +211,10 @@ def _irregular(path: Path, text: str, told: Told, above: int) -> MadeColumns:
             continue
         if any(row[len(header) :]):
             refuse_separator(path, header)
-            raise InputError(f'{path}, line {line}: more values than the {len(header)} columns')
+            raise InputError(
+                f'{path}, line {line}: more values than the {len(header)} columns of its header; '
+                'a table with other lines above that: calib_ros import'
+            )
         if len(rows) == MOST_ROWS:
             raise InputError(
                 f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'

@@ -156,10 +156,13 @@ class _Table:
         for name, ours in own.items():
             if ours in kept or ours in self._ours or lower.count(name.lower()) != 1:
                 continue
+            column = lower.index(name.lower())
             if ours in WORDS:
-                self._ours[ours] = f'#{lower.index(name.lower()) + 1}'
+                self._ours[ours] = f'#{column + 1}'
                 continue
-            kept[ours] = Expression.parse(f'#{lower.index(name.lower()) + 1}')
+            if ours[0] in 'sva' and ours[1:].isdigit() and self._sheet.header[column] != name:
+                continue  # the axes of KUKA are A1, A2, ...: no accelerations
+            kept[ours] = Expression.parse(f'#{column + 1}')
             if name != ours:
                 guessed.append(f'{ours} = {name}')
         if guessed:

@@ -9,6 +9,7 @@ back gets a second row, marked `removed`; nothing is ever deleted.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import fcntl
 import io
@@ -75,6 +76,13 @@ class Journal:
         """Write the header into a new file; leave out what a crash cut off."""
         expected = ','.join(header).encode() + b'\n'
         found = os.pread(self._file, len(expected), 0)
+        plain = found.removeprefix(codecs.BOM_UTF8).replace(b'\r', b'')
+        if plain != found and expected.startswith(plain):
+            raise InputError(
+                f'{self.path} was saved by another program (a byte order mark, or lines that end '
+                'in CR LF), so no rows can be added: save it without these, or move it. calib_ros '
+                'identify reads it as it is'
+            )
         if not expected.startswith(found):
             raise InputError(
                 f"{self.path} does not have this robot's columns: move it, or choose another "

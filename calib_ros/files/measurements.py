@@ -305,7 +305,7 @@ def _check_header(columns: Columns, joints: int) -> None:
             f'and, with orientation, {", ".join(QUATERNION)} as well (or '
             'distance, plane, or location and socket); found '
             f'{", ".join(columns.header) or "nothing"}. '
-            'Columns of other names: --columns q1=NAME,x=NAME,...'
+            'Columns of other names: --columns "q*=joint_*,x=NAME,..."'
         )
 
 

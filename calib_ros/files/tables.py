@@ -24,7 +24,14 @@ from calib_ros.escapes import to_cell
 from calib_ros.files.columns import Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
+from calib_ros.files.layouts import (
+    COVARIANCE,
+    POSITION,
+    QUATERNION,
+    TURNS,
+    UPPER,
+    joint_columns,
+)
 from calib_ros.files.measurements import (
     DISTANCE,
     PLANE,
@@ -94,7 +101,18 @@ def read_table(
         made, warnings = foreign.convert(path)
         return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
     data, warnings = _read(path, columns(joints))
-    return table_of(columns_of(path, data, told), joints, sessions, sigmas, eye_in_hand, warnings)
+    found = columns_of(path, data, told)
+    warnings = (*warnings, *_unread(found, joints))
+    return table_of(found, joints, sessions, sigmas, eye_in_hand, warnings)
+
+
+def _unread(found: Columns, joints: int) -> Iterator[str]:
+    """Yield which columns are not read that someone may have wanted to be."""
+    if f'q{joints + 1}' in found.header:
+        yield f'{found.path}: the column q{joints + 1} is left out: the arm has {joints} joints'
+    if {*TURNS} <= {*found.header} and QUATERNION[0] not in found.header:
+        turns = ', '.join(TURNS)
+        yield f'{found.path}: {turns} are left out: give --euler or --rotation-vector to use them'
 
 
 def table_of(

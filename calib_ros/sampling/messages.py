@@ -33,6 +33,8 @@ LINKS = (TRANSFORMS, *BODIES)
 """Types of messages that link several frames at once."""
 PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
+NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
 
 
 class MessageError(InputError):
@@ -114,7 +116,7 @@ def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]
             causes[cause] += count
             good[wrong] = False
 
-    refuse(found.stamps_ns <= 0, 'zero stamp')
+    refuse(found.stamps_ns <= 0, NO_STAMP)
     if kind in (JOINT_STATE, *PICTURES):
         return good, causes
     width = numbers.shape[1]
@@ -129,7 +131,7 @@ def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]
     if width >= 7:
         with np.errstate(over='ignore'):  # of numbers that are refused
             length = np.sqrt((numbers[:, 3:7] ** 2).sum(axis=1))
-        refuse(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE), 'quaternion not of length 1')
+        refuse(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE), NOT_UNIT)
     if width > 7:  # mostly all have the same
         rows = numbers[:, 7:]
         changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1

@@ -208,7 +208,7 @@ class Links:
         pair = f'parent={shlex.quote(parent)} child={shlex.quote(child)}'
         line = f'{self.topic} {kind}{pair}'
         quoted = f'"{line}"' if '"' not in line else shlex.quote(line)
-        return f'{words}; name what a device measures in sources, such as {quoted}'
+        return f'{words}; name what a device measures in sources (--sources), such as {quoted}'
 
     # Details
 

@@ -255,19 +255,31 @@ SKEW = GOOD.copy()
 SKEW[0, 1] = 0.5
 ZERO = np.diag([1, 1, 1, 1, 1, 0])
 BAD_POSES = [
-    (pose_stamped(0), 'measurements: zero stamp'),
+    (pose_stamped(0), 'measurements: zero stamp (fill header.stamp where it is published)'),
     (pose_stamped(105 * MS, (np.nan, 0, 0)), 'measurements: NaN or infinite position'),
     (pose_stamped(115 * MS, (0, 0, np.inf)), 'measurements: NaN or infinite position'),
-    (pose_stamped(125 * MS, quat=(0, 0, 0, 0)), 'measurements: quaternion not of length 1'),
-    (pose_stamped(135 * MS, quat=(0, 0, 0, 1.01)), 'measurements: quaternion not of length 1'),
-    (pose_stamped(145 * MS, quat=(0, 0, np.nan, 1)), 'measurements: quaternion not of length 1'),
+    (
+        pose_stamped(125 * MS, quat=(0, 0, 0, 0)),
+        'measurements: quaternion not of length 1 (normalise it where it is published)',
+    ),
+    (
+        pose_stamped(135 * MS, quat=(0, 0, 0, 1.01)),
+        'measurements: quaternion not of length 1 (normalise it where it is published)',
+    ),
+    (
+        pose_stamped(145 * MS, quat=(0, 0, np.nan, 1)),
+        'measurements: quaternion not of length 1 (normalise it where it is published)',
+    ),
     (point_stamped(155 * MS, (0, -np.inf, 0)), 'measurements: NaN or infinite position'),
-    (transform_stamped(0), 'measurements: zero stamp'),
+    (transform_stamped(0), 'measurements: zero stamp (fill header.stamp where it is published)'),
     (
         transform_stamped(165 * MS, child='a\nb'),
         'measurements: child frame whose name cannot be printed',
     ),
-    (transform_stamped(175 * MS, quat=(1, 1, 1, 1)), 'measurements: quaternion not of length 1'),
+    (
+        transform_stamped(175 * MS, quat=(1, 1, 1, 1)),
+        'measurements: quaternion not of length 1 (normalise it where it is published)',
+    ),
     (pose_with_covariance(185 * MS, NAN), 'measurements: covariance with NaN or infinite values'),
     (pose_with_covariance(195 * MS, SKEW), 'measurements: covariance not symmetric'),
     (pose_with_covariance(205 * MS, -GOOD), 'measurements: covariance not positive definite'),
@@ -292,7 +304,7 @@ def test_bad_measurements_are_dropped_and_counted_by_cause(tmp_path):
 
 
 BAD_JOINTS = [
-    (joint_state(0), 'joints: zero stamp'),
+    (joint_state(0), 'joints: zero stamp (fill header.stamp where it is published)'),
     (joint_state(55 * MS, (0.1, np.nan, 0.3)), 'joints: NaN or infinite joint value'),
     (joint_state(55 * MS, (0.1, np.inf, 0.3)), 'joints: NaN or infinite joint value'),
     (joint_state(55 * MS, (0.1, 0.2)), 'joints: names and positions differ in number'),

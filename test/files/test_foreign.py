@@ -334,6 +334,14 @@ def test_a_table_without_joint_values_is_refused(tmp_path, capsys):
     assert 'cell.csv has no joint values: name their columns' in capsys.readouterr().err
 
 
+def test_axes_called_like_accelerations_are_none(tmp_path):
+    text = text_of(JOINTS, PLACES, names=['A1', 'A2', 'x', 'y', 'z'])
+    path, out = tmp_path / 'cell.csv', tmp_path / 'out.csv'
+    path.write_text(text)
+    assert main(['import', str(path), '--columns', 'q*=A*', '--out', str(out)]) == 0
+    assert out.read_text().splitlines()[0] == 'q1,q2,x,y,z'
+
+
 @pytest.mark.parametrize('row', ['1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5'])
 def test_a_table_of_semicolons_says_what_to_give(tmp_path, row):
     path = tmp_path / 'cell.csv'

@@ -215,6 +215,18 @@ def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, conten
     assert path.read_text() == content
 
 
+@pytest.mark.parametrize(('mark', 'end'), [(b'\xef\xbb\xbf', b'\n'), (b'', b'\r\n')])
+def test_a_journal_that_a_spreadsheet_saved_is_refused_for_that(tmp_path, mark, end):
+    path = tmp_path / 'cell.csv'
+    written(path, [plain(1)])
+    content = mark + path.read_bytes().replace(b'\n', end)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match='was saved by another program'):
+        Journal(path, JOINTS)
+    assert path.read_bytes() == content
+    assert_equal(read_journal(path, JOINTS)[0], [plain(1)])
+
+
 @pytest.mark.parametrize('tail', [b'', b'1,2', b'\0' * 10, b'\0' * 200_000])
 def test_what_a_crash_left_behind_the_last_row_is_cut_off(tmp_path, tail):
     path = tmp_path / 'cell.csv'

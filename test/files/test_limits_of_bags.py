@@ -157,7 +157,7 @@ def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, r
 @pytest.mark.parametrize(
     ('cause', 'refused'),
     [
-        ('measurements: zero stamp', True),
+        ('measurements: zero stamp (fill header.stamp where it is published)', True),
         ('measurements: later than lateness allows', True),
         ('measurements: same stamp twice', False),
         ('measurements: NaN or infinite position', False),

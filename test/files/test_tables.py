@@ -233,3 +233,19 @@ def test_sessions_come_in_the_order_asked_for(tmp_path):
     found = read_table(path, 2, ('B', 'A')).fitted
     assert [each.positions[:, 0].tolist() for each in found] == [[2.0], [1.0, 3.0]]
     assert [each.base for each in found] == ['base', 'base_A']
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('q1,q2,q3,x,y,z\n0,0,0,1,2,3\n', 'the column q3 is left out: the arm has 2 joints'),
+        ('q1,q2,x,y,z,rx,ry,rz\n0,0,1,2,3,0,0,0\n', 'rx, ry, rz are left out: give --euler'),
+        ('q1,q2,x,y,z,rx,qx,qy,qz,qw\n0,0,1,2,3,0,0,0,0,1\n', ''),
+    ],
+)
+def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
+    path = tmp_path / 'cell.csv'
+    path.write_text(text)
+    warnings = read_table(path, 2).warnings
+    assert len(warnings) == bool(said)
+    assert all(said in each for each in warnings)

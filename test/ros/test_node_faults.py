@@ -235,9 +235,9 @@ def test_broken_messages_are_counted_by_cause(cell, recording):
     assert cell.node.session.account().dropped == {
         'joints: NaN or infinite joint value': 1,
         'joints: names and positions differ in number': 1,
-        'joints: zero stamp': 1,
+        'joints: zero stamp (fill header.stamp where it is published)': 1,
         'measurements: NaN or infinite position': 1,
-        'measurements: quaternion not of length 1': 2,
+        'measurements: quaternion not of length 1 (normalise it where it is published)': 2,
     }
 
 

@@ -145,7 +145,7 @@ def test_what_cannot_be_used_is_told_by_its_cause(good, bad, cause):
     found = Readings(np.array([5, 6, 0]), ('tracker',), np.array([good, bad, good]))
     usable_, causes = usable('', found)
     assert usable_.tolist() == [True, False, False]
-    assert causes == {cause: 1, 'zero stamp': 1}
+    assert causes == {cause: 1, 'zero stamp (fill header.stamp where it is published)': 1}
 
 
 def trajectory(frame_id, names, points):

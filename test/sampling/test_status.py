@@ -104,7 +104,10 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
 
 @pytest.mark.parametrize(
     ('stamp', 'value', 'cause'),
-    [(10**18, np.nan, 'NaN or infinite joint value'), (0, 0.1, 'zero stamp')],
+    [
+        (10**18, np.nan, 'NaN or infinite joint value'),
+        (0, 0.1, 'zero stamp (fill header.stamp where it is published)'),
+    ],
 )
 def test_the_status_tells_why_no_joint_state_is_used(stamp, value, cause):
     made = session()

@@ -278,8 +278,14 @@ def test_a_pair_that_repeats_is_one_measurement(tmp_path, rng):
             lambda bad: setattr(bad.transform.translation, 'x', np.nan),
             'NaN or infinite position',
         ),
-        (lambda bad: setattr(bad.transform.rotation, 'w', 3.0), 'quaternion not of length 1'),
-        (lambda bad: setattr(bad.header.stamp, 'sec', -1), 'zero stamp'),
+        (
+            lambda bad: setattr(bad.transform.rotation, 'w', 3.0),
+            'quaternion not of length 1 (normalise it where it is published)',
+        ),
+        (
+            lambda bad: setattr(bad.header.stamp, 'sec', -1),
+            'zero stamp (fill header.stamp where it is published)',
+        ),
     ],
 )
 def test_bad_transforms_are_counted_if_they_are_of_the_pair(rng, change, cause, big_endian):
