@@ -295,9 +295,14 @@ def _judged(
 
 
 def _applied(previous: Calibration, start: Chain, change: Mapping[str, float]) -> Chain:
-    """Return a chain with changes of what was fitted; effects that were considered stay zero."""
-    own = {name: x for name, x in change.items() if name in previous.names}
+    """Return a chain with changes of the arm; effects that were considered stay zero."""
+    own = {name: x for name, x in change.items() if _kept(previous, name)}
     return replace(start, effects=previous.chain.effects).with_offsets(own)
+
+
+def _kept(previous: Calibration, name: str) -> bool:
+    """Tell whether a change is one of the calibration: of what was fitted, or held nominal."""
+    return name in previous.names or Parameter(name).of_dh
 
 
 def _updated(
@@ -320,7 +325,7 @@ def _updated(
         else:
             moved = motion @ here.matrix
         before = before.with_frame(name, replace(here, matrix=moved))
-    own = [arm.names.index(Parameter(name)) for name in previous.names if name in arm.names]
+    own = [k for k, name in enumerate(arm.names) if _kept(previous, name)]
     names = tuple(arm.names[k] for k in own)
     region = previous.region
     if region is not None:

@@ -61,6 +61,26 @@ def test_a_bent_link_is_named(earlier):
     assert rms(found.calibration.chain, now, Q) < 0.3 * rms(previous.chain, now, Q)
 
 
+@pytest.mark.parametrize('seed', range(2))
+def test_what_was_held_nominal_may_be_told_by_new_poses(seed):
+    """The elbow stood still in the earlier session, then first still and then not."""
+    rng = np.random.default_rng(seed)
+    true = faulty(UR10E, Cell(), rng)
+    q = [UR10E.random_joints(count, rng) for count in (60, 20, 20)]
+    q[0][:, 2] = q[1][:, 2] = 1.4
+    first, still, moved = (
+        Problem(UR10E, measure(true, each, rng, *NOISE), **SIGMAS) for each in q
+    )
+    fixed = identify(first).not_excited
+    previous = Calibration.of(identify(replace(first, fixed=fixed)))
+    same, now = (recalibrate(previous, each, 0.1) for each in (still, moved))
+    assert same.accepted
+    assert same.after.rms_mm < 1.1 * same.before.rms_mm
+    assert now.accepted
+    assert rms(now.calibration.chain, true, Q) < 0.1 * rms(previous.chain, true, Q)
+    assert set(fixed) <= set(now.calibration.names)
+
+
 def test_of_an_arm_that_has_not_changed_nothing_is_claimed(earlier):
     """Of 8 sets of 8 poses at 0.5 % each, one claim is improbable (4 %); seeded."""
     true, previous = earlier

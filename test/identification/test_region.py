@@ -68,13 +68,15 @@ def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
     assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
 
 
+@pytest.mark.parametrize('way', ['fixed', 'priors'])
 @pytest.mark.parametrize('seed', range(3))
-def test_what_is_held_nominal_is_not_known(seed):
+def test_what_is_held_nominal_is_not_known(seed, way):
     true, q = arm(seed), with_a_still_joint(seed, 0.0)
     seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
     still = identify(Problem(UR10E, seen)).not_excited
     assert still
-    found = identify(Problem(UR10E, seen, fixed=still))
+    held = {'fixed': still} if way == 'fixed' else {'priors': dict.fromkeys(still, 1e-3)}
+    found = identify(Problem(UR10E, seen, **held))
     assert found.accepted
     assert not found.region.whole
     everywhere = UR10E.random_joints(500, np.random.default_rng(1))
