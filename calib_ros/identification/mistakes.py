@@ -123,17 +123,18 @@ def explained(problem: Problem) -> Explained | None:
         found = _tried(each.chain or chain, tuple(map(each.change, map(_few, whole))))
         if found is not None and found.share < given.share:
             rough.append((found.share, k, each, found))
+    largest = problem.largest_error + LEVER * problem.largest_angle / 3.0
     tried = []
     for _, k, each, found in sorted(rough, key=lambda one: one[:2])[:POLISHED]:
         so = _polished(problem, found)
-        tried.append((so.share, k, each, so))
+        if so.error <= largest:  # an arm in mm fits places in mm, and is off by metres
+            tried.append((so.share, k, each, so))
     if not tried:
         return None
     tried.sort(key=lambda one: one[:2])
     best = tried[0][3]
     given = min(given, _polished(problem, given), key=lambda one: one.share)
-    largest = problem.largest_error + LEVER * problem.largest_angle / 3.0
-    if best.error > min(largest, NEARER * given.error):
+    if best.error > NEARER * given.error:
         return None
     if best.share > NEARER * min(given.share, 1.0):
         return None

@@ -239,7 +239,16 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
 
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
-    """Yield the other convention, and other arms with the same kinds of joints."""
+    """Yield lengths in mm, the other convention, and other arms with the same kinds of joints."""
+    small = [replace(j, a=SCALES['mm'] * j.a, d=SCALES['mm'] * j.d) for j in chain.joints]
+    remedy = 'give a and d in metres there'
+    yield Suspect(
+        'the lengths of the chain file are in mm, not metres',
+        remedy,
+        _as_it_is,
+        chain=replace(chain, joints=tuple(small)),
+        published=remedy,
+    )
     other = 'modified' if chain.convention == 'standard' else 'standard'
     yield Suspect(
         f'the DH table is in the {other} convention, not the {chain.convention} one',

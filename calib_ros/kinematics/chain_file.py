@@ -45,6 +45,8 @@ CHAIN_KEYS = (
 )
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
+TWO_TURNS = 4.0 * math.pi
+"""What no angle of a table exceeds [rad]: degrees do, all that tables have."""
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 
 
@@ -260,6 +262,12 @@ def _joint(row: object, where: str) -> Joint:
         for key in (*DH_KINDS, 'sign', 'mass', 'gear_ratio')
         if content.get(key) is not None
     }
+    for key in ('alpha', 'theta', 'beta'):
+        if abs(numbers.get(key, 0.0)) > TWO_TURNS:
+            raise ConfigError(
+                f'{where}: {key} must be in radians, not {numbers[key]:g}: write degrees as '
+                f'{math.radians(numbers[key]):.9g}'
+            )
     for key in ('lower', 'upper'):
         if content.get(key) is not None:
             limit = parse_number(content[key], f'{where}: {key}', largest=math.inf)

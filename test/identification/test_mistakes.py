@@ -111,6 +111,12 @@ def test_another_robot_and_the_other_convention_are_named():
     assert 'convention: standard' in str(explained(Problem(other, seen)))
 
 
+def test_a_chain_file_in_millimetres_is_named():
+    rows = tuple(replace(joint, a=1e3 * joint.a, d=1e3 * joint.d) for joint in UR.joints)
+    named = identify(Problem(replace(UR, joints=rows), seen_of())).refusals[0]
+    assert 'the lengths of the chain file are in mm, not metres' in named
+
+
 @pytest.mark.parametrize(
     ('mistake', 'remedy'),
     [

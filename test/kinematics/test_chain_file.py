@@ -211,6 +211,7 @@ WRONG = [
     ('name: joint_1', 'name: null', 'joint 1: key "name" is missing'),
     ('convention: standard', '', 'key "convention" is missing'),
     ('joints:', 'calibration:', 'key "joints" is missing'),
+    ('theta: 0.0', 'theta: 90', 'joint 1: theta must be in radians, not 90: write .* as 1.570796'),
     ('sign: 1', 'sign: 2', 'joint 1: sign must be 1 or -1, not 2'),
     ('sign: 1', 'lower: 2, upper: 1', 'limits of joint "joint_1"'),
     ('name: joint_2', 'name: joint_1', 'two joints named "joint_1"'),
