@@ -114,18 +114,13 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
         validation.after.configurations[judged],
     )
     if not gain > limit:
-        text = (
-            f'no gain on held-out poses beyond chance (RMS {before.rms_mm:.3f} mm before, '
-            f'{after.rms_mm:.3f} mm after)'
-        )
+        text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
         if gain > 0.0:
             count = len(np.unique(validation.after.configurations[judged]))
             kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
-            text += (
-                f': it differs so much between the {count} {kind} that chance alone may bring '
-                f'{before.rms_mm * np.exp(-limit):.3f} mm'
-            )
-        yield Reason(Rule.GAIN, text)
+            chance = before.rms_mm * np.exp(-limit)
+            text += f'; with {count} {kind} chance alone may give {chance:.3f} mm'
+        yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
