@@ -52,3 +52,22 @@ def test_rows_that_join_parallel_axes_are_found_unless_both_are_prismatic(
 def test_a_nominal_beta_tilts_the_axis():
     rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.2, 0.0]))
     assert Chain('arm', 'standard', rows).parallel == ('j0',)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'lower', 'upper', 'expected'),
+    [
+        ('revolute', None, None, (-np.pi, np.pi)),
+        ('prismatic', None, None, (-0.5, 0.5)),
+        ('revolute', -0.5, 0.2, (-0.5, 0.2)),
+        ('prismatic', -4.0, 4.0, (-4.0, 4.0)),
+        # Where one end is missing, as far as without limits, and no less than the whole stroke.
+        ('prismatic', -1.5, None, (-1.5, 0.5)),
+        ('prismatic', 0.2, None, (0.2, 1.2)),
+        ('prismatic', None, 1.5, (-0.5, 1.5)),
+        ('prismatic', None, -0.2, (-1.2, -0.2)),
+    ],
+)
+def test_a_joint_ranges_over_its_limits_and_a_whole_stroke_without(kind, lower, upper, expected):
+    found = Joint('j', kind, lower=lower, upper=upper).range
+    assert found == pytest.approx(expected, abs=1e-12)
