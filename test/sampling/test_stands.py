@@ -17,7 +17,8 @@ def planned(stands, until, newest, done=0, sampled=0, settings=SETTINGS):
     stands = np.array(stands, dtype=np.int64).reshape(-1, 2) * S
     plan.of_stands(stands, until * S, None if newest is None else newest * S, settings)
     assert plan.done_ns == (plan.ends[-1] if plan.ends else done * S)
-    return [(e // S, why, b // S) for e, why, b in zip(plan.ends, plan.why, plan.begins)]
+    found = zip(plan.ends, plan.why, plan.begins, strict=True)
+    return [(end // S, why, begin // S) for end, why, begin in found]
 
 
 @pytest.mark.parametrize(
@@ -72,7 +73,8 @@ def test_a_stop_seen_before_is_known_where_and_when_it_was():
     assert known.meets([(20, 30)], where, near) == [True]  # they touch
     assert known.meets([(5, 10)], where, near) == [True]
     assert known.meets([(12, 14)], where - [2.0 * np.pi, 0.0], near) == [True]
-    assert known.meets([(12, 14)], where + [0.9e-3, -0.9e-3], near) == [True]
+    assert known.meets([(12, 14)], where + 0.9 * near, near) == [True]
+    assert known.meets([(12, 14)], where + 1.1 * near, near) == [False]
     assert known.meets([(12, 14)], where - [0.0, 2.0 * np.pi], near) == [False]
     assert known.meets([(1, 9), (21, 22)], np.repeat(where, 2, axis=0), near) == [False, False]
 
