@@ -96,3 +96,6 @@ def test_delays_of_a_frame_add_up():
     assert later.delay == 0.25
     assert later.moved({DELAY: 0.5}).delay == 0.75
     assert later.moved({'x': 1.0}).delay == 0.25
+    chain = row_of((HALF, 0.0), 'standard')
+    assert chain.value(f'base.{DELAY}') == 0.0
+    assert chain.with_frame('base', later).value(f'base.{DELAY}') == 0.25
