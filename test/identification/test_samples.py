@@ -58,3 +58,19 @@ def test_residuals_are_those_of_the_joint_values_at_the_delay():
         joints, velocity = Samples(seen, 1.0, 1.0).moving(chain)
         np.testing.assert_array_equal(joints, seen.joints.T)
         assert velocity is None
+
+
+@pytest.mark.parametrize('correlated', [False, True])
+def test_rows_of_positions_among_poses_are_those_of_each_alone(correlated):
+    rng = np.random.default_rng(0)
+    seen = measure(arm(0), UR10E.random_joints(4, rng), rng, 5e-5, 2e-4)
+    seen = replace(seen, oriented=np.array([True, False, False, True]))
+    if correlated:
+        seen = replace(seen, covariance=1e-8 * np.tile(SPREAD, (4, 1, 1)))
+    names = UR10E.parameter_names[:4]
+    found = Samples(seen, 3e-4, 7e-4).rows_of(UR10E, names)
+    for k, oriented in enumerate(seen.oriented):
+        alone = Samples(seen.select(np.array([k])), 3e-4, 7e-4).rows_of(UR10E, names)
+        same = slice(0, 6 if oriented else 3)
+        np.testing.assert_allclose(found[:, same, k], alone[:, same, 0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(found[:, same.stop :, k], 0.0)

@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.joint import Frame
+from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS
 
 HALF = np.pi / 2
 
@@ -52,3 +55,47 @@ def test_rows_that_join_parallel_axes_are_found_unless_both_are_prismatic(
 def test_a_nominal_beta_tilts_the_axis():
     rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.2, 0.0]))
     assert Chain('arm', 'standard', rows).parallel == ('j0',)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'lower', 'upper', 'expected'),
+    [
+        ('revolute', None, None, (-np.pi, np.pi)),
+        ('prismatic', None, None, (-0.5, 0.5)),
+        ('revolute', -0.5, 0.2, (-0.5, 0.2)),
+        ('prismatic', -4.0, 4.0, (-4.0, 4.0)),
+        # Where one end is missing, as far as without limits, and no less than the whole stroke.
+        ('prismatic', -1.5, None, (-1.5, 0.5)),
+        ('prismatic', 0.2, None, (0.2, 1.2)),
+        ('prismatic', None, 1.5, (-0.5, 1.5)),
+        ('prismatic', None, -0.2, (-1.2, -0.2)),
+    ],
+)
+def test_a_joint_ranges_over_its_limits_and_a_whole_stroke_without(kind, lower, upper, expected):
+    found = Joint('j', kind, lower=lower, upper=upper).range
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_joint_drives_its_angle_or_its_length():
+    assert Joint('j').driven.kind == 'theta'
+    assert Joint('j', 'prismatic').driven.kind == 'd'
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_frame_moves_by_its_offsets(seed):
+    first, second = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, 6))
+    start = Frame().moved(dict(zip(FRAME_KINDS, first, strict=True)))
+    moved = start.moved(dict(zip(FRAME_KINDS, second, strict=True)))
+    np.testing.assert_allclose(start.offsets(), first, atol=1e-12)
+    np.testing.assert_allclose(moved.offsets(start), second, atol=1e-12)
+
+
+def test_delays_of_a_frame_add_up():
+    assert Frame().moved({'x': 1.0}).delay is None
+    later = Frame().moved({DELAY: 0.25})
+    assert later.delay == 0.25
+    assert later.moved({DELAY: 0.5}).delay == 0.75
+    assert later.moved({'x': 1.0}).delay == 0.25
+    chain = row_of((HALF, 0.0), 'standard')
+    assert chain.value(f'base.{DELAY}') == 0.0
+    assert chain.with_frame('base', later).value(f'base.{DELAY}') == 0.25

@@ -6,7 +6,7 @@ from hypothesis import given, strategies as st
 
 from calib_ros.kinematics import se3
 from calib_ros.sampling.making import ROW_WIDTH, Maker, Matched
-from calib_ros.sampling.slices import StreamKey
+from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice, StreamKey
 from calib_ros.sampling.track import Motion
 
 POSE = StreamKey('', '', False, False, False)
@@ -51,3 +51,15 @@ def test_the_rotation_of_a_spike_does_not_count(rng):
     assert first.count == second.count == 19
     for sample in (first, second):
         np.testing.assert_allclose(sample.rotation, np.eye(3), atol=1e-12)
+
+
+def test_a_delay_is_taken_off_the_stamps_of_measurements_alone():
+    joints = Piece(('j1',), np.array([0, 4]), np.array([70, 90]), np.zeros((2, 1)))
+    poses = Piece(POSE, np.array([1, 2]), np.array([80, 100]), np.zeros((2, ROW_WIDTH)))
+    found = Slice.of([poses, joints], 5)
+    assert found.times.tolist() == [70, 75, 95, 90]
+    assert found.where(JOINTS).tolist() == [0, 3]
+    assert found.where(POSES).tolist() == [1, 2]
+    later = found.between(2, 4)
+    assert later.times.tolist() == [95, 90]
+    assert [each.stamps.tolist() for each in later.pieces] == [[100], [90]]

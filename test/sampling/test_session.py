@@ -276,3 +276,11 @@ def test_samples_on_a_target_that_the_calibration_does_not_know_are_no_judges():
     drive(made, 3, [(Source('x', target='new'), *tracker()[1:])])
     with pytest.raises(InputError, match='does not know'):
         made.validate()
+
+
+def test_samples_of_another_frame_are_not_used_even_where_there_is_no_other():
+    made = session(samples(30, frame_id='left'))
+    assert len(made.problem().sets) == 1
+    made.change(replace(made.settings, frame_id='right'))
+    with pytest.raises(InputError, match='30 x poses left out, in another frame'):
+        made.problem()

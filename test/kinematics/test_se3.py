@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from scipy.linalg import expm
+
+from calib_ros.kinematics import se3
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+@pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-4, 0.3, 2.0, 3.1])
+@given(SEEDS)
+def test_a_turn_is_the_exponential(angle, seed):
+    axis = np.random.default_rng(seed).normal(size=3)
+    vector = angle * axis / np.linalg.norm(axis)
+    expected = expm(se3.skew(vector))
+    np.testing.assert_allclose(se3.turned(*vector), expected, rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(se3.exp_rotation(vector), expected, rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize('angle', [0.0, 1e-7, 1e-3, 0.3, 2.0, 3.0])
+@given(SEEDS)
+def test_the_left_jacobian_is_the_central_difference(angle, seed):
+    axis = np.random.default_rng(seed).normal(size=3)
+    vector = angle * axis / np.linalg.norm(axis)
+    step, end = 1e-5, se3.exp_rotation(vector)
+    less, more = (
+        se3.log_rotation(se3.exp_rotation(sign * step * np.eye(3)) @ end) for sign in (-1, 1)
+    )
+    expected = (more - less).T / (2.0 * step)
+    np.testing.assert_allclose(se3.left_jacobian_inverse(vector), expected, atol=1e-7)
+
+
+@given(SEEDS)
+def test_of_a_matrix_the_nearest_rotation_is_no_reflection(seed):
+    matrix = np.random.default_rng(seed).normal(size=(2, 3, 3))
+    found = se3.nearest_rotation(matrix)
+    np.testing.assert_allclose(np.linalg.det(found), 1.0)
+    near = se3.exp_rotation(1e-3 * np.vstack([np.eye(3), -np.eye(3)]))
+    for rotation, wanted in zip(found, matrix, strict=True):
+        distance = np.linalg.norm(near @ rotation - wanted, axis=(1, 2))
+        assert (distance >= np.linalg.norm(rotation - wanted)).all()
+
+
+@given(SEEDS)
+def test_quaternions_come_back_with_a_positive_w(seed):
+    quat = np.random.default_rng(seed).normal(size=(3, 4))
+    unit = quat / np.linalg.norm(quat, axis=1, keepdims=True)
+    found = se3.to_quat(se3.from_quat(quat))
+    np.testing.assert_allclose(found, unit * np.sign(unit[:, 3:]), atol=1e-12)

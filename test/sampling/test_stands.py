@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from calib_ros.sampling.slices import Piece, Slice, StreamKey
+from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
+from calib_ros.sampling.stops import SPIKE
+from calib_ros.sampling.waiting import Waiting
+from calib_ros.settings import Settings
+
+S = 10**9
+MOVING, SHORT = 'the arm was moving', 'the stop was too short'
+SETTINGS = Settings(shortest_stop=1.0, longest_stop=3.0)
+
+
+def planned(stands, until, newest, done=0, sampled=0, settings=SETTINGS):
+    plan = Plan(done * S, sampled * S)
+    stands = np.array(stands, dtype=np.int64).reshape(-1, 2) * S
+    plan.of_stands(stands, until * S, None if newest is None else newest * S, settings)
+    assert plan.done_ns == (plan.ends[-1] if plan.ends else done * S)
+    found = zip(plan.ends, plan.why, plan.begins, strict=True)
+    return [(end // S, why, begin // S) for end, why, begin in found]
+
+
+@pytest.mark.parametrize(
+    ('stands', 'until', 'newest', 'expected'),
+    [
+        ([], 10, 12, [(10, MOVING, 0)]),
+        # A stop of just the shortest time is one; what is left of a longer one is not used.
+        ([(2, 3)], 10, 12, [(2, MOVING, 0), (3, '', 2), (10, MOVING, 0)]),
+        ([(2, 9)], 10, 12, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
+        # One that goes on is waited for, unless it has the longest time already.
+        ([(2, 4)], 4, 4, [(2, MOVING, 0)]),
+        ([(2, 5)], 5, 5, [(2, MOVING, 0)]),
+        ([(2, 6)], 5, 6, [(2, MOVING, 0), (5, '', 2)]),
+        ([(2, 6)], 4, 6, [(2, MOVING, 0)]),
+        # Without a newest stamp everything ends.
+        ([(2, 6)], 4, None, [(2, MOVING, 0), (4, '', 2)]),
+        ([(12, 16)], 10, 16, [(10, MOVING, 0)]),
+    ],
+)
+def test_stands_become_stops(stands, until, newest, expected):
+    assert planned(stands, until, newest) == expected
+
+
+def test_a_short_stand_is_none():
+    settings = Settings(shortest_stop=2.0, longest_stop=3.0)
+    assert planned([(2, 3), (5, 7)], 10, 12, settings=settings) == [
+        (2, MOVING, 0),
+        (3, SHORT, 0),
+        (5, MOVING, 0),
+        (7, '', 5),
+        (10, MOVING, 0),
+    ]
+
+
+@pytest.mark.parametrize('begin', [3, 5])
+def test_of_a_stop_that_was_sampled_nothing_more_is_used(begin):
+    assert planned([(begin, 8)], 10, 12, 5, 5) == [(8, SAMPLED, 0), (10, MOVING, 0)]
+
+
+def test_what_was_dealt_with_is_not_dealt_with_again():
+    assert planned([(1, 5), (6, 8)], 10, 12, 5, 0) == [
+        (6, MOVING, 0),
+        (8, '', 6),
+        (10, MOVING, 0),
+    ]
+
+
+def test_a_stop_seen_before_is_known_where_and_when_it_was():
+    known = Known(np.array([True, False]), 9)
+    where, near = np.array([[3.0, 0.2]]), 1e-3
+    assert known.meets([(10, 20)], where, near) == [False]
+    assert known.meets([(20, 30)], where, near) == [True]  # they touch
+    assert known.meets([(5, 10)], where, near) == [True]
+    assert known.meets([(12, 14)], where - [2.0 * np.pi, 0.0], near) == [True]
+    assert known.meets([(12, 14)], where + 0.9 * near, near) == [True]
+    assert known.meets([(12, 14)], where + 1.1 * near, near) == [False]
+    assert known.meets([(12, 14)], where - [0.0, 2.0 * np.pi], near) == [False]
+    assert known.meets([(1, 9), (21, 22)], np.repeat(where, 2, axis=0), near) == [False, False]
+
+
+@pytest.mark.parametrize(('stamp', 'met'), [(9, True), (10, False), (20, False), (21, True)])
+def test_only_the_stop_that_stands_at_a_stamp_is_forgotten(stamp, met):
+    known = Known(np.array([True]), 9)
+    where = np.zeros((1, 1))
+    known.meets([(10, 20)], where, 1e-3)
+    known.forget(stamp)
+    assert known.meets([(10, 20)], where, 1e-3) == [met]
+
+
+def test_rests_unseen_count_once_each_up_to_a_capacity():
+    rests = Rests(3)
+    assert rests.needed(0.0) is None
+    rests.note(1.0)
+    assert rests.needed(0.0) == SPIKE
+    for noise in (9.0, None, 2.0, None, 4.0, None, 8.0):  # 9 within the first, 8 too many
+        rests.note(noise)
+    assert rests.needed(0.0) == SPIKE * 2.0
+    assert rests.needed(SPIKE * 2.0) is None
+    rests.sampled = 2
+    assert rests.needed(0.0) == SPIKE * 2.0
+    rests.sampled = 3
+    assert rests.needed(0.0) is None
+
+
+def test_a_stop_shows_from_its_shortest_time_on_until_it_is_dealt_with():
+    stands = np.array([[10, 20]])
+    rounds = [13, 14, 19, 23, 24, 25]
+    found = seen_stops(stands, rounds, 9, 4, 4)
+    assert found == [False, True, True, True, True, False]
+    assert seen_stops(stands, [15], 20, 4, 4) == [False]
+    assert seen_stops(stands, [15], 19, 4, 4) == [True]
+
+
+def test_there_is_room_up_to_the_first_message_that_does_not_fit():
+    key = StreamKey('', '', False, False, False)
+    joints = Piece(('j',), np.array([0]), np.array([0]), np.zeros((1, 1)))
+    poses = Piece(key, np.array([1, 3, 4]), np.array([5, 6, 7]), np.zeros((3, 1)))
+    dropped = Counter()
+    waiting, given = Waiting(1, 3, dropped, lambda key: False), Slice.of([joints, poses])
+    assert waiting.room(given) == len(given) == 4
+    waiting.extend(key, np.array([1, 2]), np.zeros((2, 1)), 1)
+    assert (waiting.count, dropped.total()) == (1, 1)
+    assert waiting.room(given) == 3
+    waiting.extend(key, np.array([2, 3]), np.zeros((2, 1)), 1)
+    assert (waiting.count, waiting.room(given)) == (3, 1)
