@@ -12,7 +12,8 @@ the quantile of its values for d ~ N(d, C).
 What neither model has shows in both calibrations, and differently where other poses were measured;
 so do smooth errors of a device that stands elsewhere (`device.py`). The covariances of noise know
 nothing of it; the expected squares of errors do (`region.py`). A difference that is significant by
-the former only, is told as what it is.
+the former only, is told as what it is. Where a calibration held DH parameters at nominal, the
+fitted ones contain part of their errors: its expected squares stand for its covariance, too.
 """
 
 from __future__ import annotations
@@ -149,14 +150,15 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     square, lacking = np.zeros((2, len(names), len(names)))
     for each in (first, second):
         assert each.covariance is not None
-        own = _in_names(each.chain, names, each.names, each.covariance)
-        square += own
+        own = whole = _in_names(each.chain, names, each.names, each.covariance)
         region = each.region
-        if region is None:
-            lacking += own
-        else:
+        if region is not None:
             either = region.square + region.device @ region.device.T
-            lacking += _in_names(region.chain, names, region.names, either)
+            whole = _in_names(region.chain, names, region.names, either)
+            if any(Parameter(n).of_dh and n not in each.names for n in region.names):
+                own = whole
+        square += own
+        lacking += whole
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
     told = _told(names, change, lacking)

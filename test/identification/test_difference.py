@@ -26,9 +26,12 @@ NOISE = (5e-5, 2e-4)
 UR10 = DATA / 'ur10_ipa_leica'
 
 
-def calibrated(true, seed, **more):
+def calibrated(true, seed, still=None, **more):
     rng = np.random.default_rng(seed)
-    seen = measure(true, UR.random_joints(50, rng), rng, *NOISE)
+    q = UR.random_joints(50, rng)
+    if still is not None:
+        q[:, still] = 1.0
+    seen = measure(true, q, rng, *NOISE)
     sigmas = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
     return Calibration.of(identify(Problem(UR, seen, **sigmas, **more)))
 
@@ -56,6 +59,18 @@ def test_an_arm_that_has_not_changed_is_the_same_wherever_the_device_stands(nigh
         assert found.limit < 1e-4
         assert found.left < 1e-7
         assert found.in_words().startswith('unchanged within 0.0')
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_what_was_held_nominal_is_no_change(nights, seed):
+    """The elbow stood still, and its parameters are in others that were fitted."""
+    true, first = nights
+    fixed = ['elbow_joint.*', 'shoulder_lift_joint.*']
+    found = difference(calibrated(true, seed, still=2, fixed=fixed), first)
+    assert found.same
+    assert found.rms > 2e-4
+    slipped = true.with_offsets({'wrist_1_joint.theta': 0.02})
+    assert not difference(calibrated(slipped, seed, still=2, fixed=fixed), first).same
 
 
 @pytest.mark.parametrize(('name', 'seed'), [('ur10', 0), ('staubli_tx90l', 2)])
