@@ -19,9 +19,9 @@ from calib_ros.kinematics.se3 import FloatArray
 class Visibility:
     """Where the measuring device sees the target.
 
-    `box` (2, 3) [m] has the corners of the measurable region, `tracker` (3,) [m] is where the
-    device stands, both in the `world` or else in the arm's base frame. The `axis` in the target's
-    frame points to the device within a `cone` [rad].
+    `box` (2, 3) [m] holds two opposite corners of the measurable region, `tracker` (3,) [m] the
+    position of the device, both in the `world` or else in the arm's base frame. The `axis` in the
+    target's frame must point to the device within a `cone` [rad].
     """
 
     box: FloatArray | None = None
@@ -76,7 +76,7 @@ def draw_candidates(
 ) -> FloatArray:
     """Draw joint values (count, n) within the limits at which the target can be measured.
 
-    The region is out of reach where so many `tries` for each do not find them.
+    The region counts as out of reach after so many `tries` for each.
     """
     found = np.zeros((0, len(design.chain.joints)))
     drawn = 0
@@ -94,11 +94,11 @@ def draw_candidates(
 
 
 def visit_order(joints: FloatArray, velocities: FloatArray) -> NDArray[np.intp]:
-    """Return an order (N,) of visiting configurations (N, n) that takes little time.
+    """Return a fast order (N,) in which to visit configurations (N, n).
 
-    The time of a move is that of the joint which takes longest, at `velocities` (n,) [rad/s or
-    m/s]. Nearest neighbour from the configuration that lies farthest out, then parts of the way
-    are turned round while that shortens it (2-opt; Croes 1958).
+    The slowest joint, at `velocities` (n,) [rad/s or m/s], determines the time of a move. Nearest
+    neighbour from the outermost configuration, then parts of the path are reversed while that
+    shortens it (2-opt; Croes 1958).
     """
     travel = travel_times(joints, velocities)
     count = len(joints)

@@ -9,10 +9,10 @@ of freedom, which makes it a normal variable z, independent of those before. Two
 
     S_0 = 0        S = max(0, S + z - k)
 
-look for shifts of about 2 k: a small k for what creeps, a large one for what jumps. An alarm is
-S > h. How many nights pass until a false one, on average, follows from the Markov chain of S in
-steps (Brook and Evans 1972), and h from how many years that shall be. A robot with two charts has
-a false alarm twice as often; each is given half. After an alarm all begins anew.
+detect shifts of about 2 k: a small k slow changes, a large one jumps. S > h raises an alarm. The
+mean number of nights until a false alarm follows from a discretised Markov chain of S (Brook and
+Evans 1972); h is set from the wanted number of years between false alarms. Two charts per robot
+double the rate of false alarms, so each gets half. Both restart after an alarm.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Drift:
 
 
 def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift:
-    """Look for nights from which on an arm is worse.
+    """Find the nights since which an arm is worse.
 
     Errors of the nights (N,) are in any unit, with their degrees of freedom (N,) as of
     `Verification.freedom`; `years` pass between two false alarms, with a night each day.

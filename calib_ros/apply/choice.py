@@ -50,11 +50,10 @@ def choose(
 ) -> NDArray[np.intp]:
     """Choose poses to measure among candidates (N, n) [rad or m].
 
-    Return the indices (count,) of the chosen, the best first: with the first of them alone most
-    is determined. The criterion `task` asks for joint values (T, n) at which the arm is to be
-    accurate. Two poses are `apart` by so much [rad or m] of the joint that moves most.
-    Exchanges begin at `start`, indices (count,), where a good choice is known, and
-    are left out where a quick choice will do.
+    Return the indices (count,) of the chosen poses, the most informative first. The criterion
+    `task` needs joint values (T, n) at which the arm must be accurate. Any two poses differ by at
+    least `apart` [rad or m] in the joint that moves most. Exchanges begin at `start`, indices
+    (count,), if a good choice is known; a quick choice skips them.
     """
     if count < 1:
         raise ConfigError(f'at least one pose must be chosen, not {count}')
@@ -89,7 +88,7 @@ class _Pick:
         self.chosen: list[int] = []
 
     def best(self, worth: _Worth) -> int:
-        """Return the best candidate that is free to be chosen."""
+        """Return the best candidate not chosen yet."""
         free = np.flatnonzero(self._blocked == 0)
         if not free.size:
             raise InputError(
@@ -200,7 +199,7 @@ def _root(information: FloatArray) -> FloatArray:
 def efficiency(
     design: Design, candidates: FloatArray, chosen: NDArray[np.intp], task: FloatArray | None
 ) -> float:
-    """Return a lower bound of how good a choice is against the best of as many candidates.
+    """Return a lower bound on how good a choice is against the best choice of as many candidates.
 
     For the criterion `d`, or `task` with the poses of one, as a share of poses: with 0.9 even the
     best choice would need 90 % of them. Both criteria are convex, and the tangent at the choice

@@ -38,7 +38,7 @@ orientation be wrong of arms that can reach every one."""
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensator(Shown, Limits):
-    """What the controller believes, what the arm is, and how far a correction may go (`Limits`).
+    """The arm the controller assumes, the real arm, and the limits of a correction (`Limits`).
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class Compensator(Shown, Limits):
     region: Region | None = None
 
     def __post_init__(self) -> None:
-        """Refuse chains that are not of one robot, and limits that are none."""
+        """Refuse chains of different robots and invalid limits."""
         ours, theirs = (
             ', '.join(f'{joint.name} ({joint.type})' for joint in chain.joints)
             for chain in (self.nominal, self.calibrated)
@@ -79,7 +79,7 @@ class Compensator(Shown, Limits):
 
     @cached_property
     def follower(self) -> Follower:
-        """Return what finds the corrections."""
+        """Return the solver of the corrections."""
         return Follower(
             self.nominal, self.calibrated, self.tool, self.largest, self.orientation_weight
         )
@@ -101,7 +101,7 @@ class Refusal:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensation(Solution):
-    """Corrected joint commands, with what they leave (`Solution`) and what was refused.
+    """Corrected joint commands, their remaining errors (`Solution`), and refusals.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class Compensation(Solution):
 
     @property
     def correction(self) -> FloatArray:
-        """Return what is added to the command (N, n)."""
+        """Return the change of the command (N, n)."""
         return self.joints - self.command
 
 
@@ -133,12 +133,12 @@ def compensate(
     """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
 
     `approach` (N, n) holds the signs of the velocities before, for backlash;
-    `told` is called with the share that is done.
+    `told` receives the share done.
 
     Raises
     ------
     InputError
-        For joint values of a wrong shape, or that are no finite numbers.
+        For joint values of the wrong shape or that are not finite.
 
     """
     command = np.array(joints, dtype=np.float64)

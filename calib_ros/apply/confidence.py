@@ -1,19 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How far the RMS of position errors over poses like those measured may be from the RMS found.
+"""Confidence limits of the RMS position error over poses like those measured.
 
-Of K configurations with errors e_k the sum of squares is taken for theta / nu chi2(nu)
+The sum of squares over K configurations with errors e_k is approximated by theta / nu chi2(nu)
 (Satterthwaite 1946) with
 
     S = mean of e_k e_k^T        g = 2 tr S^2 / (tr S)^2        nu = 2 K / max(g, c^2)
 
-between K (g = 2: all errors in one direction) and 3 K (in all directions alike) for Gaussian
-errors of one size, and fewer where the errors are larger at some places than at others, as
-compliance and eccentricities leave them: c^2 is the variance of the squared errors over the square
-of their mean, taken together with g for one configuration more, and larger by SAFETY of its
-standard deviations, for few configurations rarely show the worst places. Measurements of one
-configuration share its error and count for one. Limits are one-sided, each at the confidence
-wanted.
+For Gaussian errors of equal size nu lies between K (g = 2: all errors in one direction) and 3 K
+(isotropic). It is smaller if errors vary over the workspace, as under compliance and eccentricity:
+c^2 is the variance of the squared errors over their squared mean, estimated with g for one more
+configuration and raised by SAFETY standard deviations, because few configurations rarely include
+the worst places. Measurements of one configuration share its error and count as one. Limits are
+one-sided, each at the wanted confidence.
 """
 
 from __future__ import annotations

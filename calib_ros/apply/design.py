@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What poses would tell about the parameters, before any is measured.
+"""The information that poses would give about the parameters, before any is measured.
 
 A pose adds A^T A to the information M about the parameters, with A (m, P) its rows of the weighted
 Jacobian: 6 by full pose, 3 by position. Neither needs a measured value. With C = M^-1 the
@@ -33,7 +33,7 @@ ASSUMED_TOOL = 3 * (LEVER / 3.0,)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(Shown):
-    """What is to be identified, how it will be measured, and what is known about it already.
+    """What to identify, how it will be measured, and what is already known.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ class Design(Shown):
     sigma_position, sigma_orientation : float, float or None
         Of a measured pose [m, rad]; None when only positions are measured.
     known : (R, P)
-        Rows of information that is there already, in sigma: priors, poses taken.
+        Rows of existing information, in sigma: priors, poses taken.
     base, tool : str
-        Frames of the chain that hold for the poses to come.
+        Frames of the chain for the poses to come.
 
     """
 

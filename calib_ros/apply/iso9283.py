@@ -2,12 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Five poses at which to verify an arm, after ISO 9283:1998, 6.10.2.
 
-They lie in the largest cube that is found in the workspace beside the z axis of the base (on which
-the arm itself stands), with edges parallel to the base frame and one orientation for all: P1 in
-its centre, P2 to P5 on a diagonal plane of it, each a tenth of the diagonal away from a corner.
+They lie in the largest cube found in the workspace beside the z axis of the base (where the arm
+stands), with edges parallel to the base frame and one orientation for all: P1 at the centre, P2 to
+P5 on a diagonal plane, each a tenth of the diagonal away from a corner.
 
-The cube grows about many reachable poses at once; where its eight corners are reached is followed
-(`inverse.py`), and what is lost on the way is out.
+Cubes grow about many reachable poses at once. Inverse kinematics tracks their eight corners
+(`inverse.py`); a cube is dropped when a corner is lost.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def iso_9283_poses(
 ) -> TestPoses:
     """Return the test poses in the largest cube that the arm reaches, and the device sees.
 
-    Cubes are grown about so many reachable centres, from this `edge` [m] on. An arm that
-    keeps its orientation in none, as with fewer than six joints, is refused.
+    Cubes grow about so many reachable centres, from this `edge` [m] on. An arm that cannot keep
+    its orientation in any of them, as with fewer than six joints, is refused.
     """
     middle = draw_candidates(design, centres, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)

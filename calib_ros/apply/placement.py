@@ -2,11 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where in the workspace a task is done best.
 
-The optimal workspace of a task (Vacarescu et al., abstract) is where its frame is placed so that
-the error expected there (`workspace.py`) is least, the mean or the worst over the task's poses. It
-is searched on a grid, which is the map to prove it, and refined about the best. Every pose is
-solved for joint values (`inverse.py`): the first one from configurations that come near it, the
-others from pose to pose.
+The optimal workspace of a task (Vacarescu et al., abstract) is the placement of its frame with the
+least expected error (`workspace.py`), the mean or the worst over the task's poses. A grid search,
+whose map is the evidence, is refined about the best placement. Inverse kinematics (`inverse.py`)
+solves the first pose from nearby configurations and the others from pose to pose.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ STEPS = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 
 
 
 def task_of(poses: FloatArray) -> FloatArray:
-    """Return poses (K, 4, 4) in a frame at their middle, whose axes stay as they are."""
+    """Return poses (K, 4, 4) in a frame at their middle, with unchanged axes."""
     task = poses.copy()
     task[:, :3, 3] -= 0.5 * (poses[:, :3, 3].min(axis=0) + poses[:, :3, 3].max(axis=0))
     return task

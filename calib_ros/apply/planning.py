@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How many poses to measure, which, in what order, and what they promise."""
+"""How many poses to measure, which, in what order, and the accuracy to expect."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from calib_ros.shown import Shown, as_frame
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Shown):
-    """Poses to measure, and what they promise.
+    """Poses to measure, and the accuracy to expect.
 
     Attributes
     ----------
     joints : (K, n)
-        Joint values [rad or m], the most telling first.
+        Joint values [rad or m], the most informative first.
     visit : (K,)
         Their order of visit.
     travel : float
@@ -38,8 +38,8 @@ class Plan(Shown):
     at_random : (K,)
         The same with candidates taken at random (median of draws).
     efficiency : float or None
-        Lower bound against the best choice of as many candidates; None for o2 to o5, and
-        with too few poses to determine all parameters.
+        Lower bound against the best choice of as many candidates; None for o2 to o5 and for too
+        few poses to determine all parameters.
     lacking : tuple of str
         Parameters that no choice of these candidates would determine; they are left out.
 
@@ -148,7 +148,7 @@ def fewest(
 
 
 def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> str:
-    """Return what a plan promises: a table over the number of poses, and how good it is."""
+    """Return the expected accuracy by number of poses, and the efficiency of the plan."""
     count = len(plan.joints)
     first = int(np.isfinite(plan.accuracy).sum())
     shown = np.unique(np.linspace(count - first + 1, count, min(first, 12)).round().astype(int))

@@ -35,7 +35,7 @@ class Program(Shown):
     Attributes
     ----------
     names : tuple of str
-        Columns of the arrays; joints that are not of the arm may be among them.
+        Columns of the arrays; other joints than the arm's may be among them.
     positions : (N, m)
         Joint values [rad or m], in the order in which they are run through.
     velocities, accelerations : (N, m), optional
@@ -56,10 +56,10 @@ class Program(Shown):
 def compensate_program(
     compensator: Compensator, program: Program, told: Told = nobody
 ) -> tuple[Program, Compensation]:
-    """Return a program with corrected joint values, and what became of each point.
+    """Return a program with corrected joint values, and the outcome at each point.
 
-    Velocities and accelerations follow the corrected path; times stay. Joints that are not of the
-    arm stay as they are. Refused points are NaN; `told` is called with the share that is done.
+    Velocities and accelerations follow the corrected path; times and other joints do not change.
+    Refused points are NaN; `told` receives the share done.
 
     Raises
     ------

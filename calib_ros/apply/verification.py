@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Is the corrected arm as accurate as it has to be? New measurements, and a verdict.
+"""Is the corrected arm accurate enough? A verdict from new measurements.
 
-A controller that is corrected by a calibration C stands at joint values q where C means the pose
-that was wanted, so that it misses by measured - C(q); an uncorrected one would miss by
-measured - N(q). Both are known from the joint values that the controller reports. Where the
-program is known as it was before its correction, the pose wanted is N(q_commanded), and a
-correction that did not arrive shows as well.
+A controller corrected by a calibration C stands at joint values q where C predicts the wanted
+pose, so its error is measured - C(q); without the correction it would be measured - N(q). Both
+follow from the joint values that the controller reports. If the uncorrected program is known, the
+wanted pose is N(q_commanded), and a correction that did not arrive shows as well.
 
 The figure is the RMS position error over poses like those measured, with its limits
 (`confidence.py`):
@@ -15,10 +14,10 @@ The figure is the RMS position error over poses like those measured, with its li
     FAIL        the lower limit is beyond it
     UNDECIDED   neither: more poses are needed
 
-Frames of the new measurements are fitted to both arms where that is asked for: the base where the
-device stands elsewhere, the tool where another target, or the same anew, is on the flange. A frame
-that is not fitted must be that of the calibration: else its change counts as the arm's error, and
-tells nothing about which of two calibrations is better.
+On request, frames of the new measurements are fitted to both arms: the base if the device was
+moved, the tool if the target was changed or remounted. A frame that is not fitted must equal that
+of the calibration; otherwise its change counts as an error of the arm and says nothing about which
+of two calibrations is better.
 """
 
 from __future__ import annotations
