@@ -3,22 +3,21 @@
 """The rules of acceptance: what a result must show before it may replace the nominal parameters.
 
 1. The fit has converged.
-2. The rank is full after gauges: no parameter that other poses would determine is left out.
+2. The rank is full apart from gauges: no parameter that other poses would determine is left out.
 3. The RMS position error on held-out poses is lower than before, by more than its uncertainty
    (one-sided 95 %, Student's t over configurations; see `log_gain`). The orientation must not get
    worse by the same measure.
-4. The gain is no chance: where what is measured in succession shares errors, moved in time they
-   are explained as well (`drift.py`; 95 %).
+4. The gain is not drift: time-shifted residuals are not explained equally well (`drift.py`; 95 %).
 5. No DH parameter is certainly (by three standard deviations) further from nominal than
-   `largest_length` or `largest_angle`, and no more than `largest_error` is left: else that is
+   `largest_length` or `largest_angle`, and at most `largest_error` remains: otherwise it is
    another robot, not a faulty one.
 6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
-7. Nothing moved while it was measured: no step in time of a frame or a joint's zero explains more
+7. Nothing moved during the session: no step in time of a frame or a joint's zero explains more
    than half of the residuals (`steps.py`).
-8. Outliers are not the arm's own behaviour (`misfits.py`), and the error with them does not get
-   worse: neither its mean, nor certainly (99 %) its RMS.
+8. Outliers are not the arm's own behaviour (`misfits.py`), and the error including them does not
+   get worse: neither its mean, nor with 99 % confidence its RMS.
 9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
-10. The arm gets better, as far as is known, at the poses measured at least (`region.py`).
+10. The calibration improves the arm at the measured poses at least (`region.py`).
 """
 
 from __future__ import annotations

@@ -1,24 +1,24 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which few parameters of an arm have changed, told by the information about the change.
+"""Which few parameters of an arm have changed.
 
-What is known of the change x of all parameters is a normal likelihood with the information A and
-the vector b = A x^ (A may be singular: some poses tell only a part). Before the question is put,
-changes that need no explanation, x ~ N(0, K), as by the uncertainty of an earlier calibration, are
-marginalised:
+The information about the change x of all parameters is a normal likelihood with the information
+matrix A and the vector b = A x^ (A may be singular: some poses determine only some parameters).
+Changes that need no explanation, x ~ N(0, K), such as the uncertainty of an earlier calibration,
+are marginalised first:
 
     A' = A - A R M R^T A        b' = b - A R M R^T b        M = (1 + R^T A R)^-1,  K = R R^T
 
-An explanation says that x = G z: one parameter has changed, all parameters of a joint (its link is
-bent), or a frame (the device or the target was moved). Its gain of chi-squared,
+An explanation states x = G z: one parameter has changed, or all parameters of a joint (a bent
+link), or a frame (the device or the target was moved). Its gain in chi-squared,
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
-has as many degrees of freedom as z. A change is claimed where chance, over all explanations that
-were tried, reaches the gain in FALSE of the cases at most (Bonferroni). How the explanations
-compare is told by their evidence with z ~ N(0, S), S the size of changes: those of several
-parameters pay for them (Occam's razor; MacKay 1992). Explanations whose share of the evidence is
-above 1 - CONFIDENT cannot be told apart from the best.
+has as many degrees of freedom as z. A change is claimed if chance, over all explanations tried,
+reaches the gain in at most FALSE of the cases (Bonferroni). Explanations are compared by their
+evidence with z ~ N(0, S), S the typical size of changes, which penalises additional parameters
+(Occam's razor; MacKay 1992). Explanations whose share of the evidence exceeds 1 - CONFIDENT
+cannot be distinguished from the best one.
 """
 
 from __future__ import annotations

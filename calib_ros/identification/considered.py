@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What may add to the errors that are fitted: effects left out, and what a device does to space.
+"""Errors that are not fitted but considered: unmodelled effects, and errors of the device.
 
-Neither is fitted. Effects that an arm may have, and the scale of a device, are columns of the
-posterior with own sizes (`evidence.py`). What a device does besides (`device.py`), and joint
-values that were rounded, have known sizes s: their columns N are taken out of the
-products of the others A: A^T A becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 +
-s^2 N N^T were the covariance of the measurements (Schmidt 1966).
+Effects that an arm may have, and the scale of the device, are columns of the posterior with their
+own sizes (`evidence.py`). Other errors of the device (`device.py`) and rounded joint values have
+known sizes s. Their columns N are eliminated from the products of the other columns A: A^T A
+becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 + s^2 N N^T were the covariance of the
+measurements (Schmidt 1966).
 
-The scale of a device makes all lengths grow alike: positions are linear in all lengths L, so its
-column is the sum of L dp/dL.
+A scale error of the device stretches all lengths alike: positions are linear in all lengths L, so
+its column is the sum of L dp/dL.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a measuring device may do to space: smooth errors, as large as its sigma.
+"""How a measuring device may distort space: smooth errors as large as its sigma.
 
-Axes that are not square to each other, a lens, mirrors or markers that are not quite where they
-are thought to be bend what is measured. Such errors repeat: no number of poses averages them out,
-poses held out share them, and arms bend space much alike. A device that is right to its sigma may
-be off by all of it in this way. So they are taken as polynomials of the second order in the
-measured place, for each of its coordinates, and *considered* where a calibration may be used
-(`evidence.py`).
+Axes that are not square, a lens, and misplaced mirrors or markers distort what is measured. Such
+errors repeat: no number of poses averages them out, held-out poses share them, and arms distort
+space in a similar way. A device that is accurate to its sigma may have all of it in this form.
+These errors are modelled as second-order polynomials in the measured position, for each
+coordinate, and *considered* in the decision where a calibration may be used (`evidence.py`).
 """
 
 from __future__ import annotations

@@ -1,19 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is different between two calibrations of one robot, by both covariances.
+"""The difference between two calibrations of one robot, tested with both covariances.
 
-Frames are free: the device may stand elsewhere, the target may be another. The second arm is
-brought into the parameters of the first by a fit to its poses all over the joint range, so that
-parameters that trade against each other are taken out. The difference d of the parameters is
-tested with C = C_1 + C_2, d^T C^-1 d; the few that may have changed are looked for (`changes.py`).
-The difference of predicted positions, in the best frames, is a quadratic form of d; the limit is
-the quantile of its values for d ~ N(d, C).
+Frames are free: the device may have been moved, the target changed. The second arm is expressed in
+the parameters of the first by a fit to its poses all over the joint range, which removes gauge
+freedoms. The difference d of the parameters is tested by d^T C^-1 d with C = C_1 + C_2; then the
+few parameters that may have changed are searched for (`changes.py`). The difference of predicted
+positions, in the best frames, is a quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
-What neither model has shows in both calibrations, and differently where other poses were measured;
-so do smooth errors of a device that stands elsewhere (`device.py`). The covariances of noise know
-nothing of it; the expected squares of errors do (`region.py`). A difference that is significant by
-the former only, is told as what it is. Where a calibration held DH parameters at nominal, the
-fitted ones contain part of their errors: its expected squares stand for its covariance, too.
+Unmodelled effects appear in both calibrations, and differently if other poses were measured; so do
+smooth errors of a device that was moved (`device.py`). Covariances of noise do not include them;
+expected squares of errors do (`region.py`). A difference that is significant only by the former is
+reported as such. If a calibration held DH parameters at nominal, its fitted parameters contain
+part of their errors, so its expected squares replace its covariance.
 """
 
 from __future__ import annotations

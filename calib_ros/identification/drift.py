@@ -1,22 +1,22 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Is a gain chance, when what is measured in succession shares errors?
+"""Can drift of the device explain a gain?
 
-A tracker drifts, so errors in succession are alike. Poses along a path change as slowly, and a
-model can follow the drift: it gains by it, even on poses that were left out between fitted ones.
-But a drift knows nothing of joint values; moved in time against them it would be explained as
-well. So the residuals are moved by every shift, and the model is fitted to each. Whatever the
-autocorrelation of stationary errors, what is explained where they belong has any rank among the
-shifts with equal probability (a randomisation test); a model that is true explains most there.
+A tracker drifts, so successive errors are similar. Poses along a path change as slowly, and a
+model can follow the drift: it then gains even on poses left out between fitted ones. But drift
+does not depend on joint values: shifted in time against them, it would be explained equally well.
+So the residuals are shifted in time by every possible amount, and the model is fitted to each.
+Whatever the autocorrelation of stationary errors, the unshifted gain has any rank among the
+shifted ones with equal probability (a randomisation test); a true model explains most unshifted.
 
 Of residuals r, columns A beside the columns F of the model before them explain the share
 
     (e(F, A) - e(F)) / (|r|^2 - e(F))        e(X) = r^T X (X^T X + L)^-1 X^T r
 
-where L holds the inverse variances of priors. A series is closed to a circle by its mirror image,
-and its slowest part, which is not stationary, is taken out of residuals and columns: a few
-cosines over the session. Samples of one stop move together, as their sum, and of pixels with their
-first moments. All shifts of X^T r are one circular correlation, by fast Fourier
+where L holds the inverse variances of priors. A series is closed to a circle by its mirror image.
+Its slowest part, which is not stationary, is removed from residuals and columns: a few cosines
+over the session. Samples of one stop move together, as their sum; those of pixels also with their
+first moments. All shifts of X^T r are one circular correlation, computed by fast Fourier
 transforms.
 """
 

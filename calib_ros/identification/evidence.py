@@ -1,34 +1,32 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How large the errors of this arm are, told by its own data (empirical Bayes).
+"""The typical size of the errors of this arm, estimated from its own data (empirical Bayes).
 
-Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there,
-and the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm are taken
-to be normal about zero, with one size for each group of parameters: lengths, angles, what drives
-do to a joint value (`ratio`, `sin_1`, ...), couplings, and what bends or has play. The sizes s
-maximise the probability of the data, parameters integrated out (evidence; MacKay 1992):
+Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there, and
+the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm have normal
+priors about zero, with one size for each group of parameters: lengths, angles, errors of drives
+(`ratio`, `sin_1`, ...), couplings, and bending or play. The sizes s maximise the probability of
+the data with the parameters integrated out (evidence; MacKay 1992):
 
     s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
 
 with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1. L is the normal matrix with
-the given sigmas, t the factor by which the noise is larger, shared errors included. gamma counts
-the parameters that the data determine. Where these are few, a hyperprior holds: a size is about
-TYPICAL, within a factor of SPREAD; and where a calibration may be used is judged with sizes above
-and below, because a size that few parameters tell may be wrong by much. Parameters that the data
-determine keep their values, and the others shrink to nominal. One error may be far larger than the
-others, as of a motor that was put in wrongly: the prior has the tails of Student's t with TAILS
-degrees of freedom, as a normal one with the variance s^2 / w, w = (TAILS + 1) / (TAILS + (x^2 +
-V_ii) / s^2).
+the given sigmas, t the ratio of actual to given noise, shared errors included. gamma counts the
+parameters that the data determine. If it is small, a hyperprior dominates: a size is about
+TYPICAL, within a factor of SPREAD; and sizes above and below are included in the decision where a
+calibration may be used, because a size estimated from few parameters may be far off. Parameters
+that the data determine keep their values; the others shrink to nominal. One error may be far
+larger than the others, as of a wrongly mounted motor: the prior has the tails of Student's t with
+TAILS degrees of freedom, as a normal prior with the variance s^2 / w, w = (TAILS + 1) / (TAILS +
+(x^2 + V_ii) / s^2).
 
-Where an arm is judged, variances are means over all that is not known: over w, whose inverse has
-the mean (TAILS + (x^2 + V_ii) / s^2) / (TAILS - 1), so that a parameter of which the data tell
-nothing has the variance of Student's t, TAILS / (TAILS - 2) s^2; and over the sizes.
+To judge an arm, variances are averaged over w, whose inverse has the mean (TAILS + (x^2 + V_ii) /
+s^2) / (TAILS - 1), so that a parameter that the data do not determine has the variance of
+Student's t, TAILS / (TAILS - 2) s^2; and over the sizes.
 
-Effects that a model leaves out are *considered*: they are columns of the same posterior with sizes
-of their own, so that the arm as it may be, effects included, can be held against the one that was
-fitted (`region.py`; Schmidt 1966 has the idea). So is the scale of the measuring device, which
-makes all lengths grow alike: positions are linear in all lengths L, so its column is the sum of
-L dp/dL; and all that it may do to space besides (`device.py`).
+Effects missing from the model are *considered* (Schmidt 1966): they are columns of the same
+posterior with their own sizes, so that the real arm with its possible effects can be compared with
+the fitted one (`region.py`). So are errors of the device (`considered.py`).
 """
 
 from __future__ import annotations

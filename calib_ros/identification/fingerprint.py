@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which measurements a calibration was fitted to, in a few hundred numbers.
+"""A few hundred numbers that identify the measurements a calibration was fitted to.
 
-Each row has a hash. The least `KEPT` of them are a random choice of the rows: of further rows,
-those with a hash up to the largest that is kept are known, or were not fitted (Broder 1997).
+Each row has a hash. The smallest `KEPT` hashes are a random sample of the rows. A further row with
+a hash up to the largest kept one is either among them or was not fitted (Broder 1997).
 """
 
 from __future__ import annotations

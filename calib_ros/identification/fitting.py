@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fit itself: what is fitted, from where, with which priors, and what its residuals tell.
+"""The fit itself: its parameters, start, priors and noise.
 
-A first fit of some samples comes close; priors of common sense keep it from going astray where
-these tell little. The robust fit of all samples follows, and where its data tell priors that
-would change it (`evidence.py`), once more with them.
+A first fit to some samples comes close; common-sense priors keep it from going astray where these
+samples carry little information. The robust fit to all samples follows. If its data yield priors
+that would change it (`evidence.py`), it is repeated with them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The linear model about a geometric fit: what more effects would predict, without fitting again.
+"""The linear model about a geometric fit: what further effects would predict, without refitting.
 
-At that fit every effect is one more column. The residual of a part left out is r - J_S beta, with
-beta from the other parts. Parts are dealt out twice, one by one and in blocks of what was measured
-in succession, and both must agree, because neighbours share errors.
+Every effect adds a column at that fit. The residual of a left-out part is r - J_S beta, with beta
+from the other parts. Parts are formed in two ways, sample by sample and in blocks of successive
+samples, and both must agree, because neighbours share errors.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Are samples that a robust fit has given up gross errors, or what the arm really does?
+"""Are the outliers of a robust fit gross errors, or the arm's own behaviour?
 
-A device errs where it likes, an arm by its joint values. So samples taken for gross errors are
-the arm's own behaviour where
+Errors of a device occur anywhere, errors of an arm follow its joint values. So outliers are the
+arm's own behaviour if
 
-- a joint hardly moves but in them,
-- all targets that were seen at a stop are off there, more often than by chance,
-- they go with the values of a joint. Moved in time against the joint values, as in `drift.py`,
-  outliers of a device do as well, also where they come in a row.
+- a joint hardly moves except in them,
+- all targets seen at a stop are off there, more often than by chance,
+- they follow the values of a joint. Shifted in time against the joint values, as in `drift.py`,
+  outliers of a device do so as well, even if they occur in a row.
 """
 
 from __future__ import annotations

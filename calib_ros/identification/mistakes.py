@@ -1,17 +1,16 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The usual mistakes, tried out: units, conventions, joints, the wrong arm. Named, never mended.
+"""The usual mistakes, tried out: units, conventions, joints, the wrong arm. Never corrected.
 
-Where the nominal arm misses the measurements by more than faulty arms do, each suspect changes
-some samples, or the chain, and base and tool are found anew in closed form (`start.py`). Of the
-best few they are polished by least squares. A suspect is named when the typical error so is
-NEARER times that as given and within what faulty arms show; those that explain nearly as much are
-named with it.
+If the nominal arm misses the measurements by more than faulty arms do, each suspected mistake is
+undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`).
+The best few are refined by least squares. A mistake is named if undoing it reduces the typical
+error below NEARER times the original and to a level that faulty arms have; mistakes that explain
+nearly as much are named with it.
 
 The typical error is the median over the samples of the distance and the angle times LEVER, in
-units of the spread of the positions.
-Nothing can be told where a mistake makes no difference: a first joint's zero is the base's turn,
-a last one's the tool's.
+units of the spread of the positions. Mistakes without effect cannot be detected: the zero of the
+first joint is a rotation of the base, that of the last joint one of the tool.
 """
 
 from __future__ import annotations

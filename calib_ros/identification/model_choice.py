@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which non-geometric effects pay for themselves, by cross-validation (`linear_model.py`).
 
-Groups of effects are added one by one, the best first, as long as the position error on the
-configurations left out falls by more than chance explains, and explain more of the residuals than
-of the same moved in time (`drift.py`), as a drift would be. Then the spectrum of what is left is
-searched, joint by joint, for harmonics of gears: the one that explains most is added while it pays
-as well, and all of them where many explain something.
+Groups of effects are added one by one, the best first, as long as the position error on left-out
+configurations falls by more than chance explains, and as long as they explain more of the
+residuals than of time-shifted ones (`drift.py`), which rules out drift. Then the spectrum of the
+remaining residuals is searched, joint by joint, for gear harmonics: the strongest one is added
+while it pays, and all of them if many explain something.
 """
 
 from __future__ import annotations

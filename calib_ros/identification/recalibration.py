@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A few poses bring an earlier calibration up to date: what has changed since, and by how much.
+"""Update an earlier calibration with a few poses: what has changed since, and by how much.
 
-The earlier parameters x are known to C, and each of the arm's has wandered since by a growth g
-per root of a year (a random walk). The residuals r of the new poses at the earlier arm tell of
-the change dx by A = J^T W J and b = J^T W r; dx ~ N(0, C + g^2 t). What is larger than that must
-have a reason: few parameters have changed by a collision, say (`changes.py`). Their sizes are then
-free, and the estimate is the mean of dx given A and b, relinearised until it stands still. Where
-two reasons cannot be told apart, both are free.
+The earlier parameters x have the covariance C, and each of the arm's parameters has drifted since
+by a growth g per root of a year (a random walk). The residuals r of the new poses at the earlier
+arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ N(0, C + g^2 t). A
+larger change must have a cause: a collision, say, that changed few parameters (`changes.py`).
+These become free, and the estimate is the mean of dx given A and b, relinearised until it
+converges. If two causes cannot be distinguished, both are free.
 """
 
 from __future__ import annotations

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a calibration may be used: where it is known to bring the arm closer, not only near.
+"""Where a calibration may be used: where it is known to improve the arm, not only near its poses.
 
-By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C), those
-of the calibration x^. At poses with the Jacobian A, base and tool frames projected out, the errors
-are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse over these poses if
+By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C); those of
+the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, the
+errors are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse there if
 
     |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
 
-whose left side is normal: this *risk* is one value of the normal distribution, or the mean of some
-with other sizes of errors, which are not known for sure. The calibration is used at the poses
-measured if the risk there is below RISK, by themselves and with those of the whole range that are
-known as well; and further out, in shells of growing standard deviation of the predicted position,
-as far as the risk in each shell is.
+The left side is normal, so this *risk* is a value of the normal distribution, or a mean of several
+for different sizes of errors, which are uncertain. The calibration may be used at the measured
+poses if the risk there is below RISK, for these poses alone and together with all poses of the
+joint range that are predicted as well. It may be used further out, in shells of growing standard
+deviation of the predicted position, as long as the risk in each shell is below RISK.
 """
 
 from __future__ import annotations

@@ -3,21 +3,21 @@
 """Least squares that gross errors do not ruin, and their names.
 
 A sample's distance is the length of its residual in units of a scale estimated from the data (the
-median of all lengths), the larger one of position and orientation, or of a corner and the sum over
-its image. Weights follow it, and the fit
-is repeated until they stand still (iteratively reweighted least squares; Holland and Welsch 1977):
+median of all lengths): the larger of position and orientation, or of a corner and the sum over its
+image. Weights depend on the distance, and the fit is repeated until they converge (iteratively
+reweighted least squares; Holland and Welsch 1977):
 
-    first        w = min(1, 1 / distance)                  the fit of least absolute lengths
+    first        w = min(1, 1 / distance)                  least absolute lengths
     redescending w = 1 below INNER, 0 beyond OUTER, falling in between (Hampel 1974)
     huber        w = min(1, INNER / distance)              (Huber 1964)
 
-Clean data keep the weight 1 throughout, so nothing is lost against least squares.
+Clean data keep the weight 1, so nothing is lost against least squares.
 
-Gross errors that agree with each other, as from a target that was bumped, are a second model that
-the first fit may settle between or even at. Where it names outliers, or leaves more than the
-sigmas given explain, the fit is repeated from the best half of the samples (`trimmed.py`). It
-counts when half of the residuals shrink by it, and what it leaves out is more than chance leaves
-out of few samples.
+Gross errors that agree with each other, as from a bumped target, are a second model; the first fit
+may settle between the two, or at the wrong one. If it finds outliers, or larger residuals than the
+given sigmas explain, the fit is repeated from the best half of the samples (`trimmed.py`). The
+second fit is kept if it shrinks half of the residuals, and if it excludes more than chance would
+exclude from few samples.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values that were rounded: is the gain the arm's, or that of rounding?
+"""Rounded joint values: does the arm explain the gain, or the rounding?
 
-Values that are multiples of a step are off by up to half of it, alike wherever a joint has the
-same value: in grids, and wherever other joints move meanwhile. A model follows that, also on poses
-left out at the same values. So two explanations of the nominal residuals y are compared, frames
-projected out, by their evidence (the marginal likelihood, Gaussian throughout):
+Values that are multiples of a step are off by up to half a step, identically wherever a joint has
+the same value, as in grids or while other joints move. A model follows that, even on left-out
+poses with the same values. So two explanations of the nominal residuals y, frames projected out,
+are compared by their evidence (the marginal likelihood, Gaussian throughout):
 
     rounding      y ~ N(0, k I + C C^T)                 C: a column for each value of each joint
     and the arm   y ~ N(0, k I + C C^T + s J J^T)       J: the arm's columns, times usual errors
 
-with the variance of the noise k and the size s of the arm's errors at their best.
+with the best variance k of the noise and size s of the arm's errors.
 """
 
 from __future__ import annotations

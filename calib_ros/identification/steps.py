@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Something moved while it was measured: one step in time of a base, a tool or a joint's zero.
+"""Something moved during the session: one step in time of a base, a tool or a joint's zero.
 
-A bumped target, a tracker that was moved or an encoder that slipped is one more group of columns
-X of the linear model, switched on at some stop. At the fit, with J the columns of the parameters
-and r the residuals, a group explains of the squares that are left
+A bumped target, a moved tracker or a slipped encoder adds a group of columns X to the linear
+model, switched on at some stop. At the fit, with J the columns of the parameters and r the
+residuals, a group explains, of the remaining squares,
 
     e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
 
-Products of all columns with each other are made once, part by part of the session, and summed
-from its end; they serve every stop. What a robust fit has given up as gross errors is looked at
-as well, with bounded influence: a step may hide there.
+Products of all columns are computed once, part by part of the session, and summed from its end;
+they serve every stop. Gross errors excluded by the robust fit are included with bounded influence,
+because a step may hide there. Known distances between sockets are not: they say nothing about
+time.
 
-Effects that the model lacks follow the joints, and no step in time explains more than half of
-what they leave. A drift is no step: a few cosines over the session explain it better.
+Unmodelled effects follow the joints, and no step in time explains more than half of their
+residuals. A drift is no step: a few cosines over the session explain it better.
 """
 
 from __future__ import annotations

@@ -1,22 +1,22 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What looks wrong in a result that is good by its figures: one sentence each, and what to do.
+"""What looks wrong in a result with good figures: one sentence each, and what to do.
 
-Scale. A measuring device whose metre is wrong by s lets all lengths of the arm seem to grow alike;
-so does its temperature. With L the derivative of the fitted lengths by s (the frames take up their
-share), x their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s, with
-tau as the scatter about the line says (Paule and Mandel 1982). Arms have offsets of their own:
-they scatter, and make s uncertain. No arm grows by more than LARGEST_SCALE: aluminium does by 23
-ppm a degree. What is certainly beyond is the device's, and such a result is refused, because it is
-good in the device's metres only; below, it may be the arm's own growth, and is said.
+Scale. A device with a scale error s makes all lengths of the arm seem to grow alike; so does its
+temperature. With L the derivative of the fitted lengths by s (the frames take their share), x
+their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s, with tau
+estimated from the scatter about the line (Paule and Mandel 1982). An arm's own offsets scatter and
+make s uncertain. No arm grows by more than LARGEST_SCALE: aluminium grows by 23 ppm a degree. A
+scale certainly beyond it is the device's, and the result is refused, because it is good in the
+device's metres only; a smaller one may be the arm's own growth, and a remark says so.
 
-Sister. Of the shipped robots with as many joints one may be much nearer to the arm found, by the
-positions that both reach in the best base and tool, than the nominal one is.
+Sister. Among the shipped robots with as many joints, one may be much closer to the identified arm
+than the nominal one, by the positions that both reach in the best base and tool.
 
-Gravity. Where effects of gravity are fitted, another direction may explain clearly more than the
-one given. The base frame found tells nothing about up: the device stands anyhow.
+Gravity. If effects of gravity are fitted, another direction may explain clearly more than the
+given one. The base frame found does not tell which way is up: the device may have any orientation.
 
-Coupling. Joint values that lack the couplings of a wrist leave residuals that these explain.
+Coupling. Joint values without the couplings of a wrist leave residuals that these explain.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A start that gross errors cannot lead astray, even where they agree with each other.
+"""A start that gross errors cannot lead astray, even if they agree with each other.
 
-Least trimmed squares: the fit to that half of the samples that fits best (Rousseeuw 1984), found
-as in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few configurations drawn
-at random, as near to the start as they allow. From each, concentration steps lead downhill: take
-the half with the shortest residuals, fit it, and again. On the linearised model all fits are done
-at once, as products of matrices; it is linearised anew at the best one until its half stands
-still.
+Least trimmed squares: the fit to the half of the samples that fits best (Rousseeuw 1984), found as
+in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few randomly drawn
+configurations, as close to the start as these allow. Concentration steps improve each: take the half with
+the shortest residuals, fit it, repeat. All fits share one linearised model and are computed at
+once as matrix products; the model is linearised again at the best fit until its half no longer
+changes.
 
-Half means half of every set of observations, and somewhat more: with P parameters and R equations
-(1 + P / R) / 2 of the samples, which stands the most gross errors, (1 - P / R) / 2 of them
+Half means half of every set of observations, and slightly more: with P parameters and R equations
+(1 + P / R) / 2 of the samples, which tolerates the most gross errors, (1 - P / R) / 2 of them
 (Rousseeuw and Leroy 1987).
 """
 
