@@ -4,10 +4,10 @@
 
 Least trimmed squares: the fit to the half of the samples that fits best (Rousseeuw 1984), found as
 in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few randomly drawn
-configurations, as close to the start as these allow. Concentration steps improve each: take the half with
-the shortest residuals, fit it, repeat. All fits share one linearised model and are computed at
-once as matrix products; the model is linearised again at the best fit until its half no longer
-changes.
+configurations, as close to the start as these allow. Concentration steps improve each: take the
+half with the shortest residuals, fit it, repeat. All fits share one linearised model and are
+computed at once as matrix products; the model is linearised again at the best fit until its half
+no longer changes.
 
 Half means half of every set of observations, and slightly more: with P parameters and R equations
 (1 + P / R) / 2 of the samples, which tolerates the most gross errors, (1 - P / R) / 2 of them
