@@ -88,8 +88,7 @@ class Seen:
             self.faults.append(message.text)
 
     def drawn(self):
-        """Draw all figures, as printing does."""
-        self.page.evaluate("dispatchEvent(new Event('beforeprint'))")
+        """Wait for all figures, which come one by one unless they are looked at."""
         self.page.wait_for_function(
             "[...document.querySelectorAll('div.plot')].every((e) => e.querySelector('.main-svg'))"
         )

@@ -15,7 +15,8 @@
     legend: { orientation: 'h', y: 1.02, yanchor: 'bottom', x: 0 },
   });
 
-  // Figures are drawn when they come into view: the page opens at once.
+  // Figures are drawn when they come into view, the others when nothing else is to do: the page
+  // opens at once, and a picture of all of it has them.
   const waiting = new Map();
   const watcher = new IntersectionObserver((seen) => {
     for (const each of seen) if (each.isIntersecting) draw(each.target.id);
@@ -36,6 +37,12 @@
     waiting.set(id, work);
     watcher.observe(place);
   }
+  const idle = window.requestIdleCallback || ((work) => setTimeout(work, 100));
+  const next = () => {
+    const [id] = waiting.keys();
+    if (id) { draw(id); idle(next); }
+  };
+  window.addEventListener('load', () => idle(next));
   window.addEventListener('beforeprint', () => {
     [...waiting.keys()].forEach(draw);
     document.querySelectorAll('details').forEach((each) => { each.open = true; });
