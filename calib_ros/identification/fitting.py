@@ -211,6 +211,7 @@ def _fit(
     fit = robust.fit
     factor = factor_of(fit.chain, names, robust.system, fit.normal)
     noise, uncertainty = noise_of(fit, names, robust.system, factor)
+    noise = replace(noise, given=problem.sigmas)
     return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
 
 

@@ -4,8 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import special
@@ -32,7 +32,8 @@ class Noise:
     each other and that are near each other in joint space; `shared` names which of them a test
     finds to share errors (`shared_errors.py`), and `widened` by what factor that makes the
     standard deviations larger (median). `size` is that by which they are larger than the sigmas
-    given would make them, in all.
+    given would make them, in all. `given` are these sigmas [m, rad, px] by their names in
+    `Problem`, as far as they are known.
     """
 
     position: float
@@ -43,6 +44,7 @@ class Noise:
     shared: tuple[str, ...]
     widened: float = 1.0
     size: float = 1.0
+    given: Mapping[str, float] = field(default_factory=dict)
 
 
 def noise_of(

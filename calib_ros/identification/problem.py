@@ -24,6 +24,8 @@ from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
 from calib_ros.shown import Shown
 
+SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
+
 
 @dataclass(frozen=True)
 class Learned:
@@ -110,9 +112,9 @@ class Problem(Shown):
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
-        for name in ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch'):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ConfigError(f'{name} must be a positive number, not {getattr(self, name)}')
+        for name, sigma in self.sigmas.items():
+            if not 0.0 < sigma < np.inf:
+                raise ConfigError(f'{name} must be a positive number, not {sigma}')
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()
@@ -225,6 +227,11 @@ class Problem(Shown):
                 chain = chain.with_frame(each.base, replace(device, delay=start))
         wanted = [each for name in self.effects for each in effects.resolve(chain, name)]
         return chain.with_effects(wanted)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Return the sigmas of the measurements [m, rad, px, m] by name."""
+        return {name: getattr(self, name) for name in SIGMAS}
 
     @cached_property
     def prior_sigmas(self) -> Mapping[str, float]:

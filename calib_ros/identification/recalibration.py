@@ -42,8 +42,8 @@ from calib_ros.identification.leastsquares import (
     products_of,
 )
 from calib_ros.identification.levels import ALIKE, chance_of
+from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
-from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document
 from calib_ros.identification.validation import ErrorFigures, left_out
@@ -263,11 +263,29 @@ def _wandered(names: Sequence[Parameter], years: float, growth: float) -> FloatA
 
 def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
     """Return the new poses with the noise that was found with the earlier ones."""
-    noise, sigmas = previous.noise, (problem.sigma_position, problem.sigma_orientation)
-    if noise is not None and not noise.consistent:
-        scales = (noise.position, noise.orientation or noise.position)
-        sigmas = (sigmas[0] * scales[0], sigmas[1] * scales[1])
-    return System(tuple(samples_of(each, sigmas, problem.sigma_pixel) for each in sets))
+    if previous.noise is not None:
+        problem = replace(problem, **_sigmas(problem.sigmas, previous.noise))
+    return System(problem.system(sets).sets)
+
+
+def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
+    """Return the sigmas of new poses, by those stated and the noise of the earlier ones.
+
+    One left at its default is the earlier one. Larger residuals than the earlier sigma allowed
+    need not come from the device: the excess is added to a new sigma too.
+    """
+    found = {}
+    for name, sigma in stated.items():
+        then = noise.given.get(name, sigma)
+        if sigma == getattr(Problem, name):
+            sigma = then
+        ratio = 1.0
+        if not noise.consistent:
+            turned = noise.orientation if name == 'sigma_orientation' else None
+            ratio = turned or noise.position
+        lacking = then * np.sqrt(max(ratio**2 - 1.0, 0.0))
+        found[name] = np.hypot(sigma * (min(ratio, 1.0) if sigma == then else 1.0), lacking)
+    return found
 
 
 def _judged(

@@ -227,6 +227,10 @@ def noise_of(record: Mapping[str, Any], where: str) -> Noise | None:
             tuple(map(str, known['shared'])),
             parse_number(known['widened'], 'widened'),
             parse_number(known['size'], 'size'),
+            {
+                str(name): parse_number(sigma, f'given: {name}')
+                for name, sigma in dictionary(known.get('given'), 'given').items()
+            },
         )
     except (ConfigError, KeyError, TypeError) as err:
         raise damaged('noise_in_sigma', where, err) from err

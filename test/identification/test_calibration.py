@@ -71,6 +71,7 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
         ('covariance', 5),
         ('noise_in_sigma', {'position': 'small'}),
         ('noise_in_sigma', {'shared': None}),
+        ('noise_in_sigma', {'given': {'sigma_position': 'small'}}),
         ('frames', {'base': {'session': ''}}),
         ('frames', {'base': 3}),
         ('nominal', {'base': {'xyz': [0.0]}}),

@@ -92,6 +92,29 @@ def test_of_an_arm_that_has_not_changed_nothing_is_claimed(earlier):
     )
 
 
+@pytest.mark.parametrize('stated', [True, False])
+def test_new_poses_have_the_noise_of_the_earlier_ones(stated):
+    """Of a device that is five times as noisy as assumed by default, stated once or never."""
+    noise = (5e-4, 1e-3)
+    then = dict(zip(SIGMAS, noise, strict=True)) if stated else {}
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        slipped = true.with_offsets({'elbow_joint.theta': 4e-3})
+        first, still, now = (
+            measure(arm, UR10E.random_joints(count, rng), rng, *noise)
+            for arm, count in ((true, 60), (true, 8), (slipped, 8))
+        )
+        text = Calibration.of(identify(Problem(UR10E, first, **then))).dump()
+        previous = parse_calibration(text, 'c.yaml', UR10E)
+        found = recalibrate(previous, Problem(UR10E, still), 0.1)
+        assert found.accepted
+        assert not found.changed
+        found = recalibrate(previous, Problem(UR10E, now), 0.1)
+        assert found.accepted
+        assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
+
+
 def test_a_device_that_stands_elsewhere_and_a_new_target_are_no_change_of_the_arm(earlier):
     true, previous = earlier
     rng = np.random.default_rng(6)
