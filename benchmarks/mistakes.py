@@ -26,6 +26,7 @@ from pathlib import Path
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.files.tables import read_table
@@ -74,6 +75,24 @@ def joints(change):
 def turned(change):
     """Return a change of the observations by one of their quaternions."""
     return lambda each: replace(each, rotations=se3.from_quat(change(se3.to_quat(each.rotations))))
+
+
+def rewritten(read, written, in_turn=False, size=1.0):
+    """Return a change of the observations: angles `written` in one order, `read` in another.
+
+    They are read about the axes that they are written about, or `in_turn`. None is a vector.
+    """
+    names = written or 'XYZ'
+
+    def change(each):
+        turns = Rotation.from_matrix(each.rotations)
+        angles = size * (turns.as_euler(written) if written else turns.as_rotvec())
+        if not in_turn:
+            angles = angles[:, [names.index(axis) for axis in read or 'XYZ']]
+        made = Rotation.from_euler(read, angles) if read else Rotation.from_rotvec(angles)
+        return replace(each, rotations=made.as_matrix())
+
+    return change
 
 
 def later(each):
@@ -149,6 +168,17 @@ def spoilt(problem):
         'not on the flange',
         with_(lambda e: e.inverted(), measured and oriented),
     )
+    for group, words, change in (
+        ('Euler order', 'angles are ZYX (xyz about fixed axes), not', rewritten('XYZ', 'ZYX')),
+        ('Euler order', 'angles are XYZ (zyx about fixed axes), not', rewritten('ZYX', 'XYZ')),
+        ('Euler order', 'angles are ZXY (yxz about fixed axes), not', rewritten('XYZ', 'ZXY')),
+        ('Euler order and columns', 'in the order of', rewritten('ZYX', 'XYZ', True)),
+        ('rotation vectors read as Euler angles', 'are rotation vec', rewritten('ZYX', None)),
+        ('Euler angles read as rotation vectors', 'not rotation vec', rewritten(None, 'ZYX')),
+        ('radians read as degrees', 'in radians, not', rewritten('ZYX', 'ZYX', size=np.pi / 180)),
+        ('degrees read as radians', 'orientations do', rewritten('ZYX', 'ZYX', size=180 / np.pi)),
+    ):
+        yield group, words, with_(change, measured and oriented)
     yield 'left-handed', 'left-handed', with_(suspects._mirrored, measured)
     for k in range(count):
         signs = np.ones(count)

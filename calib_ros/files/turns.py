@@ -31,6 +31,7 @@ from calib_ros.files.layouts import (
 )
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.se3 import FloatArray
 
 
@@ -96,6 +97,14 @@ def _rotations(
         )
     angles = np.column_stack([values[name] for name in names])
     _require_whole(angles, made, ', '.join(names))
+    large = np.abs(angles).max(axis=1) > TWO_TURNS
+    if large.any():
+        row = int(np.argmax(large))
+        raise InputError(
+            f'{made.where(row, ", ".join(names))} are angles of up to '
+            f'{np.abs(angles[row]).max():.6g} rad: if they are in degrees, give --angle deg '
+            '(and --joint-angle rad if the joint values are in radians)'
+        )
     if layout.rotation_vector:
         left = np.linalg.inv(se3.left_jacobian_inverse(angles))
         return se3.exp_rotation(angles), np.asarray(left)

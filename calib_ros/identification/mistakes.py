@@ -29,7 +29,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms
-from calib_ros.identification.suspects import Sets, Suspect, suspects
+from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
@@ -52,6 +52,11 @@ class Explained:
     given: float
     so: float
 
+    @property
+    def alone(self) -> bool:
+        """Tell whether it is enough to refuse a result that nothing else refuses."""
+        return not any(each.chain or each.what == ORIENTATIONS.what for each in self.suspects)
+
     def __str__(self) -> str:
         """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
@@ -65,14 +70,15 @@ def remarked(problem: Problem, result: Identification) -> Identification:
     """Return the result with the mistake that explains its errors, if there are such.
 
     It stands first among the refusals, to which measurements that are not what they should be
-    belong; another arm is a remark where the result is not refused.
+    belong; another arm, and orientations that do not fit, are a remark where the result is not
+    refused.
     """
     if not _suspicious(problem, result):
         return result
     found = explained(problem)
     if found is None:
         return result
-    if result.refusals or not any(each.chain for each in found.suspects):
+    if result.refusals or found.alone:
         return replace(result, refusals=(Reason(Rule.MISTAKE, str(found)), *result.refusals))
     return replace(result, remarks=(str(found), *result.remarks))
 
@@ -116,6 +122,17 @@ def explained(problem: Problem) -> Explained | None:
     given = _tried(chain, few)
     if given is None:
         return None
+    found = _named(problem, chain, sets, few, given) or _by_places(problem, chain, sets, given)
+    if found is None or not problem.of_messages:
+        return found
+    return replace(found, suspects=tuple(replace(e, remedy=e.published) for e in found.suspects))
+
+
+def _named(
+    problem: Problem, chain: Chain, sets: Sets, few: Sets, given: _Trial
+) -> Explained | None:
+    """Return the mistakes that explain nearly the most, up to three, if they explain enough."""
+    of_images = any(each.pixels is not None for each in problem.sets)
     rough = []
     for k, each in enumerate(suspects(chain, few, of_images)):
         whole = [_moved(problem, one, each.rows) for one in sets] if each.rows else few
@@ -141,9 +158,31 @@ def explained(problem: Problem) -> Explained | None:
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
     named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
-    if problem.of_messages:
-        named = [replace(each, remedy=each.published) for each in named]
     return Explained(tuple(named[:3]), given.error, best.error)
+
+
+def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+    """Return that the orientations are wrong, if the arm, or a mistake, explains the positions."""
+    of_images = any(each.pixels is not None for each in problem.sets)
+    if of_images or not all(e.oriented.all() and not (e.socket or e.inverse) for e in sets):
+        return None
+    alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
+    few = tuple(map(_few, alone))
+    start = _tried(chain, few)
+    if start is None:
+        return None
+    so = _polished(problem, start)
+    given = min(given, _polished(problem, given), key=lambda one: one.share)
+    if so.error <= min(problem.largest_error, NEARER * given.error):
+        known = so.error + LEVER * problem.sigma_orientation
+        enough = known < NEARER * given.error
+        return Explained((ORIENTATIONS,), given.error, so.error) if enough else None
+    found = _named(problem, chain, alone, few, start)
+    if found is None:
+        return None
+    more = ', and the orientations do not fit either'
+    named = tuple(replace(each, what=each.what + more) for each in found.suspects)
+    return replace(found, suspects=named)
 
 
 def _known(frame: Frame | None) -> Frame | None:

@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from calib_ros.identification.misread import Turn, misread
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -40,6 +41,15 @@ class Suspect:
     chain: Chain | None = None
     rows: int = 0
     published: str = 'correct it where it is published'
+
+
+ORIENTATIONS = Suspect(
+    'the positions fit the arm, the orientations do not',
+    'check their convention, their units and their columns, or leave them out',
+    lambda each: each,
+    published='check the orientations where they are published',
+)
+"""What is left to say where no other mistake explains what was measured."""
 
 
 def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Suspect]:
@@ -190,6 +200,8 @@ def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> 
                 rest = ', and correct the rest where it is published' if more else ''
                 found = replace(found, published=in_sources + rest)
             yield found
+    for what, remedy, turn in misread():
+        yield Suspect(what, remedy, _one_by_one(_as_measured, _with(turn), again), 2)
 
 
 def _of_joints(chain: Chain) -> Iterator[Suspect]:
@@ -305,10 +317,12 @@ def _scaled(size: float) -> Change:
     return lambda each: replace(each, positions=size * each.positions)
 
 
+def _with(turn: Turn) -> Change:
+    return lambda each: replace(each, rotations=turn(each.rotations))
+
+
 def _reordered(order: list[int]) -> Change:
-    return lambda each: replace(
-        each, rotations=se3.from_quat(se3.to_quat(each.rotations)[:, order])
-    )
+    return _with(lambda rotations: se3.from_quat(se3.to_quat(rotations)[:, order]))
 
 
 def _transposed(each: Observations) -> Observations:

@@ -99,6 +99,16 @@ def test_euler_angles_of_any_order(read, letters):
         assert_same(read(text_of(JOINTS, PLACES, np.radians(angles), names=names), euler=letters))
 
 
+@pytest.mark.parametrize('layout', [{'euler': 'XYZ'}, {'rotation_vector': True}])
+def test_angles_of_many_turns_are_taken_for_degrees(read, layout):
+    text = text_of(
+        JOINTS, PLACES, 60.0 * TURNED.as_rotvec(), names=['q1', 'q2', *'xyz', 'rx', 'ry', 'rz']
+    )
+    with pytest.raises(InputError, match=r'line [0-9]+: rx, ry, rz .* in degrees, .*--angle deg'):
+        read(text, **layout)
+    read(text, angle='deg', **layout)
+
+
 @pytest.mark.parametrize('letters', ['XYZ', 'zyx', 'ZYZ', 'zxy'])
 def test_standard_deviations_of_euler_angles(read, letters):
     sigmas = np.array([1e-4, 2e-4, 3e-4])

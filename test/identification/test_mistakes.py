@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identification import Problem, identify
@@ -39,6 +40,28 @@ def later(each):
     return replace(short, joints=each.joints[1:])
 
 
+def rewritten(read, written, size=1.0):
+    """Angles about x, y and z, or a rotation vector (''), are written and read otherwise."""
+
+    def change(each):
+        turns = Rotation.from_matrix(each.rotations)
+        angles = turns.as_rotvec()
+        if written:
+            angles = turns.as_euler(written)[:, [written.index(axis) for axis in 'XYZ']]
+        made = Rotation.from_rotvec(size * angles)
+        if read:
+            in_turn = size * angles[:, ['XYZ'.index(axis) for axis in read]]
+            made = Rotation.from_euler(read, in_turn)
+        return replace(each, rotations=made.as_matrix())
+
+    return change
+
+
+def _in_turn(rotations):
+    angles = Rotation.from_matrix(rotations).as_euler('ZYX')
+    return Rotation.from_euler('XYZ', angles).as_matrix()
+
+
 COUPLED = np.eye(6)
 COUPLED[2, 1] = 1.0
 SIGNS = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
@@ -54,6 +77,21 @@ SPOILT = {
     'transposed': (
         lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)),
         '--columns qx=-qx,qy=-qy,qz=-qz',
+    ),
+    'Euler order': (rewritten('XYZ', 'ZYX'), '--euler ZYX, '),
+    'Euler middle': (rewritten('XYZ', 'ZXY'), '--euler ZXY, '),
+    'Euler columns': (
+        lambda e: replace(e, rotations=_in_turn(e.rotations)),
+        '--euler ZYX with r1, r2, r3 (now rx, ry, rz)',
+    ),
+    'vectors': (rewritten('XYZ', ''), '--rotation-vector'),
+    'no vectors': (rewritten('', 'XYZ'), '--euler XYZ'),
+    'Euler radians': (rewritten('ZXY', 'ZXY', np.radians(1.0)), '--angle rad'),
+    'vectors in radians': (rewritten('', '', np.radians(1.0)), '--angle rad'),
+    'orientations': (rewritten('', '', np.degrees(1.0)), 'the orientations do not: check'),
+    'Euler order and mm': (
+        lambda e: replace(rewritten('XYZ', 'ZYX')(e), positions=1e3 * e.positions),
+        'in mm, not metres, and the orientations do not fit either: --length mm',
     ),
     'inverse': (lambda e: replace(e.inverted(), inverse=False), '--eye-in-hand (or --inverse'),
     'eye in hand': (lambda e: e.inverted(), 'leave out --eye-in-hand'),
@@ -120,6 +158,7 @@ def test_a_chain_file_in_millimetres_is_named():
 @pytest.mark.parametrize(
     ('mistake', 'remedy'),
     [
+        ('orientations', 'check the orientations where they are published'),
         ('both', 'correct it where it is published'),
         ('inverse', 'set eye_in_hand=true in sources'),
         ('sign', 'sign: -1 in the chain file'),
@@ -132,6 +171,17 @@ def test_mistakes_in_messages_name_no_option_of_a_table(mistake, remedy):
     found = str(explained(Problem(UR, SPOILT[mistake][0](seen_of()), of_messages=True)))
     assert remedy in found
     assert '--' not in found.replace(' -- or ', '')
+
+
+@pytest.mark.parametrize(('stated', 'remarks'), [(0.1, 0), (0.01, 1)])
+def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(stated, remarks):
+    """Of a small target, say: 0.1 rad; nothing is said if that is what was stated."""
+    rng = np.random.default_rng(1)
+    true = faulty(UR, Cell(), rng)
+    seen = measure(true, UR.random_joints(40, rng), rng, 5e-5, 0.1)
+    found = identify(Problem(UR, seen, sigma_position=5e-5, sigma_orientation=stated))
+    assert found.accepted
+    assert len([each for each in found.remarks if 'orientations do not' in each]) == remarks
 
 
 def test_another_robot_in_messages_is_named_as_the_chain_to_set():
