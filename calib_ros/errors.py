@@ -69,6 +69,10 @@ class UnknownNameError(ConfigError):
         )
 
 
+class ColumnsError(InputError):
+    """A table whose columns are not ours; it may be in another layout."""
+
+
 class TooFewObservationsError(InputError):
     """Not enough matched pairs for the parameters asked for."""
 

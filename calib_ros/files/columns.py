@@ -38,6 +38,12 @@ class Columns:
         """Return the place of a cell in words."""
         return f'{self.path}, line {self.lines[row]}: {name}'
 
+    def _no_number(self, row: int, name: str, text: str) -> InputError:
+        return InputError(
+            f'{self.where(row, name)} must be a finite number, not {text!r}: mend that row, or '
+            'leave it out'
+        )
+
     def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:
         """Return the numbers (N, len(names)), NaN for empty cells.
 
@@ -60,7 +66,7 @@ class Columns:
                     break
         if first is not None:
             row, k, text = first
-            parse_number(text, self.where(row, (called or names)[k]), InputError)
+            raise self._no_number(row, (called or names)[k], text)
         return parsed
 
     def block(
@@ -80,8 +86,7 @@ class Columns:
             nothing = np.isnan(found)
             lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
-                where = self.where(row, names[int(nothing[row].argmax())])
-                parse_number('', where, InputError)
+                raise self._no_number(row, names[int(nothing[row].argmax())], '')
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import MOST_ENTRIES, InputError
+from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, Row, numbered, of_cells
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
@@ -211,7 +212,7 @@ def _irregular(path: Path, text: str, told: Told, above: int) -> MadeColumns:
             continue
         if any(row[len(header) :]):
             refuse_separator(path, header)
-            raise InputError(
+            raise ColumnsError(
                 f'{path}, line {line}: more values than the {len(header)} columns of its header; '
                 'a table with other lines above that: calib_ros import'
             )
@@ -247,8 +248,18 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
     """Say how to read a table whose cells are not separated by commas."""
     for name, mark in (('semicolon', ';'), ('tab', '\t')):
         if any(mark in cell for cell in header):
-            raise InputError(
+            raise ColumnsError(
                 f'the cells of {path} are separated by {name}s: give --separator {name} (and, '
                 'where they differ, --decimal comma, --columns, --length, --angle), or convert it '
                 'with calib_ros import'
             )
+
+
+def like_joints(header: Sequence[str], joints: int) -> str:
+    """Return how names that count the joints in a header are given, or an example."""
+    for name in header:
+        for one in re.finditer('1', name):
+            before, after = name[: one.start()], name[one.end() :]
+            if all(f'{before}{k}{after}' in header for k in range(1, joints + 1)):
+                return '' if before + after == 'q' else f'q*={before}*{after},'
+    return 'q*=joint_*,'

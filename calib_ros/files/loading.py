@@ -5,13 +5,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.errors import CalibrationError, ColumnsError, InputError, TooFewObservationsError
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import Table, read_table
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.model_choice import identify_model
@@ -86,9 +88,20 @@ def table(
     foreign: Foreign | None = None,
     told: Told = nobody,
 ) -> Table:
-    """Return a table of measurements of a chain."""
+    """Return a table of measurements of a chain.
+
+    If nothing is said about its layout and its columns are not ours, their names may be those of
+    the joints, and its separator another: what is guessed is among the warnings.
+    """
     sigmas = (settings.sigma_position, settings.sigma_orientation)
-    return read_table(path, len(chain.joints), sessions, sigmas, eye_in_hand, foreign, told)
+    given = path, len(chain.joints), sessions, sigmas, eye_in_hand
+    try:
+        return read_table(*given, foreign, told)
+    except ColumnsError:
+        if foreign is None:
+            with suppress(CalibrationError):  # the first error tells what was expected
+                return read_table(*given, Foreign(Layout(), chain), told)
+        raise
 
 
 def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:

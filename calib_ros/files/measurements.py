@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ConfigError, InputError
+from calib_ros.errors import ColumnsError, ConfigError, InputError
 from calib_ros.files.columns import (
     Codes,
     Columns,
@@ -23,7 +23,7 @@ from calib_ros.files.columns import (
     lines_in_words,
     numbered,
 )
-from calib_ros.files.csv_columns import refuse_separator
+from calib_ros.files.csv_columns import like_joints, refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
@@ -300,12 +300,12 @@ def _check_header(columns: Columns, joints: int) -> None:
     if missing:
         refuse_separator(columns.path, columns.header)
         expected = ', '.join([*needed[:joints], *POSITION])
-        raise InputError(
+        raise ColumnsError(
             f'{columns.path} has no column {", ".join(missing)}; expected {expected} '
             f'and, with orientation, {", ".join(QUATERNION)} as well (or '
             'distance, plane, or location and socket); found '
             f'{", ".join(columns.header) or "nothing"}. '
-            'Columns of other names: --columns "q*=joint_*,x=NAME,..."'
+            f'Columns of other names: --columns "{like_joints(columns.header, joints)}x=NAME,..."'
         )
 
 

@@ -50,11 +50,12 @@ def misread() -> Iterator[tuple[str, str, Turn]]:
             '--rotation-vector, or convert them so',
             _meant(_angles(read), VECTOR, 'XYZ'),
         )
-        yield (
-            f'the angles are Euler angles {_order(read)}, not rotation vectors',
-            f'--euler {read}, or convert them so',
-            _meant(_vectors, read, read),
-        )
+        for vectors in (_vectors, _longer):
+            yield (
+                f'the angles are Euler angles {_order(read)}, not rotation vectors',
+                f'--euler {read}, or convert them so',
+                _meant(vectors, read, read),
+            )
         yield (
             'the Euler angles are in radians, not degrees',
             '--angle rad, with --joint-angle for the joints',
@@ -119,3 +120,8 @@ def _vectors(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     one = se3.log_rotation(rotations)
     length = np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-300)
     return one, one * (1.0 - 2.0 * np.pi / length)
+
+
+def _longer(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return them the other way round: Euler angles may well be longer than half a turn."""
+    return _vectors(rotations)[::-1]

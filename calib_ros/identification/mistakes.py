@@ -158,7 +158,8 @@ def _named(
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
     named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
-    return Explained(tuple(named[:3]), given.error, best.error)
+    unlike = {each.what: each for each in named}
+    return Explained(tuple(unlike.values())[:3], given.error, best.error)
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
@@ -178,11 +179,10 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
         enough = known < NEARER * given.error
         return Explained((ORIENTATIONS,), given.error, so.error) if enough else None
     found = _named(problem, chain, alone, few, start)
-    if found is None:
+    if found is None or len(found.suspects) > 1:
         return None
-    more = ', and the orientations do not fit either'
-    named = tuple(replace(each, what=each.what + more) for each in found.suspects)
-    return replace(found, suspects=named)
+    what = f'{found.suspects[0].what}, and the orientations do not fit either'
+    return replace(found, suspects=(replace(found.suspects[0], what=what),))
 
 
 def _known(frame: Frame | None) -> Frame | None:
