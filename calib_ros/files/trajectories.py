@@ -20,7 +20,7 @@ from calib_ros.apply.program import Program
 from calib_ros.errors import InputError
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.layouts import joint_columns
-from calib_ros.files.waypoints import joint_values
+from calib_ros.files.waypoints import header_of, joint_values
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
@@ -41,9 +41,9 @@ class ProgramFile:
 def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
     """Read a program for an arm with the named joints: CSV, or YAML by the file's suffix.
 
-    CSV: joint values in q1 ... qn, in the order of the arm; s1 ... sn, if present, are the signs
-    of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic echo` prints
-    it.
+    CSV: joint values in q1 ... qn, or in columns with the joints' names; s1 ... sn, if present,
+    are the signs of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic
+    echo` prints it.
     """
     readers = {'.csv': _read_csv, '.yaml': _read_yaml, '.yml': _read_yaml}
     if path.suffix.lower() not in readers:
@@ -57,14 +57,14 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
 
 def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
     found = columns_of(path, text.encode())
-    positions = joint_values(found, len(joints))
+    positions = joint_values(found, joints)
     signs = joint_columns(len(joints), 's')
     signed = set(signs) <= set(found.header)
     approach = np.sign(found.block(signs)) if signed else None
 
     def text_with(corrected: Program) -> str:
         header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
-        at = [found.header.index(name) for name in joint_columns(len(joints))]
+        at = [found.header.index(name) for name in header_of(found, joints)]
         for row, values in zip(rows, corrected.positions.tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value)

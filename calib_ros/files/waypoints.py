@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of poses (CSV) that hold nothing measured: candidates, tasks, plans.
 
-Joint values are in q1 ... qn [rad or m], poses in x y z [m] and qx qy qz qw.
+Joint values are in q1 ... qn, or in columns with the joints' names [rad or m], poses in x y z [m]
+and qx qy qz qw.
 """
 
 from __future__ import annotations
@@ -26,30 +27,39 @@ POSE = (*POSITION, *QUATERNION)
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
-    """Read joint values (N, n) [rad or m] of a chain from the columns q1 ... qn of a CSV.
+    """Read joint values (N, n) [rad or m] of a chain from a CSV.
 
     A value over 1e-3 beyond the limits of its joint is refused.
     """
-    found = read_columns(path, joint_columns(len(chain.joints)))
-    values = joint_values(found, len(chain.joints))
+    found = read_columns(path, ())
+    values = joint_values(found, chain.joint_names)
     lower, upper = limits(chain)
     beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
     for k, i in np.argwhere(beyond).tolist():
+        where = found.where(k, header_of(found, chain.joint_names)[i])
         raise InputError(
-            f'{found.where(k, f"q{i + 1}")} {values[k, i]:.6g} is beyond the limits of '
-            f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
+            f'{where} {values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
+            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
         )
     return values
 
 
-def joint_values(found: Columns, joints: int) -> FloatArray:
-    """Return the joint values (N, n) [rad or m] of an arm in columns q1 ... qn."""
-    names = joint_columns(joints)
-    if f'q{joints + 1}' in with_rows(found, names).header:
+def joint_values(found: Columns, joints: Sequence[str]) -> FloatArray:
+    """Return the joint values (N, n) [rad or m] of an arm with the named joints."""
+    names = header_of(found, joints)
+    more = f'q{len(joints) + 1}'
+    if more in with_rows(found, names).header:
         raise InputError(
-            f'{found.path} has a column q{joints + 1}, but the arm has {joints} joints only'
+            f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
     return found.block(names)
+
+
+def header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns that hold the joint values: q1 ... qn, or the names of the joints."""
+    ours = joint_columns(len(joints))
+    named = set(joints) <= set(found.header) and not set(ours) <= set(found.header)
+    return tuple(joints) if named else ours
 
 
 def read_poses(path: Path) -> FloatArray:

@@ -122,6 +122,19 @@ def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
     np.testing.assert_allclose(corrected, expected, rtol=0, atol=1e-15)
 
 
+def test_columns_may_have_the_names_of_the_joints(run, tmp_path):
+    """In any order, as drivers write them."""
+    assert run(TABLE)[0] == 0
+    expected = (tmp_path / 'out.csv').read_text().splitlines()[1:]
+    named = TABLE
+    for k, name in enumerate(UR.joint_names):
+        named = named.replace(f'q{k + 1}', name)
+    assert run(named, '--force')[0] == 0
+    head, *found = (tmp_path / 'out.csv').read_text().splitlines()
+    assert found == expected
+    assert head == named.splitlines()[0]
+
+
 def test_a_trajectory_is_corrected_and_the_rest_kept(run, tmp_path):
     q = regular(UR, 1) + 0.02 * np.arange(4)[:, None]
     names = ['gripper', *UR.joint_names]

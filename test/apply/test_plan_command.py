@@ -167,6 +167,10 @@ def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
             'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
             'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',
         ),
+        (
+            ','.join(load_chain('ur10e').joint_names) + '\n0,-90,0,0,0,0\n',
+            'line 2: shoulder_lift_joint -90 is beyond the limits',
+        ),
         ('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,x\n', "line 2: q6 must be a finite number, not 'x'"),
     ],
 )
