@@ -213,6 +213,24 @@ def spoilt(problem):
                 f'{names[k]} is not given against {names[k - 1]}',
                 with_(joints(lambda q, matrix=matrix: q @ matrix.T)),
             )
+    for k in range(1, count - 2):
+        signs, zero = np.ones(count), np.zeros(count)
+        signs[k], zero[k + 1] = -1.0, 0.5 * np.pi
+        yield (
+            'a sign and a zero',
+            'several mistakes',
+            with_(joints(lambda q, signs=signs, zero=zero: signs * q + zero)),
+        )
+        yield (
+            'a sign, a zero, and mm',
+            'several mistakes',
+            with_(
+                lambda e, signs=signs, zero=zero: replace(
+                    both(e, 1e3), joints=signs * e.joints + zero
+                ),
+                measured,
+            ),
+        )
     other = 'modified' if chain.convention == 'standard' else 'standard'
     yield (
         'standard and modified DH',

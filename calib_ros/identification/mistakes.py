@@ -15,6 +15,7 @@ first joint is a rotation of the base, that of the last joint one of the tool.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
 
 POLISHED = 6
 """Suspects that are polished (benchmarks/mistakes.py)."""
+MOST_AT_ONCE = 4
+"""Mistakes made at once that are looked for (benchmarks/mistakes.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +125,11 @@ def explained(problem: Problem) -> Explained | None:
     given = _tried(chain, few)
     if given is None:
         return None
-    found = _named(problem, chain, sets, few, given) or _by_places(problem, chain, sets, given)
+    found = (
+        _named(problem, chain, sets, few, given)
+        or _by_places(problem, chain, sets, given)
+        or _several(problem, chain, few, given)
+    )
     if found is None or not problem.of_messages:
         return found
     return replace(found, suspects=tuple(replace(e, remedy=e.published) for e in found.suspects))
@@ -158,7 +165,7 @@ def _named(
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
     named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
-    unlike = {each.what: each for each in named}
+    unlike = {(each.what, each.remedy): each for each in named}
     return Explained(tuple(unlike.values())[:3], given.error, best.error)
 
 
@@ -183,6 +190,57 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
         return None
     what = f'{found.suspects[0].what}, and the orientations do not fit either'
     return replace(found, suspects=(replace(found.suspects[0], what=what),))
+
+
+def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explained | None:
+    """Return mistakes that were made at once, each of which explains a part of the errors.
+
+    The best few are kept and another one is added to each, until the arm explains the rest.
+    """
+    if given.error <= problem.largest_error:
+        return None
+    of_images = any(each.pixels is not None for each in problem.sets)
+    options = [each for each in suspects(chain, few, of_images) if each.part]
+    largest = min(
+        problem.largest_error + LEVER * problem.largest_angle / 3.0, NEARER * given.error
+    )
+    kept: list[tuple[Suspect, ...]] = [()]
+    for _ in range(MOST_AT_ONCE):
+        found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
+        for some in kept:
+            for each in options:
+                if each.part not in {one.part for one in some}:
+                    more = tuple(sorted((*some, each), key=lambda one: one.part != 'measured'))
+                    trial = _tried(chain, _undone(more, few))
+                    if trial is not None:  # others may be the same in other words
+                        found.setdefault(round(trial.share, 6), (trial, more))
+        best = [found[share] for share in sorted(found)[:POLISHED]]
+        for trial, some in best[:1]:
+            so = _polished(problem, trial)
+            if so.error <= largest and so.share <= NEARER * given.share:
+                return Explained((_together(some),), given.error, so.error)
+        kept = [some for _, some in best]
+    return None
+
+
+def _undone(mistakes: Sequence[Suspect], sets: Sets) -> Sets:
+    for each in mistakes:
+        sets = tuple(map(each.change, sets))
+    return sets
+
+
+def _together(mistakes: Sequence[Suspect]) -> Suspect:
+    """Return several mistakes as one."""
+    remedies = [
+        (each.what, each.remedy if each.part == 'measured' else each.published, each.published)
+        for each in mistakes
+    ]
+    return replace(
+        mistakes[0],
+        what='several mistakes at once',
+        remedy='; '.join(f'{what} ({remedy})' for what, remedy, _ in remedies),
+        published='; '.join(f'{what} ({published})' for what, _, published in remedies),
+    )
 
 
 def _known(frame: Frame | None) -> Frame | None:

@@ -31,7 +31,7 @@ class Suspect:
     `change` makes of the samples those that should have been given, `chain` is the nominal one as
     it had to be; joint values stand so many `rows` below their measurement. Of those that explain
     the same, the lowest in `rank` are named. `published` is what to do about messages, live or of
-    a bag.
+    a bag. Mistakes of different parts, what is `measured` or a `joint`, may come together.
     """
 
     what: str
@@ -41,6 +41,7 @@ class Suspect:
     chain: Chain | None = None
     rows: int = 0
     published: str = 'correct it where it is published'
+    part: str = ''
 
 
 ORIENTATIONS = Suspect(
@@ -58,19 +59,20 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     Poses `of_images` are those of a board in a camera; joint values stand in a table of places.
     """
     if of_images:
-        yield from _of_boards(sets[0].inverse)
+        yield from _measured(_of_boards(sets[0].inverse))
         for each in _of_places(chain):
             remedy = each.published if 'chain' in each.published else 'correct it in --places'
             yield replace(each, remedy=remedy)
         return
     if not any(each.socket for each in sets):
         degrees = _turned(chain, np.radians(1.0))
-        yield from _units(chain, degrees)
+        yield from _measured(_units(chain, degrees))
         if all(each.oriented.any() for each in sets):
             whole = all(each.oriented.all() for each in sets)
             in_mm = _lengths(chain, SCALES['mm'])
             inverse = any(each.inverse for each in sets)
-            yield from _conventions(in_mm, degrees, inverse, whole)
+            yield from _measured(_conventions(in_mm, degrees, inverse, whole))
+            yield from _misread(inverse)
         yield Suspect(
             'the axes of the measuring device are left-handed',
             'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
@@ -80,6 +82,11 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     yield from _of_places(chain)
 
 
+def _measured(found: Iterator[Suspect]) -> Iterator[Suspect]:
+    for each in found:
+        yield replace(each, part='measured')
+
+
 def _of_places(chain: Chain) -> Iterator[Suspect]:
     """Yield what may be wrong about joint values and the arm."""
     for one, other, unit, size in (
@@ -87,7 +94,7 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
         ('radians', 'degrees', 'rad', np.degrees(1.0)),
     ):
         what = f'the joint values are in {one}, not {other}'
-        yield Suspect(what, f'--joint-angle {unit}', _turned(chain, size))
+        yield Suspect(what, f'--joint-angle {unit}', _turned(chain, size), part='measured')
     yield from _of_joints(chain)
     yield from _of_arms(chain)
     for rows in (1, -1, 2, -2):
@@ -200,6 +207,11 @@ def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> 
                 rest = ', and correct the rest where it is published' if more else ''
                 found = replace(found, published=in_sources + rest)
             yield found
+
+
+def _misread(inverse: bool) -> Iterator[Suspect]:
+    """Yield other conventions that the rotations may have been written in."""
+    again: Change = Observations.inverted if inverse else _as_it_is
     for what, remedy, turn in misread():
         yield Suspect(what, remedy, _one_by_one(_as_measured, _with(turn), again), 2)
 
@@ -209,24 +221,12 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
     names = chain.joint_names
     count = len(names)
     revolute = [joint.type == 'revolute' for joint in chain.joints]
-    for k, name in enumerate(names):
-        other_way = np.eye(count)
-        other_way[k, k] = -1.0
-        in_file = f'sign: {-chain.joints[k].sign} in the chain file'
-        yield Suspect(
-            f'{name} counts the other way round',
-            f'{in_file}, or --columns q{k + 1}=-q{k + 1}',
-            _joints(other_way),
-            published=in_file,
-        )
-        for degrees, angle in QUARTERS.items() if revolute[k] else ():
-            in_file = f'theta {degrees} degrees in the chain file'
-            yield Suspect(
-                f'{name} has its zero {degrees[1:]} degrees away',
-                f'{in_file}, or --columns q{k + 1}=q{k + 1}{degrees[0]}{abs(angle):.16g}',
-                _joints(np.eye(count), angle * np.eye(count)[k]),
-                published=in_file,
-            )
+    for k in range(count):
+        for sign in (1.0, -1.0):
+            zeros = {'': 0.0, **(QUARTERS if revolute[k] else {})}
+            for degrees, angle in zeros.items():
+                if sign < 0.0 or degrees:
+                    yield _of_joint(chain, k, sign, degrees, angle)
     for i in range(count):
         for j in range(i + 1, count):
             order = np.arange(count)
@@ -248,6 +248,31 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
                 _joints(coupled),
                 2,
             )
+
+
+def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
+    """Return that a joint counts the other way round, has another zero [rad], or both."""
+    whats, in_file, column = [], [], f'q{k + 1}'
+    if sign < 0.0:
+        whats.append('counts the other way round')
+        in_file.append(f'sign: {-chain.joints[k].sign}')
+        column = f'-{column}'
+    if degrees:
+        whats.append(f'has its zero {degrees[1:]} degrees away')
+        in_file.append(f'theta {degrees} degrees')
+        column += f'{degrees[0]}{abs(angle):.16g}'
+    count = len(chain.joints)
+    matrix = np.eye(count)
+    matrix[k, k] = sign
+    remedy = f'{" and ".join(in_file)} in the chain file'
+    return Suspect(
+        f'{chain.joint_names[k]} {" and ".join(whats)}',
+        f'{remedy}, or --columns q{k + 1}={column}',
+        _joints(matrix, angle * np.eye(count)[k]),
+        len(whats),
+        published=remedy,
+        part=chain.joint_names[k],
+    )
 
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:

@@ -111,6 +111,11 @@ SPOILT = {
 }
 
 
+TWO_SIGNS = np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+SIGNS_OF_TWO = tuple(
+    f'{name} counts the other way round (sign: -1 in the chain file)'
+    for name in ('shoulder_lift_joint', 'wrist_2_joint')
+)
 POSITIONS_TELL = ('mm', 'left-handed', 'sign', 'coupled')
 
 
@@ -124,6 +129,37 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     assert remedy in str(found)
     assert len(found.suspects) <= 2
     assert 5.0 * found.so < found.given
+
+
+SEVERAL = {
+    'two signs': (joints(lambda q: TWO_SIGNS * q), SIGNS_OF_TWO),
+    'sign and zero, in mm': (
+        lambda e: replace(e, joints=SIGNS * e.joints + QUARTER, positions=1e3 * e.positions),
+        (
+            'the positions are in mm, not metres (--length mm)',
+            'elbow_joint counts the other way round (sign: -1 in the chain file)',
+            'wrist_1_joint has its zero 90 degrees away (theta -90 degrees in the chain file)',
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('mistakes', SEVERAL)
+def test_mistakes_made_at_once_are_named(mistakes, oriented):
+    change, said = SEVERAL[mistakes]
+    found = str(explained(Problem(UR, change(seen_of(oriented=oriented)))))
+    assert found.startswith('several mistakes at once: ')
+    for each in said:
+        assert each in found
+
+
+def test_a_joint_with_another_sign_and_zero_is_named():
+    seen = seen_of(oriented=False)
+    turned = replace(seen, joints=SIGNS * seen.joints + np.eye(6)[2] * np.pi / 2)
+    found = str(explained(Problem(UR, turned)))
+    assert 'elbow_joint counts the other way round and has its zero 90 degrees away' in found
+    assert 'sign: -1 and theta +90 degrees in the chain file, or --columns q3=-q3+1.5' in found
 
 
 @pytest.mark.parametrize(
