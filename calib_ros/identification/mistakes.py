@@ -197,6 +197,7 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
 
     The best few are kept and another one is added to each, until the arm explains the rest.
     """
+    given = min(given, _polished(problem, given), key=lambda one: one.share)
     if given.error <= problem.largest_error:
         return None
     of_images = any(each.pixels is not None for each in problem.sets)
@@ -204,6 +205,7 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
     largest = min(
         problem.largest_error + LEVER * problem.largest_angle / 3.0, NEARER * given.error
     )
+    share = NEARER * min(given.share, 1.0)
     kept: list[tuple[Suspect, ...]] = [()]
     for _ in range(MOST_AT_ONCE):
         found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
@@ -214,10 +216,10 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
                     trial = _tried(chain, _undone(more, few))
                     if trial is not None:  # others may be the same in other words
                         found.setdefault(round(trial.share, 6), (trial, more))
-        best = [found[share] for share in sorted(found)[:POLISHED]]
+        best = [found[key] for key in sorted(found)[:POLISHED]]
         for trial, some in best[:1]:
             so = _polished(problem, trial)
-            if so.error <= largest and so.share <= NEARER * given.share:
+            if len(some) > 1 and so.error <= largest and so.share <= share:
                 return Explained((_together(some),), given.error, so.error)
         kept = [some for _, some in best]
     return None
