@@ -6,7 +6,8 @@ If the nominal arm misses the measurements by more than faulty arms do, each sus
 undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`).
 The best few are refined by least squares. A mistake is named if undoing it reduces the typical
 error below NEARER times the original and to a level that faulty arms have; mistakes that explain
-nearly as much are named with it.
+nearly as much are named with it. If none does, the positions are tried without the orientations,
+then several mistakes at once.
 
 The typical error is the median over the samples of the distance and the angle times LEVER, in
 units of the spread of the positions. Mistakes without effect cannot be detected: the zero of the
