@@ -38,6 +38,7 @@ from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import EXCEPTION
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
@@ -196,17 +197,18 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
 def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explained | None:
     """Return mistakes that were made at once, each of which explains a part of the errors.
 
-    The best few are kept and another one is added to each, until the arm explains the rest.
+    The best few are kept and another one is added to each, until the arm explains the rest, or
+    one more is no better.
     """
     given = min(given, _polished(problem, given), key=lambda one: one.share)
-    if given.error <= problem.largest_error:
+    if NEARER * given.error <= problem.largest_error:
         return None
     of_images = any(each.pixels is not None for each in problem.sets)
     options = [each for each in suspects(chain, few, of_images) if each.part]
     largest = min(
         problem.largest_error + LEVER * problem.largest_angle / 3.0, NEARER * given.error
     )
-    share = NEARER * min(given.share, 1.0)
+    share, least = NEARER * min(given.share, 1.0), given.share
     kept: list[tuple[Suspect, ...]] = [()]
     for _ in range(MOST_AT_ONCE):
         found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
@@ -218,11 +220,13 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
                     if trial is not None:  # others may be the same in other words
                         found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:POLISHED]]
-        for trial, some in best[:1]:
-            so = _polished(problem, trial)
-            if len(some) > 1 and so.error <= largest and so.share <= share:
-                return Explained((_together(some),), given.error, so.error)
+        if not best or best[0][0].share > (1.0 - EXCEPTION) * least:
+            return None
+        least = best[0][0].share
+        so = _polished(problem, best[0][0])
         kept = [some for _, some in best]
+        if len(kept[0]) > 1 and so.error <= largest and so.share <= share:
+            return Explained((_together(kept[0]),), given.error, so.error)
     return None
 
 
@@ -327,8 +331,7 @@ def _error(chain: Chain, sets: Sets) -> float:
         found = chain.forward(each.joints, base=each.base, tool=each.tool)
         away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
         if each.oriented.any():
-            relative = np.swapaxes(found[:, :3, :3], 1, 2) @ each.rotations
-            turns = np.linalg.norm(se3.log_rotation(relative), axis=1)
+            turns = se3.angles_between(found[:, :3, :3], each.rotations)
             away = away + LEVER * np.where(each.oriented, turns, 0.0)
         sizes.append(away)
     return float(np.median(np.concatenate(sizes)))

@@ -10,6 +10,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from calib_ros.identification.levels import NEARER
 from calib_ros.identification.misread import Turn, misread
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
@@ -72,7 +73,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
             in_mm = _lengths(chain, SCALES['mm'])
             inverse = any(each.inverse for each in sets)
             yield from _measured(_conventions(in_mm, degrees, inverse, whole))
-            yield from _misread(inverse)
+            yield from _misread(chain, sets[0])
         yield Suspect(
             'the axes of the measuring device are left-handed',
             'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
@@ -209,11 +210,24 @@ def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> 
             yield found
 
 
-def _misread(inverse: bool) -> Iterator[Suspect]:
-    """Yield other conventions that the rotations may have been written in."""
-    again: Change = Observations.inverted if inverse else _as_it_is
+def _misread(chain: Chain, each: Observations) -> Iterator[Suspect]:
+    """Yield other conventions that the rotations may have been written in.
+
+    Base and tool leave the angle between two poses as it is: it must be that between two flanges.
+    """
+    arm = replace(chain, base=None, tool=None).forward(each.joints)[each.oriented, :3, :3]
+    between = se3.angles_between(arm[:-1], arm[1:])
+
+    def away(rotations: FloatArray) -> float:
+        some = rotations[each.oriented]
+        return float(np.median(np.abs(se3.angles_between(some[:-1], some[1:]) - between)))
+
+    as_given = away(each.rotations)
+    again: Change = Observations.inverted if each.inverse else _as_it_is
     for what, remedy, turn in misread():
-        yield Suspect(what, remedy, _one_by_one(_as_measured, _with(turn), again), 2)
+        change = _one_by_one(_as_measured, _with(turn), again)
+        if away(change(each).rotations) < NEARER * as_given:
+            yield Suspect(what, remedy, change, 2)
 
 
 def _of_joints(chain: Chain) -> Iterator[Suspect]:

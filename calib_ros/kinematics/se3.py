@@ -97,6 +97,12 @@ def log_rotation(rotation: FloatArray) -> FloatArray:
     return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
 
 
+def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the angles (N,) [rad] between rotations (N, 3, 3), to 1e-8."""
+    cosines = (np.einsum('nij,nij->n', first, second) - 1.0) / 2.0
+    return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)))
+
+
 def skew(vector: FloatArray) -> FloatArray:
     """Return the matrices (..., 3, 3) of the cross product with (..., 3) vectors."""
     x, y, z = np.moveaxis(vector, -1, 0)

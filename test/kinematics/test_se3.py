@@ -10,6 +10,14 @@ from calib_ros.kinematics import se3
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+def test_the_angle_between_rotations_is_that_of_their_difference():
+    rng = np.random.default_rng(0)
+    vectors = np.array([[0.0, 0.0, 0.0], [1e-4, 0.0, 0.0], [0.3, -0.4, 0.5], [0.0, np.pi, 0.0]])
+    first = se3.exp_rotation(rng.normal(size=(4, 3)))
+    found = se3.angles_between(first, first @ se3.exp_rotation(vectors))
+    np.testing.assert_allclose(found, np.linalg.norm(vectors, axis=1), atol=3e-8)
+
+
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-4, 0.3, 2.0, 3.1])
 @given(SEEDS)
 def test_a_turn_is_the_exponential(angle, seed):
