@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.escapes import to_cell
-from calib_ros.files.columns import Columns, MadeColumns, distinct
+from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import (
@@ -100,6 +101,11 @@ def read_table(
     if foreign is not None:
         made, warnings = foreign.convert(path)
         return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
+    if path.is_file() and path.stat().st_size > LARGEST_TABLE:
+        rows, warnings = _of_journal(path, joints, told) or (None, ())
+        if rows is not None:
+            chosen = rows.select(_rows_of(path, rows.session, sessions))
+            return _table(chosen, sigmas, eye_in_hand, warnings)
     data, warnings = _read(path, columns(joints))
     found = columns_of(path, data, told)
     warnings = (*warnings, *_unread(found, joints))
@@ -124,10 +130,22 @@ def table_of(
     warnings: tuple[str, ...] = (),
 ) -> Table:
     """Return the table of columns; the arguments are those of `read_table`."""
-    made = measurements(_of_sessions(found, joints, sessions), joints).kept()
+    made = measurements(_of_sessions(found, joints, sessions), joints)
+    return _table(made, sigmas, eye_in_hand, warnings, 'stamp_ns' not in found.header)
+
+
+def _table(
+    made: Measurements,
+    sigmas: tuple[float, float],
+    eye_in_hand: bool,
+    warnings: tuple[str, ...],
+    by_line: bool = False,
+) -> Table:
+    """Return the table of the rows of some sessions."""
+    made = made.kept()
     made.check_frames()
     if made.test.all():
-        raise InputError(f'{found.path} has no rows to fit, only such that are marked test')
+        raise InputError(f'{made.path} has no rows to fit, only such that are marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
     frames, cameras = Frames(), dict[str, Lens]()
@@ -140,7 +158,6 @@ def table_of(
     place, names = made.frame_id
     first = np.flatnonzero(np.array([bool(name) for name in names])[place])[:1]
     world_frame = names[place[first[0]]] if len(first) else ''
-    by_line = 'stamp_ns' not in found.header
     return Table(fitted, held_out, pairs, world_frame, cameras, warnings, by_line)
 
 
@@ -184,7 +201,19 @@ def _sets(
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-    """Return the samples of a journal, of which there may be none, and warnings.
+    """Return the samples of a journal, of which there may be none, and warnings."""
+    found = _of_journal(path, joints)
+    if found is None:  # cut off, or a table
+        data, warnings = _read(path, columns(joints))
+        found = measurements(columns_of(path, data), joints), warnings
+    made, warnings = found
+    return () if made is None else tuple(_samples(made.kept())), warnings
+
+
+def _of_journal(
+    path: Path, joints: int, told: Told = nobody
+) -> tuple[Measurements | None, tuple[str, ...]] | None:
+    """Return the rows of a journal, None without any, and warnings; None for other files.
 
     What a node wrote may be of any length, for its samples were in memory before: it is read by
     parts, and what is no journal is refused at its first part.
@@ -194,10 +223,9 @@ def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str
     lines, rest = 1, b''
     try:
         with path.open('rb') as file:
-            if file.read(len(header)) != header:  # cut off, or a table
-                data, warnings = _read(path, columns(joints))
-                made = measurements(columns_of(path, data), joints)
-                return tuple(_samples(made.kept())), warnings
+            if file.read(len(header)) != header:
+                return None
+            size = path.stat().st_size
             while data := file.read(LARGEST_TEXT):
                 whole, end, rest = (rest + data).rpartition(b'\n')
                 if end:
@@ -206,10 +234,11 @@ def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str
                     lines += whole.count(b'\n') + 1
                 if len(rest) > LARGEST_TEXT:
                     raise InputError(f'{path}, line {lines + 1} has no end: is it a journal?')
+                told(min(file.tell() / size, 1.0))
     except OSError as err:
         raise InputError(f'cannot read {path}: {err.strerror or err}') from err
-    samples = tuple(_samples(joined(parts).kept())) if parts else ()
-    return samples, (_cut_off(path, lines + 1),) if rest else ()
+    made = joined(parts) if parts else None
+    return made, (_cut_off(path, lines + 1),) if rest else ()
 
 
 def _samples(made: Measurements) -> Iterator[Sample]:
@@ -311,9 +340,15 @@ def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Column
     if not len(found.lines):
         measurements(found, joints)  # a column that is missing says more
         raise InputError(f'{path} has no rows')
-    numbers, known = found.labels('session')
     if 'session' not in found.header and sessions:
         raise InputError(f'{path} has no column "session" to choose "{", ".join(sessions)}" from')
+    rows = _rows_of(path, found.labels('session'), sessions)
+    return found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
+
+
+def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:
+    """Return the rows of the sessions that are asked for, session by session."""
+    numbers, known = labels
     if not sessions and len(known) > 1:
         raise InputError(
             f'{path} holds several sessions, choose one of {", ".join(known)} (or several, '
@@ -324,8 +359,5 @@ def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Column
             raise InputError(f'session "{name}" is named twice')
         if name not in known:
             raise UnknownNameError(f'session in {path}', name, known)
-    if not sessions or list(sessions) == known == known[:1]:
-        return found
-    return found.select(
-        np.concatenate([np.flatnonzero(numbers == known.index(name)) for name in sessions])
-    )
+    wanted = [known.index(name) for name in sessions or known]
+    return np.concatenate([np.flatnonzero(numbers == place) for place in wanted])

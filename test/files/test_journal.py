@@ -176,6 +176,30 @@ def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
             read_journal(copy, JOINTS)
 
 
+@pytest.mark.parametrize('sessions', [('b', 'a'), ('a',)])
+def test_a_journal_longer_than_any_table_is_identified(tmp_path, monkeypatch, sessions):
+    path = tmp_path / 'cell.csv'
+    many = [plain(k, session='ab'[k % 3 == 0]) for k in range(1, 30)]
+    written(path, many)
+    with path.open('ab') as file:
+        file.write(b'1,2')
+    at_once = read_table(path, JOINTS, sessions)
+    monkeypatch.setattr(tables, 'LARGEST_TEXT', 700)
+    monkeypatch.setattr(tables, 'LARGEST_TABLE', 1000)
+    shares = []
+    by_parts = read_table(path, JOINTS, sessions, told=shares.append)
+    assert shares[-1] == 1.0
+    assert shares == sorted(shares)
+    assert len(shares) >= 5
+    assert by_parts.warnings == at_once.warnings
+    for one, other in zip(by_parts.fitted, at_once.fitted, strict=True):
+        assert (one.base, one.tool) == (other.base, other.tool)
+        np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+        np.testing.assert_array_equal(one.positions, other.positions)
+    with pytest.raises(InputError, match='holds several sessions, choose one of a, b'):
+        read_table(path, JOINTS)
+
+
 @pytest.mark.parametrize('name', ['ball', 'a,b', 'say "ball"', 'Kugel \u00e4\u2460'])
 @pytest.mark.parametrize('share', np.linspace(0.02, 0.98, 5))
 def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
