@@ -24,7 +24,7 @@ import numpy as np
 
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
-from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, NEARER
+from calib_ros.identification.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -38,7 +38,6 @@ from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import EXCEPTION
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
@@ -198,10 +197,10 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
     """Return mistakes that were made at once, each of which explains a part of the errors.
 
     The best few are kept and another one is added to each, until the arm explains the rest, or
-    one more is no better.
+    one more is no better. One alone may be no better: two can hide each other.
     """
     given = min(given, _polished(problem, given), key=lambda one: one.share)
-    if NEARER * given.error <= problem.largest_error:
+    if given.error <= problem.largest_error:
         return None
     of_images = any(each.pixels is not None for each in problem.sets)
     options = [each for each in suspects(chain, few, of_images) if each.part]
@@ -220,7 +219,7 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
                     if trial is not None:  # others may be the same in other words
                         found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:POLISHED]]
-        if not best or best[0][0].share > (1.0 - EXCEPTION) * least:
+        if not best or (len(best[0][1]) > 1 and best[0][0].share > CONFIDENT * least):
             return None
         least = best[0][0].share
         so = _polished(problem, best[0][0])

@@ -222,11 +222,11 @@ def _misread(chain: Chain, each: Observations) -> Iterator[Suspect]:
         some = rotations[each.oriented]
         return float(np.median(np.abs(se3.angles_between(some[:-1], some[1:]) - between)))
 
-    as_given = away(each.rotations)
+    largest = NEARER * max(away(each.rotations), float(np.median(between)))
     again: Change = Observations.inverted if each.inverse else _as_it_is
     for what, remedy, turn in misread():
         change = _one_by_one(_as_measured, _with(turn), again)
-        if away(change(each).rotations) < NEARER * as_given:
+        if away(change(each).rotations) < largest:
             yield Suspect(what, remedy, change, 2)
 
 

@@ -131,6 +131,20 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     assert 5.0 * found.so < found.given
 
 
+@pytest.mark.parametrize('seed', range(2))
+def test_a_wrong_order_of_angles_is_named_where_the_tool_hardly_turns(seed):
+    rng = np.random.default_rng(seed)
+    q = np.array([0.3, -1.4, 1.6, 0.0, -1.5, 0.2]) + 0.1 * rng.uniform(-1.0, 1.0, (40, 6))
+    q[:, :3] += rng.uniform(-0.5, 0.5, (40, 3))
+    q[:, 3] -= np.pi / 2 + q[:, 1] + q[:, 2]
+    q[:, 5] += q[:, 0]
+    seen = measure(faulty(UR, Cell(), rng), q, rng, 5e-5, 2e-4)
+    turn = seen.rotations[0].T
+    near_none = replace(seen, rotations=turn @ seen.rotations, positions=seen.positions @ turn.T)
+    found = explained(Problem(UR, rewritten('ZYX', 'XYZ')(near_none)))
+    assert '--euler XYZ, ' in str(found)
+
+
 SEVERAL = {
     'two signs': (joints(lambda q: TWO_SIGNS * q), SIGNS_OF_TWO),
     'sign and zero, in mm': (
