@@ -4,7 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Compiled once, not by each of some hundred processes of the tests.
 unexport PYTHONDONTWRITEBYTECODE
-# uv takes an eighth of pip's time; pip stands in where uv does not run or finds no index.
+# uv takes an eighth of pip's time; pip stands in where uv does not run or finds no index. Like pip
+# it trusts the certificates of the system, as behind a company's proxy.
+export UV_SYSTEM_CERTS := 1
 define packages
 { $(BIN)/uv pip install --quiet --python $(BIN)/python $(1) \
 	|| $(BIN)/python -m pip install --quiet --disable-pip-version-check $(1); }
