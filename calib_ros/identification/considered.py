@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.identification.device import bends
-from calib_ros.identification.leastsquares import Normal, System, normal_equations, stacked
+from calib_ros.identification.leastsquares import Normal, System, gram, normal_equations
 from calib_ros.identification.levels import PRINTED, SCALE
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics import effects
@@ -111,10 +111,16 @@ def _products(
     """Return the products of columns, fields (K, c, N) of each set, and the residual."""
     if not any(map(len, fields)):
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
-    wide = []
-    for rows, field in zip(system.rows_of(chain, columns), fields, strict=True):
-        bent = np.zeros((len(field), *rows.shape[1:]))
-        bent[:, : field.shape[1]] = field
-        wide.append(np.concatenate([rows[:-1], bent, rows[-1:]]))
-    matrix = stacked(wide)
-    return np.asarray(matrix.T @ matrix)
+    size = len(columns)
+    found = np.zeros((size + len(fields[0]) + 1,) * 2)
+    own = [*range(size), -1]
+    for samples, field in zip(system.sets, fields, strict=True):
+        first = 0
+        for placed, *turned in samples.parts(chain, columns):
+            last = first + placed.shape[2]
+            wide = np.concatenate([placed[:-1], field[:, :, first:last], placed[-1:]])
+            found += gram(wide)
+            for rows in turned:  # what bends space turns nothing
+                found[np.ix_(own, own)] += gram(rows)
+            first = last
+    return found

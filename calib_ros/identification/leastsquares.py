@@ -127,6 +127,12 @@ def stacked(rows: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate([each.reshape(len(each), -1) for each in rows], axis=1).T
 
 
+def gram(rows: FloatArray) -> FloatArray:
+    """Return the products (P, P) of rows (P, c, N) with each other."""
+    flat = rows.reshape(len(rows), -1)
+    return np.asarray(flat @ flat.T)
+
+
 def owners(rows: Sequence[FloatArray]) -> NDArray[np.intp]:
     """Return (R,) the number of the sample, over all sets, of each row of `stacked`."""
     ends = np.cumsum([each.shape[2] for each in rows]).tolist()

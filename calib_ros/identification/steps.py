@@ -30,7 +30,7 @@ from scipy import special
 from calib_ros.identification.configurations import stops
 from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
-from calib_ros.identification.leastsquares import STEP_TOLERANCE
+from calib_ros.identification.leastsquares import STEP_TOLERANCE, gram
 from calib_ros.identification.levels import SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -176,7 +176,7 @@ class _Scan:
         self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
         self.stops = int(number.max(initial=-1)) + 1
         extra, offset = replace(few, separations=()).extra_rows(self._chain, names)
-        whole = np.array([_product(rows) for rows in self._rows])
+        whole = np.array([gram(rows) for rows in self._rows])
         matrix = whole.sum(axis=0)[: self._fitted]
         normal = matrix[:, : self._fitted] + extra.T @ extra
         self._root = inverse_root(normal, np.diag(normal))
@@ -258,7 +258,7 @@ class _Scan:
         for rows, numbers in zip(self._rows, self._numbers, strict=True):
             moving = rows[columns][:, np.newaxis] * slow[:, np.newaxis, numbers]
             wide = moving.reshape(-1, *rows.shape[1:])
-            matrix += _product(np.concatenate([rows[: self._fitted], wide, rows[-1:]]))
+            matrix += gram(np.concatenate([rows[: self._fitted], wide, rows[-1:]]))
         cross = self._root.T @ matrix[: self._fitted, self._fitted : -1]
         own = matrix[self._fitted : -1, self._fitted : -1]
         root = inverse_root(own - cross.T @ cross, np.diag(own))
@@ -315,9 +315,3 @@ def _groups(problem: Problem) -> list[_Group]:
     for joint in problem.chain.joints:
         found.append(_Group(joint.name, 'joint', (joint.driven,), everywhere))
     return found
-
-
-def _product(rows: FloatArray) -> FloatArray:
-    """Return (K, K) the products of rows (K, c, N) with each other."""
-    flat = rows.reshape(len(rows), -1)
-    return np.asarray(flat @ flat.T)
