@@ -102,7 +102,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     """Return the step that explains more than half of the residuals of a fit, if there is one."""
     scan = _Scan(problem, names, robust)
     some = _some_places(scan.stops)
-    near = scan.best(some, 0.5 * EXPLAINED)
+    near = scan.best(some, 0.5 * EXPLAINED) if len(some) else None
     if near is None:
         return None
     before, after = some[some < near.stop], some[some > near.stop]

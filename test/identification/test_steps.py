@@ -10,6 +10,7 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, along_path
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.identification import fitting
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.observations import Observations
@@ -226,3 +227,12 @@ def test_exact_poses_have_no_step():
         true = arm(rng)
         seen = measure(true, UR10E.random_joints(30, rng), rng)
         assert identify(Problem(UR10E, seen)).step is None
+
+
+def test_nothing_moves_between_fewer_stops_than_a_step_has_on_both_sides():
+    rng = np.random.default_rng(5)
+    few = np.repeat(UR10E.random_joints(5, rng), 8, axis=0)
+    seen = measure(arm(rng), few, rng, *NOISE)
+    problem = Problem(UR10E, seen, fixed=('*_joint.*',))
+    _, _, fit = fitting.fit(problem)
+    assert find_step(problem, fit.names, fit.robust) is None
