@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from calib_ros.apply.candidates import PLANE
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
-from calib_ros.apply.iso9283 import PLANE
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import configurations

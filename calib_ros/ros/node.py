@@ -37,11 +37,9 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.report import words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary
-from calib_ros.ros.deferred import DeferredTrigger
+from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger
 from calib_ros.ros.diagnostics import Diagnostics
-from calib_ros.ros.filer import Filer
-from calib_ros.ros.identifying import Identifying, Snapshot
+from calib_ros.ros.identifying import Filer, Identifying, Snapshot
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown

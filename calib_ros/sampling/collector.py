@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.hints import Hint, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Maker, Matched, Numbered
-from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, Slice, StreamKey
-from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, Slice, Stamps, StreamKey, Waiting
+from calib_ros.sampling.stops import SAMPLED, Known, Plan, Rests, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
-from calib_ros.sampling.waiting import Waiting
 from calib_ros.settings import Settings
 
 REST_S = 0.5 * Settings.shortest_stop

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
 
 MOVED = 2.0 * Settings.still

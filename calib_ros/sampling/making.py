@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import StreamKey
+from calib_ros.sampling.slices import Stamps, StreamKey
 from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 

@@ -19,13 +19,10 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
-from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.entry import Entry, Part
-from calib_ros.sampling.hints import Hint, frozen, progress
-from calib_ros.sampling.kept import Kept
+from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
+from calib_ros.sampling.hints import Account, Hint, frozen, progress
 from calib_ros.sampling.live import Estimate, LiveEstimate
-from calib_ros.sampling.names import FrameNames, JointNames
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.problems import (
     check_joint_names,
@@ -35,10 +32,9 @@ from calib_ros.sampling.problems import (
     problem_since,
     refuse_other_joints,
 )
-from calib_ros.sampling.road import Road
+from calib_ros.sampling.road import STRAY, Road
 from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
-from calib_ros.sampling.strays import STRAY
 from calib_ros.settings import Settings
 
 ONE_FRAME = (

@@ -15,7 +15,7 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
 from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS
-from calib_ros.sampling.rows import Stamps
+from calib_ros.sampling.slices import Stamps
 from calib_ros.sampling.sources import (
     MARKERS,
     TYPES,

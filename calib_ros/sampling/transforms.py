@@ -23,7 +23,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import Layout
 from calib_ros.sampling.messages import TRANSFORMS, Readings
-from calib_ros.sampling.rows import Stamps
+from calib_ros.sampling.slices import Stamps
 from calib_ros.sampling.sources import Source, short_type
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some

@@ -97,7 +97,7 @@ def outcome(session):
 def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     rng = np.random.default_rng(seed)
     if seed == 4:  # the first stream that comes when none is in use takes the only place
-        monkeypatch.setattr('calib_ros.sampling.waiting.MOST_NAMES', 1)
+        monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 1)
     first, second = shift(rng), shift(rng)
     # The clock jumps back when the recording begins again.
     messages = first + (second if seed % 2 else [])
@@ -120,7 +120,7 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
 
 
 def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.waiting.MOST_NAMES', 1)
+    monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 1)
     quat = [0.0, 0.0, 0.0, 1.0]
     messages = [pose(START, [np.nan, 0.0, 0.0], quat)]
     for k in range(1, 5):

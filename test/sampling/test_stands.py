@@ -5,10 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from calib_ros.sampling.slices import Piece, Slice, StreamKey
-from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
-from calib_ros.sampling.stops import SPIKE
-from calib_ros.sampling.waiting import Waiting
+from calib_ros.sampling.slices import Piece, Slice, StreamKey, Waiting
+from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Plan, Rests, seen_stops
 from calib_ros.settings import Settings
 
 S = 10**9

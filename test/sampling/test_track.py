@@ -8,7 +8,7 @@ from hypothesis import given, strategies as st
 from tracked import BOTH, MAX_GAP, MS, add, at, fill, filled, track
 
 from calib_ros.sampling.interpolation import MOVED
-from calib_ros.sampling.rows import Rows
+from calib_ros.sampling.slices import Rows
 from calib_ros.sampling.track import CAUSES
 
 
