@@ -182,13 +182,8 @@ class Known:
         self._stops = Rows(1 + len(revolute), capacity)  # how long, and where
         self._last_ns = 0  # none ends later
 
-    def meets(
-        self, stops: Sequence[tuple[int, int]], joints: FloatArray, near: float
-    ) -> list[bool]:
-        """Tell which stops at joint values (S, n) were sampled before; remember the others."""
-        return [self._meets(*stop, where, near) for stop, where in zip(stops, joints, strict=True)]
-
-    def _meets(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
+    def meets(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
+        """Tell whether a stop at joint values (n,) was sampled before; remember it if not."""
         if begin <= self._last_ns:
             begins, lengths = self._stops.stamps, self._stops.values[:, 0]
             meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)

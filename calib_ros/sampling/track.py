@@ -10,7 +10,7 @@ interpolated on its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,23 +84,12 @@ CAUSES = ('', 'no joint state before', 'no joint state after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Joint values (N, n), their velocities and accelerations at N stamps.
-
-    `approach` (N, n) holds the signs of the last moves; `cause` (N,) is an index of CAUSES, and
-    where it is not zero the values count for nothing.
-    """
+class Motion(NamedTuple):
+    """Joint values (N, n), their velocities and accelerations unless the arm stands."""
 
     joints: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    approach: FloatArray
-    cause: NDArray[np.intp]
-
-    def rows(self, which: NDArray[np.bool_]) -> Motion:
-        """Return the motion at some of the stamps."""
-        return Motion(*(getattr(self, item.name)[which] for item in fields(self)))
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
 
 
 class Track:
@@ -166,35 +155,30 @@ class Track:
         return sum(rows.sort() for rows in self._parts.values())
 
     def at(self, stamps: Stamps, standing: bool = False) -> Motion:
-        """Return the motion at stamps (N,), after `sort`.
+        """Return the motion at stamps (N,) at which it is known (`causes`), after `sort`.
 
         While the arm stands joint values are interpolated linearly: a cubic beside the end of a
         stop would hold a part of the move.
         """
-        shape = (len(stamps), len(self._revolute))
-        joints, velocity, acceleration, approach = (np.zeros(shape) for _ in range(4))
+        found = np.zeros((3, len(stamps), len(self._revolute)))
         for columns, rows in self._by_size():
             index = list(columns)
-            revolute = self._revolute[index]
             why, first, last = self._brackets(rows.stamps, stamps)
-            found = interpolated(rows, stamps, first, last, revolute, standing)
-            came = last_moves(rows.values, first, found[0], self._came[index], revolute)
-            good = np.ix_(why == 0, index)
-            for whole, part in zip(
-                (joints, velocity, acceleration, approach), (*found, came), strict=True
-            ):
-                whole[good] = part[why == 0]
-        return Motion(joints, velocity, acceleration, approach, self.causes(stamps))
+            part = interpolated(rows, stamps, first, last, self._revolute[index], standing)
+            for whole, each in zip(found, part, strict=True):
+                whole[np.ix_(why == 0, index)] = each[why == 0]
+        return Motion(found[0]) if standing else Motion(*found)
 
-    def where(self, stamps: Stamps) -> FloatArray:
-        """Return joint values (N, n) while the arm stands, after `sort`, without the approach."""
-        joints = np.zeros((len(stamps), len(self._revolute)))
+    def approach(self, stamps: Stamps, joints: FloatArray) -> FloatArray:
+        """Return the signs (N, n) of the last moves before joint values (N, n) at stamps (N,)."""
+        found = np.zeros(joints.shape)
         for columns, rows in self._by_size():
             index = list(columns)
-            why, first, last = self._brackets(rows.stamps, stamps)
-            found, *_ = interpolated(rows, stamps, first, last, self._revolute[index], True)
-            joints[np.ix_(why == 0, index)] = found[why == 0]
-        return joints
+            why, first, _ = self._brackets(rows.stamps, stamps)
+            revolute, came = self._revolute[index], self._came[index]
+            signs = last_moves(rows.values, first, joints[:, index], came, revolute)
+            found[np.ix_(why == 0, index)] = signs[why == 0]
+        return found
 
     def causes(self, stamps: Stamps) -> NDArray[np.intp]:
         """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
@@ -318,6 +302,5 @@ class Track:
         if self.missing:
             return np.zeros(0, dtype=np.int64), np.zeros((0, len(self._revolute)))
         main = max(self._parts.items(), key=lambda item: len(item[0]))[1]
-        motion = self.at(main.stamps)
-        good = motion.cause == 0
-        return main.stamps[good], motion.joints[good]
+        stamps = main.stamps[self.causes(main.stamps) == 0]
+        return stamps, self.at(stamps).joints
