@@ -24,7 +24,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
-from calib_ros.sampling.slices import JOINTS, Piece, Rows, Slice, Stamps, StreamKey, merged
+from calib_ros.sampling.slices import JOINTS, Piece, Rows, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import NAMED
 from calib_ros.values import MOST_NAMES
@@ -122,7 +122,10 @@ def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
 
 
 def peaks(score: FloatArray, rise: float) -> NDArray[np.intp]:
-    """Return where correlations (N,) rise by so much above the valleys towards higher ones."""
+    """Return where correlations (N,) rise by so much above the valleys towards higher ones.
+
+    As scipy.signal.find_peaks, which takes 0.4 s and 35 MB to load.
+    """
     padded = np.pad(score, 1, constant_values=-1.0)
     found = []
     tops = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])
@@ -182,166 +185,148 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
 WATCH_NS = round(5e9 * LEAST_MOTION)
 """Time over which a watch looks."""
 DENSE_NS = round(0.8e9 * STEP)
-"""Time between two samples that it keeps; nearer ones tell no more of speeds."""
+"""Time in which it keeps one sample; more tell no more of speeds."""
 EARLY = SMOOTHING / 2.0**0.5
 """Time [s] by which measurements of a stop may be stamped too early: the accuracy of one delay. Of
 what then shows the arm leaving, most is left out as spikes; the rest moves the mean by less than
 the noise of a measurement."""
 
 
-class Sparse(Rows):
-    """Rows no nearer to each other than DENSE_NS."""
+class Clocks:
+    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops.
 
-    _last_ns = 0
-
-    def take(self, pieces: Sequence[Piece]) -> None:
-        """Take what is in pieces, as far as there is room."""
-        stamps, numbers = merged(pieces, self.width)
-        chosen: list[int] = []
-        for i, stamp_ns in enumerate(stamps.tolist()):
-            if abs(stamp_ns - self._last_ns) >= DENSE_NS:
-                self._last_ns = stamp_ns
-                chosen.append(i)
-        del chosen[self.capacity - self.count :]
-        self.extend(stamps[chosen], numbers[chosen])
-
-
-class Watch:
-    """Joint values and poses while the arm moves, to see whether the clocks agree.
-
-    Once that is seen it sleeps until measurements at stops show unrest: where a clock was moved
-    they do, and are left out or refused. Without stops it is `sleepless`.
+    Joint values and poses are watched while the arm moves. Once the clocks are seen to agree that
+    ends until measurements at stops show unrest: where a clock was moved they do, and are left out
+    or refused. In mode continuous, which has no stops, it goes on.
     """
 
-    def __init__(self, chain: Chain, sleepless: bool, settings: Settings) -> None:
+    def __init__(self, chain: Chain, settings: Settings) -> None:
+        self.settings = settings
         self._chain = chain
-        self._sleepless, self._max_gap = sleepless, settings.max_gap
-        self._capacity = settings.pose_buffer
-        self._joints = Sparse(len(chain.joints), self._capacity)
-        self._poses: dict[StreamKey, Sparse] = {}
-        self._unrest = 0
-        self._taken = self._agreed = 0
-        self.awake = True
-        self.delay: Delay | None = None
-        """The last one seen."""
-        self.unclear: Delay | None = None
-        """One with rivals, while no other was seen."""
-        self.moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
+        self._continuous = settings.mode == 'continuous'
+        self._found: Delay | None = None  # in the motion that is sampled
+        self._looked_ns = 0
+        self._joints = Rows(len(chain.joints), settings.pose_buffer)
+        self._poses: dict[StreamKey, Rows] = {}
+        self._unrest = self._taken = self._agreed = 0
+        self._awake = True
+        self._seen: Delay | None = None
+        self._unclear: Delay | None = None  # one with rivals, while no other was seen
+        self._moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
         """By how much [s] it changed, and after how many samples at least."""
+
+    @property
+    def delay(self) -> Delay | None:
+        """Return how late the measurements are stamped, as far as the motion shows."""
+        if not self._continuous:
+            return self._seen
+        return None if self._found is None or self._found.rivals else self._found
 
     def wake(self, unrest: int, calm: int, taken: int) -> None:
         """Watch again if more measurements at stops were not at rest.
 
         Before the first of these there were `calm` samples; so many are `taken` by now.
         """
-        if unrest > self._unrest and not self.awake:
-            self.awake, self._agreed = True, calm
+        if unrest > self._unrest and not self._awake:
+            self._awake, self._agreed = True, calm
         self._unrest, self._taken = unrest, taken
 
     def take(self, pieces: Sequence[Piece]) -> None:
-        """Take values of all joints, and measured positions with the rotation if known."""
-        if not self.awake:
-            return
-        joints = []
-        for each in pieces:
-            key = each.key
-            if not isinstance(key, StreamKey):
-                if len(key) == len(self._chain.joints):
-                    joints.append(each)
-            elif key.is_place and (key in self._poses or len(self._poses) < MOST_NAMES):
-                self._poses.setdefault(key, Sparse(7, self._capacity)).take([each])
-        if joints:
-            self._joints.take(joints)
+        """Watch values of all joints, and measured positions with the rotation if known."""
+        for key, _, stamps, numbers in pieces if self._awake else ():
+            rows = self._joints
+            if isinstance(key, StreamKey):
+                if not key.is_place or (key not in self._poses and len(self._poses) == MOST_NAMES):
+                    continue
+                rows = self._poses.setdefault(key, Rows(7, rows.capacity))
+            elif len(key) < rows.width:
+                continue
+            last = rows.stamps[-1:] if rows.count else np.array([-DENSE_NS])
+            fresh = np.flatnonzero(np.diff(stamps // DENSE_NS, prepend=last // DENSE_NS))
+            fresh = fresh[: rows.capacity - rows.count]
+            rows.extend(stamps[fresh], numbers[fresh, : rows.width])
 
     @property
-    def begun_ns(self) -> int | None:
+    def _begun_ns(self) -> int | None:
         """Return the first stamp since the last look."""
         return int(self._joints.stamps[0]) if self._joints.count else None
 
+    def calm(self, given: Slice) -> tuple[int, int]:
+        """Return stamps of joints between which there is nothing to look for."""
+        begun = self._begun_ns
+        if begun is None:
+            begun = int(given.times[given.where(JOINTS)[:1]].sum())
+        return begun - WATCH_NS, begun + WATCH_NS
+
     def look(self, now_ns: int) -> None:
         """Look what the motion shows if it is time to, and begin anew."""
-        if not (self.awake and self.begun_ns and abs(now_ns - self.begun_ns) > WATCH_NS):
+        if not (self._awake and self._begun_ns and abs(now_ns - self._begun_ns) > WATCH_NS):
             return
         joints, poses = self._joints, self._poses.values()
         for rows in (joints, *poses):
             rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
-        found = _delay_of(self._chain, (joints.stamps, joints.values), measured, self._max_gap)
+        found = self._delay_of((joints.stamps, joints.values), measured)
         joints.release(joints.count)
         self._poses.clear()
         if found is None:
             return
-        known = self.delay
+        known = self._seen
         every = (found.seconds, *found.rivals)
         # Speeds over SMOOTHING tell no finer difference.
         if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
             if found.rivals:
-                self.unclear = found if known is None else None
+                self._unclear = found if known is None else None
                 return
             if known is not None:
-                self.moves.append((found.seconds - known.seconds, self._agreed))
-            self.delay, self.unclear = found, None
+                self._moves.append((found.seconds - known.seconds, self._agreed))
+            self._seen, self._unclear = found, None
         self._agreed = self._taken
-        self.awake = self._sleepless
-
-
-class Clocks:
-    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops."""
-
-    def __init__(self, chain: Chain, settings: Settings) -> None:
-        self.settings = settings
-        self._chain = chain
-        self._continuous = settings.mode == 'continuous'
-        self.watch = Watch(chain, self._continuous, settings)
-        self._found: Delay | None = None  # in the motion that is sampled
-        self._looked_ns = 0
-
-    @property
-    def delay(self) -> Delay | None:
-        """Return how late the measurements are stamped, as far as the motion shows."""
-        if not self._continuous:
-            return self.watch.delay
-        return None if self._found is None or self._found.rivals else self._found
-
-    def calm(self, given: Slice) -> tuple[int, int]:
-        """Return stamps of joints between which there is nothing to look for."""
-        begun = self.watch.begun_ns
-        if begun is None:
-            begun = int(given.times[given.where(JOINTS)[:1]].sum())
-        return begun - WATCH_NS, begun + WATCH_NS
+        self._awake = self._continuous
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
-        """Look for the delay after some time of motion, until it shows.
+        """Look for the delay after some time of motion, until it shows, for a collector to use.
 
-        Nothing is sampled before; at the end (None) what has come must do.
+        Nothing is sampled before; at the end (None) what has come must do. One that has rivals is
+        not used.
         """
         if not collector.holding:
             return
         if now_ns is not None and 0 <= now_ns - self._looked_ns < 1e9 * LEAST_MOTION:
             return
         self._looked_ns = now_ns or 0
-        self._found = self._find(collector, now_ns)
+        self._found = self._delay_of(*collector.known(now_ns))
+        if self.delay is not None:
+            collector.delay_ns = round(self.delay.seconds * 1e9)
         collector.holding = self.delay is None and now_ns is not None
 
-    def _find(self, collector: Collector, now_ns: int | None) -> Delay | None:
-        """Return how late the waiting measurements are; from now on the collector uses it.
+    def _delay_of(
+        self,
+        joints: tuple[Stamps, FloatArray],
+        streams: Sequence[tuple[Stamps, FloatArray]],
+    ) -> Delay | None:
+        """Return how late poses are, by the stream that shows it best.
 
-        One that has rivals is not used.
+        Rows (N, 7 or more) of each stream have NaN where no rotation is known.
         """
-        best = _delay_of(self._chain, *collector.known(now_ns), self.settings.max_gap)
-        if best is not None and not best.rivals:
-            collector.delay_ns = round(best.seconds * 1e9)
-        return best
+        found = []
+        for stamps, rows in streams:
+            oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
+            turns = se3.from_quat(rows[:, QUAT]) if oriented else None
+            positions, max_gap = rows[:, POSITION], self.settings.max_gap
+            delay = find_delay(self._chain, *joints, stamps, positions, turns, max_gap)
+            found += [] if delay is None else [delay]
+        return max(found, key=lambda delay: (not delay.rivals, delay.correlation), default=None)
 
     def hints(self) -> list[Hint]:
         """Return what looks wrong with the clocks."""
         found = []
         delay, known = self.delay, self.settings.delay
-        if self.watch.moves:
-            found.append(moved(self.watch.moves))
+        if self._moves:
+            found.append(moved(self._moves))
         elif delay is not None and not self._continuous and self._spoils(delay.seconds):
             found.append(disagreement(delay.seconds, known))  # in motion it is fitted
-        unclear = self._found if self._continuous else self.watch.unclear
+        unclear = self._found if self._continuous else self._unclear
         if unclear is not None and unclear.rivals and not known:
             delays = (unclear.seconds, *unclear.rivals)
             if self._continuous or all(map(self._spoils, delays)):
@@ -351,22 +336,3 @@ class Clocks:
     def _spoils(self, delay: float) -> bool:
         """Tell whether a delay [s] spoils stops."""
         return not -EARLY <= delay - self.settings.delay <= self.settings.settle
-
-
-def _delay_of(
-    chain: Chain,
-    joints: tuple[Stamps, FloatArray],
-    streams: Sequence[tuple[Stamps, FloatArray]],
-    max_gap: float,
-) -> Delay | None:
-    """Return how late poses are, by the stream that shows it best.
-
-    Rows (N, 7 or more) of each stream have NaN where no rotation is known.
-    """
-    found = []
-    for stamps, rows in streams:
-        oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
-        rotations = se3.from_quat(rows[:, QUAT]) if oriented else None
-        delay = find_delay(chain, *joints, stamps, rows[:, POSITION], rotations, max_gap)
-        found += [] if delay is None else [delay]
-    return max(found, key=lambda delay: (not delay.rivals, delay.correlation), default=None)

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.sampling.messages import LARGEST, MessageError, Readings
+from calib_ros.sampling.messages import LARGEST, Readings
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
 from calib_ros.sampling.sources import Source
@@ -45,10 +45,7 @@ class JointNames:
             named = {name for names in self._layouts for name in names}
             missing = [name for name in self._names if name not in named]
             self.foreign = tuple(sorted(named)) if missing else ()
-        layout = self._layouts[key]
-        if not layout[0]:
-            raise MessageError(OTHERS)
-        return layout
+        return self._layouts[key]
 
     def foreign_ones(self, missing: Sequence[int]) -> str:
         """Return in words that other joints come than those of some numbers; empty if none do."""
@@ -67,25 +64,29 @@ class FrameNames:
         self._known: dict[str, Counter[str]] = {}
         self._usual: dict[str, str] = {}
 
-    def check(self, device: str, frame_id: str, wanted: str, count: int = 1) -> None:
-        """Note the frame of some measurements; refuse any but the one `wanted`, or the usual."""
-        if wanted and frame_id != wanted:
-            raise MessageError(f'in frame "{frame_id}", not in frame_id "{wanted}"')
-        if not frame_id.isprintable():  # it shall be a cell of a table
-            raise MessageError('in a frame whose name cannot be printed')
-        self.note(device, frame_id, count)
-        usual = self._usual.get(device, frame_id)
-        if frame_id != (wanted or usual):
-            raise MessageError(strange(frame_id, usual))
+    def fault(self, device: str, frame_id: str, wanted: str, count: int) -> str:
+        """Note the frame of some measurements; return why it is none to use, empty if it is.
 
-    def note(self, device: str, frame_id: str, count: int = 1) -> None:
-        """Note the frame of measurements that were taken before."""
+        Only the one `wanted` is, or the usual.
+        """
+        if wanted and frame_id != wanted:
+            return f'in frame "{frame_id}", not in frame_id "{wanted}"'
+        if not frame_id.isprintable():  # it shall be a cell of a table
+            return 'in a frame whose name cannot be printed'
+        if not self.note(device, frame_id, count):
+            return f'in one of more than {MOST_NAMES} frames'
+        usual = self._usual.get(device, frame_id)
+        return '' if frame_id == (wanted or usual) else strange(frame_id, usual)
+
+    def note(self, device: str, frame_id: str, count: int) -> bool:
+        """Note the frame of measurements; return False where it is one too many."""
         known = self._known.setdefault(device, Counter())
         if frame_id not in known and len(known) == MOST_NAMES:
-            raise MessageError(f'in one of more than {MOST_NAMES} frames')
+            return False
         known[frame_id] += count
         if known[frame_id] >= NO_ACCIDENT:
             self._usual.setdefault(device, frame_id)
+        return True
 
     def usual(self, device: str) -> str | None:
         """Return the usual frame of a device; None while few measurements have come."""
@@ -160,10 +161,9 @@ class Entry:
         """Yield joint values that can be used, those of the chain."""
         latest = -1
         for places, _, (stamps, (_, *names), numbers) in parts:
-            try:
-                columns, index = self._names.layout(tuple(names))
-            except MessageError as err:
-                self.miss(JOINTS, len(stamps), str(err))
+            columns, index = self._names.layout(tuple(names))
+            if not columns:
+                self.miss(JOINTS, len(stamps), OTHERS)
                 continue
             values = numbers[:, index]
             size = np.abs(values).max(axis=1)
@@ -198,7 +198,9 @@ class Entry:
             self.refused.pop(POSES, None)
             if not recording:
                 self.unused['measurements: not recording'] += count
-            elif self._is_in_frame(source.device, frame_id, wanted, count):
+            elif fault := self._frames.fault(source.device, frame_id, wanted, count):
+                self.dropped[f'{POSES}: {fault}'] += count
+            else:
                 width = readings.numbers.shape[1]
                 if width > 7:  # a covariance of zeros stands for none
                     none = ~readings.numbers[:, 7:].any(axis=1)
@@ -229,15 +231,6 @@ class Entry:
             ]
         return sorted(parts, key=lambda part: int(part.places[0]))
 
-    def _is_in_frame(self, device: str, frame_id: str, wanted: str, count: int) -> bool:
-        """Tell whether measurements are in the frame of their device; count them if not."""
-        try:
-            self._frames.check(device, frame_id, wanted, count)
-        except MessageError as err:
-            self.dropped[f'{POSES}: {err}'] += count
-            return False
-        return True
-
 
 class Kept:
     """Samples in the order in which they were taken; in the frame `wanted`, if any is.
@@ -263,10 +256,9 @@ class Kept:
         Those of targets that were measured once are left out where others were more often: they
         tell nothing about the arm, and hundreds of them would take minutes.
         """
-        wanted = self.wanted
         found = self.samples
-        if wanted or self._frames.several:
-            found = [each for each in found if self._frame_of(each, wanted) == each.frame_id]
+        if self.wanted or self._frames.several:
+            found = [each for each in found if self._frame_of(each) == each.frame_id]
         counts = Counter((each.device, each.target) for each in found if not each.validation)
         once = {key for key, count in counts.items() if count == 1}
         if once != self._once:  # the list does not only grow
@@ -276,11 +268,10 @@ class Kept:
             return found
         return [each for each in found if (each.device, each.target) not in once]
 
-    def _frame_of(self, sample: Sample, wanted: str = '') -> str:
+    def _frame_of(self, sample: Sample) -> str:
         """Return in which frame a sample should be; some do not tell in which they are."""
-        return (
-            sample.frame_id and (wanted or self._frames.main(sample.device))
-        ) or sample.frame_id
+        should = self.wanted or self._frames.main(sample.device)
+        return (sample.frame_id and should) or sample.frame_id
 
     def leave_out_strange(self) -> None:
         """Take back samples in strange frames, the first ones say, if there are only a few."""

@@ -172,7 +172,7 @@ class Road:
         """Hand over the samples made."""
         made, shaken = self.collector.maker.take()
         count = self._taken(made)
-        self.clocks.watch.wake(self.collector.maker.unrest, count - shaken, count)
+        self.clocks.wake(self.collector.maker.unrest, count - shaken, count)
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, of so many measurements."""
@@ -210,11 +210,11 @@ class Road:
                 self._newest[kind] = int(newest[-1])
                 if back := int((times < newest).sum()):  # nothing is lost by it
                     self.notes[f'{kind} with a stamp older than the one before'] += back
-        self.clocks.watch.take(given.pieces)
+        self.clocks.take(given.pieces)
         rounds = self.collector.take(given)
         if rounds:
             self.clocks.find(self.collector, rounds[-1])
             self.collector.round(rounds)
         self.hand_over()
         if rounds:
-            self.clocks.watch.look(rounds[-1])
+            self.clocks.look(rounds[-1])

@@ -188,21 +188,6 @@ def _by_arrival(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
     return tuple(sorted(present, key=lambda each: int(each.places[0])))
 
 
-def merged(pieces: Sequence[Piece], width: int) -> tuple[Stamps, FloatArray]:
-    """Return stamps (N,) and numbers (N, width) in the order in which they came, NaN for none."""
-    stamps = np.concatenate([each.stamps for each in pieces])
-    numbers = np.full((len(stamps), width), np.nan)
-    begin = 0
-    for each in pieces:
-        part = each.numbers[:, :width]
-        numbers[begin : begin + len(part), : part.shape[1]] = part
-        begin += len(part)
-    if len(pieces) == 1:
-        return stamps, numbers
-    order = np.argsort(np.concatenate([each.places for each in pieces]))
-    return stamps[order], numbers[order]
-
-
 TOO_LATE = 'measurements: later than lateness allows'
 TOO_MANY = f'measurements: of one more than {MOST_NAMES} targets, or frames'
 
