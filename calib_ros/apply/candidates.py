@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calib_ros.apply.design import Design
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import inverse, se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Visibility:
                 f'the cone must be between 0 and 180 degrees, not {np.degrees(self.cone):g}'
             )
 
-    def sees(self, design: Design, joints: FloatArray) -> NDArray[np.bool_]:
+    def sees(self, design: Design, joints: FloatArray) -> Flags:
         """Return (N,) whether the target can be measured at joint values (N, n)."""
         base = {'base': design.chain.base, **dict(design.chain.frames)}[design.base]
         poses = design.targets(joints)
@@ -94,7 +94,7 @@ def draw_candidates(
     return found[:count]
 
 
-def visit_order(joints: FloatArray, velocities: FloatArray) -> NDArray[np.intp]:
+def visit_order(joints: FloatArray, velocities: FloatArray) -> Index:
     """Return a fast order (N,) in which to visit configurations (N, n).
 
     The slowest joint, at `velocities` (n,) [rad/s or m/s], determines the time of a move. Nearest

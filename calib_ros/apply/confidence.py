@@ -18,10 +18,9 @@ one-sided, each at the wanted confidence.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0
 """So many make limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
@@ -38,9 +37,7 @@ def rms_limits(
     return lower, upper
 
 
-def rms_interval(
-    errors: FloatArray, group: NDArray[np.intp], confidence: float
-) -> tuple[float, float]:
+def rms_interval(errors: FloatArray, group: Index, confidence: float) -> tuple[float, float]:
     """Return the one-sided limits [m] of the RMS of errors (N, 3) over poses like these.
 
     `group` (N,) are the configurations, of which each counts for one. With a single one nothing
@@ -68,7 +65,7 @@ def freedom_of(moments: FloatArray) -> float:
     return float(2.0 / max(normal, scatter))
 
 
-def moments_of(errors: FloatArray, group: NDArray[np.intp]) -> FloatArray:
+def moments_of(errors: FloatArray, group: Index) -> FloatArray:
     """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
     each = errors[:, :, np.newaxis] * errors[:, np.newaxis]
     sums = np.zeros((int(group.max()) + 1, 3, 3))

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.apply.candidates import travel_times, visit_order
@@ -30,7 +29,7 @@ from calib_ros.apply.design import Candidates, Design, accuracy, information_of,
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
 from calib_ros.identification.identifiability import indices_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import CRITERIA, Criterion
 from calib_ros.shown import Shown, as_frame
@@ -48,9 +47,9 @@ def choose(
     task: FloatArray | None = None,
     apart: float = STILL,
     told: Told = nobody,
-    start: NDArray[np.intp] | None = None,
+    start: Index | None = None,
     exchanged: bool = True,
-) -> NDArray[np.intp]:
+) -> Index:
     """Choose poses to measure among candidates (N, n) [rad or m].
 
     Return the indices (count,) of the chosen poses, the most informative first. The criterion
@@ -85,7 +84,7 @@ class _Pick:
         self._each = each[(slice(None), *self._upper)]
         self._start = space.known + HALF_THE_DIGITS * np.eye(size)  # invertible
         self._apart = apart
-        self._near: list[NDArray[np.bool_]] = []
+        self._near: list[Flags] = []
         self._blocked = np.zeros(len(space.rows), dtype=np.intp)
         self.information = self._start
         self.chosen: list[int] = []
@@ -132,7 +131,7 @@ class _Pick:
             self.add(new, place)
         return changed
 
-    def in_order(self, worth: _Worth) -> NDArray[np.intp]:
+    def in_order(self, worth: _Worth) -> Index:
         """Return the chosen, the best first."""
         left, ordered, information = list(self.chosen), [], self._start
         while left:
@@ -200,7 +199,7 @@ def _root(information: FloatArray) -> FloatArray:
 
 
 def efficiency(
-    design: Design, candidates: FloatArray, chosen: NDArray[np.intp], task: FloatArray | None
+    design: Design, candidates: FloatArray, chosen: Index, task: FloatArray | None
 ) -> float:
     """Return a lower bound on how good a choice is against the best choice of as many candidates.
 
@@ -245,7 +244,7 @@ class Plan(Shown):
     """
 
     joints: FloatArray
-    visit: NDArray[np.intp]
+    visit: Index
     travel: float
     accuracy: FloatArray
     at_random: FloatArray
@@ -271,7 +270,7 @@ def plan(
     velocities: FloatArray | None = None,
     draws: int = 25,
     told: Told = nobody,
-    chosen: NDArray[np.intp] | None = None,
+    chosen: Index | None = None,
 ) -> Plan:
     """Plan a number of measurements, and compare them with so many random draws.
 
@@ -311,7 +310,7 @@ def fewest(
     criterion: Criterion = 'd',
     apart: float = STILL,
     told: Told = nobody,
-) -> NDArray[np.intp]:
+) -> Index:
     """Return the indices (K,) of the fewest poses with the accuracy `wanted`, the best first.
 
     It is the predicted RMS position error [m] at the task poses (T, n).

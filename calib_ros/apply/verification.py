@@ -27,7 +27,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calib_ros.apply.candidates import PLANE
@@ -46,7 +45,7 @@ from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
@@ -117,7 +116,7 @@ class Verification(Shown):
     comparison: Comparison
     tolerance: float | None
     confidence: float
-    group: NDArray[np.intp]
+    group: Index
     rms: float
     lower: float
     upper: float
@@ -239,7 +238,7 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
 
 
 def _decided(
-    tolerance: float, lower: FloatArray, upper: FloatArray, numbers: NDArray[np.intp]
+    tolerance: float, lower: FloatArray, upper: FloatArray, numbers: Index
 ) -> tuple[Verdict, int | None]:
     """Return the verdict by the first limits, and which of the numbers of poses would decide."""
     decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))

@@ -13,14 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import AIMS, Aim, Model
 from calib_ros.shown import Shown
@@ -281,7 +280,7 @@ class _Search:
         index = np.arange(len(placements))
         return errors[index, best], joints[index, best]
 
-    def _follow(self, poses: FloatArray, later: int) -> tuple[FloatArray, NDArray[np.bool_]]:
+    def _follow(self, poses: FloatArray, later: int) -> tuple[FloatArray, Flags]:
         """Return joint values (M, S, K, n) for poses (M, K, 4, 4), and which reach them."""
         count, length = poses.shape[:2]
         _, nearest = self._tree.query(_features(poses[:, 0]), self._starts)

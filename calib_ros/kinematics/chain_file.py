@@ -228,7 +228,6 @@ def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> st
 
 
 def _flag(content: dict[str, Any], where: str, default: bool) -> bool:
-    """Return whether a frame or lens is fixed."""
     fixed = content.get('fixed', default)
     if not isinstance(fixed, bool):
         raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')

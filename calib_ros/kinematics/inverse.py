@@ -29,12 +29,19 @@ from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.newton import Minimum, Normal, minimise
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, transform
+from calib_ros.kinematics.se3 import (
+    HALF_THE_DIGITS,
+    ROUNDING,
+    ROUNDS,
+    Flags,
+    FloatArray,
+    Index,
+    transform,
+)
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown
@@ -55,7 +62,7 @@ class Inverse:
     joints: FloatArray
     position: FloatArray
     orientation: FloatArray
-    converged: NDArray[np.bool_]
+    converged: Flags
 
 
 def solve(
@@ -89,7 +96,7 @@ def solve(
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
-    def linearise(q: FloatArray, which: NDArray[np.intp]) -> Normal:
+    def linearise(q: FloatArray, which: Index) -> Normal:
         error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], LEVER)
         error, columns = error[part], columns[:, part]
         normal = np.einsum('ikb,jkb->ijb', columns, columns)
@@ -175,9 +182,6 @@ def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
         np.array([-np.inf if lower is None else lower for lower, _ in ends]),
         np.array([np.inf if upper is None else upper for _, upper in ends]),
     )
-
-
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -331,7 +335,7 @@ class Follower:
         """
         stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], len(task.q[0])))
 
-        def linearise(x: FloatArray, which: NDArray[np.intp]) -> Normal:
+        def linearise(x: FloatArray, which: Index) -> Normal:
             some, soft = task.select(which), stiffness[..., which]
             error, columns = self._linearise(some, x, weight)
             pull = np.einsum('ijb,jb->ib', soft, x)
@@ -381,6 +385,6 @@ class _Task(NamedTuple):
     held: Flags
     start: FloatArray
 
-    def select(self, index: NDArray[np.intp]) -> _Task:
+    def select(self, index: Index) -> _Task:
         """Return some of the samples."""
         return _Task._make(None if each is None else each[..., index] for each in self)

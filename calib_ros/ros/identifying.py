@@ -51,7 +51,7 @@ class Filer:
 
     def __init__(self, place: str, serial: str, nominal: Chain) -> None:
         self._history = History(place) if place else None
-        self._serial, self._nominal = serial, nominal
+        self.serial, self._nominal = serial, nominal
         if place and not serial:
             raise ConfigError('a history needs the serial number of the robot: set serial as well')
 
@@ -76,7 +76,7 @@ class Filer:
     def _about(self, problem: Problem, settings: Settings, *more: str) -> Filing:
         sets = (*problem.sets, *problem.judging)
         hashed = settings_hash(self._nominal, settings, *more)
-        return Filing(self._serial, measured_at(sets), samples_hash(sets), hashed)
+        return Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
 
     def _file(self, row: Callable[[], Row]) -> str:
         try:
@@ -138,13 +138,13 @@ class Identifying:
         self._advice = ''  # of the last identification, that on what is graver first
         self._report: Path | None = None  # of the last identification, if it was refused
 
-    def snapshot(self, topics: Sequence[str], serial: str) -> Snapshot:
+    def snapshot(self, topics: Sequence[str]) -> Snapshot:
         """Return the problem and all that goes with it, as they are now."""
         session, self._advice, self._report = self._session, '', None
         problem = session.problem()
         samples = tuple(session.usable)
         origin = {
-            'robot_serial': serial,
+            'robot_serial': self._filer.serial,
             'topics': topics,
             'first_stamp_ns': min(sample.stamp_ns for sample in samples),
             'last_stamp_ns': max(sample.stamp_ns for sample in samples),

@@ -105,12 +105,7 @@ class Keeper:
     """Keeps the calibration of a session, its publishers and its files together."""
 
     def __init__(
-        self,
-        node: Node,
-        session: CalibrationSession,
-        archive: Archive,
-        given: Given,
-        urdf: str,
+        self, node: Node, session: CalibrationSession, archive: Archive, given: Given, urdf: str
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
         self._given, self._urdf = given, urdf
@@ -205,8 +200,7 @@ class Keeper:
         chain, record = calibration.chain, calibration.record
         links = self._given.links
         forms = exports(chain, nominal, joints, record)
-        ends = {'base_link': links['base_link'], 'tip_link': links['tip_link']}
-        forms += vendor_files(chain, nominal, record, self._urdf, ends)
+        forms += vendor_files(chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
             text = corrected_urdf(self._urdf, chain, **links)

@@ -15,9 +15,8 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.hints import Hint, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Maker, Numbered
 from calib_ros.sampling.sample import Sample
@@ -86,8 +85,10 @@ class Collector:
         can tell: none comes late for them, and there is room. That one is the first of those
         beyond two stamps of joints between which nobody else has anything to do.
         """
+        if self.track.full:  # the older half is let go: nothing may be held any longer
+            self._round(self._complete_ns)
         if self.track.full:
-            self._make_room()
+            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
         count = len(given)
         joints = given.where(JOINTS)
         stamps = given.times[joints]
@@ -335,17 +336,11 @@ class Collector:
         self.maker.forget(sample)
         self._known.forget(sample.stamp_ns - round(1e9 * sample.delay))
 
-    def _count_causes(self, cause: NDArray[np.intp]) -> None:
+    def _count_causes(self, cause: Index) -> None:
         for k, text in enumerate(CAUSES[1:], start=1):
             count = int((cause == k).sum())
             if count:
                 self.dropped[f'measurements: {text}'] += count
-
-    def _make_room(self) -> None:
-        """Let go the older half of the samples of some joints; nothing may be held any longer."""
-        self._round(self._complete_ns)
-        if self.track.full:
-            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
 
     def start_anew(self) -> None:
         """Go on after the clock jumped back: finish what came before, keep the samples."""

@@ -15,12 +15,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
@@ -113,7 +112,7 @@ def find_delay(
     )
 
 
-def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
+def _rivals(score: FloatArray, best: int) -> Index:
     """Return at which other peaks of the correlation as much of the speeds is left."""
     found = peaks(score, RISE)
     others = found[found != best]
@@ -121,7 +120,7 @@ def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
     return np.asarray(others[left < ALIKE * least])
 
 
-def peaks(score: FloatArray, rise: float) -> NDArray[np.intp]:
+def peaks(score: FloatArray, rise: float) -> Index:
     """Return where correlations (N,) rise by so much above the valleys towards higher ones.
 
     As scipy.signal.find_peaks, which takes 0.4 s and 35 MB to load.
@@ -168,7 +167,7 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
     part = slice(*known)
     other[part] = second[part] - second[part].mean()
 
-    def total(values: FloatArray, shift: NDArray[np.intp] | int = 0) -> FloatArray:
+    def total(values: FloatArray, shift: Index | int = 0) -> FloatArray:
         running = np.concatenate([[0.0], np.cumsum(values)])
         return np.asarray(running[end + shift] - running[begin + shift])
 
@@ -248,7 +247,6 @@ class Clocks:
 
     @property
     def _begun_ns(self) -> int | None:
-        """Return the first stamp since the last look."""
         return int(self._joints.stamps[0]) if self._joints.count else None
 
     def calm(self, given: Slice) -> tuple[int, int]:
@@ -301,9 +299,7 @@ class Clocks:
         collector.holding = self.delay is None and now_ns is not None
 
     def _delay_of(
-        self,
-        joints: tuple[Stamps, FloatArray],
-        streams: Sequence[tuple[Stamps, FloatArray]],
+        self, joints: tuple[Stamps, FloatArray], streams: Sequence[tuple[Stamps, FloatArray]]
     ) -> Delay | None:
         """Return how late poses are, by the stream that shows it best.
 
@@ -334,5 +330,4 @@ class Clocks:
         return found
 
     def _spoils(self, delay: float) -> bool:
-        """Tell whether a delay [s] spoils stops."""
         return not -EARLY <= delay - self.settings.delay <= self.settings.settle

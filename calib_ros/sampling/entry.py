@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.messages import LARGEST, Readings
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
@@ -18,7 +18,7 @@ from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
 from calib_ros.values import MOST_NAMES
 
-Layout: TypeAlias = tuple[Columns, NDArray[np.intp]]
+Layout: TypeAlias = tuple[Columns, Index]
 OTHERS = 'none of the joints in the message'
 
 
@@ -62,7 +62,8 @@ class FrameNames:
 
     def __init__(self) -> None:
         self._known: dict[str, Counter[str]] = {}
-        self._usual: dict[str, str] = {}
+        self.usual: dict[str, str] = {}
+        """The usual frames by device, where more than a few measurements have come."""
 
     def fault(self, device: str, frame_id: str, wanted: str, count: int) -> str:
         """Note the frame of some measurements; return why it is none to use, empty if it is.
@@ -75,7 +76,7 @@ class FrameNames:
             return 'in a frame whose name cannot be printed'
         if not self.note(device, frame_id, count):
             return f'in one of more than {MOST_NAMES} frames'
-        usual = self._usual.get(device, frame_id)
+        usual = self.usual.get(device, frame_id)
         return '' if frame_id == (wanted or usual) else strange(frame_id, usual)
 
     def note(self, device: str, frame_id: str, count: int) -> bool:
@@ -85,22 +86,13 @@ class FrameNames:
             return False
         known[frame_id] += count
         if known[frame_id] >= NO_ACCIDENT:
-            self._usual.setdefault(device, frame_id)
+            self.usual.setdefault(device, frame_id)
         return True
-
-    def usual(self, device: str) -> str | None:
-        """Return the usual frame of a device; None while few measurements have come."""
-        return self._usual.get(device)
-
-    @property
-    def settled(self) -> int:
-        """Return of how many devices the usual frame is known."""
-        return len(self._usual)
 
     def main(self, device: str) -> str | None:
         """Return the usual frame of a device, or the most frequent one while few have come."""
         known = self._known.get(device)
-        return self._usual.get(device) or (max(known, key=known.__getitem__) if known else None)
+        return self.usual.get(device) or (max(known, key=known.__getitem__) if known else None)
 
     @property
     def several(self) -> bool:
@@ -127,7 +119,7 @@ def strange(frame_id: str, usual: str) -> str:
 class Part(NamedTuple):
     """What messages of one stream say, and their places (N,) among others; source None: joints."""
 
-    places: NDArray[np.intp]
+    places: Index
     source: Source | None
     readings: Readings
 
@@ -158,7 +150,6 @@ class Entry:
             self.refused[kind] = cause
 
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
-        """Yield joint values that can be used, those of the chain."""
         latest = -1
         for places, _, (stamps, (_, *names), numbers) in parts:
             columns, index = self._names.layout(tuple(names))
@@ -190,7 +181,6 @@ class Entry:
                 self.unused['joints: not recording'] += len(stamps)
 
     def _measured(self, parts: Sequence[Part], recording: bool, wanted: str) -> Iterator[Piece]:
-        """Yield measurements that can be used."""
         for places, source, readings in self._by_frame(parts):
             assert source is not None
             count, frame_id = len(places), readings.strings[0]
@@ -221,7 +211,7 @@ class Entry:
         frames: dict[str, set[str]] = {}
         for each in parts:
             assert each.source is not None
-            if self._frames.usual(each.source.device) is None:
+            if each.source.device not in self._frames.usual:
                 frames.setdefault(each.source.device, set()).add(each.readings.strings[0])
         if any(len(some) > 1 for some in frames.values()):
             parts = [

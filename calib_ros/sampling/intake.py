@@ -20,6 +20,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.cdr import alike, head
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
@@ -50,7 +51,6 @@ Deserialise: TypeAlias = Callable[[Any, str], Any]
 """Makes a message of its bytes and type."""
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and what came on them, serialised or not, in the order in which it came."""
-Places: TypeAlias = NDArray[np.intp]
 Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
 """Place, stamp [ns] and numbers of one message."""
 
@@ -191,8 +191,7 @@ class Intake:
             for source, where, found in measured:
                 self._add(source, TRANSFORM, where, found)
 
-    def _add(self, source: Source | None, kind: str, places: Places, found: Readings) -> None:
-        """Add what can be used, and count the rest."""
+    def _add(self, source: Source | None, kind: str, places: Index, found: Readings) -> None:
         good, causes = usable(kind, found)
         self.faults[JOINTS if source is None else POSES] += causes
         if not good.all():
@@ -208,7 +207,7 @@ class Intake:
         message = partial(self._deserialise, data, stream.type)
         try:
             if stream.type == CAMERA_INFO:
-                pictures.learn(source.topic, message())
+                pictures.cameras[source.topic].learn(message())
                 return
             serialised = isinstance(data, bytes)
             stamp_ns, frame_id = head(data) if serialised else head_of(message())
@@ -220,7 +219,7 @@ class Intake:
         found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
         self._add(source, stream.type, np.array([place]), found)
 
-    def _decode(self, places: Sequence[int]) -> Iterator[tuple[Stream, Places, Readings]]:
+    def _decode(self, places: Sequence[int]) -> Iterator[tuple[Stream, Index, Readings]]:
         """Yield what messages say that are decoded one after the other, alike ones together."""
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
@@ -248,5 +247,4 @@ class Intake:
 
 
 def _pair(strings: Sequence[str]) -> Pair:
-    """Return the two frames of a link."""
     return frame_name(strings[0]), frame_name(strings[1])

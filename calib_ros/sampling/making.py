@@ -11,10 +11,9 @@ from operator import itemgetter
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import Piece, StreamKey
@@ -33,7 +32,7 @@ RESTLESS = 'measurements: a stop that spreads more than the noise'
 class Maker:
     """Makes samples, up to a capacity, and no two of one stream with the same stamp."""
 
-    def __init__(self, revolute: NDArray[np.bool_], capacity: int) -> None:
+    def __init__(self, revolute: Flags, capacity: int) -> None:
         self._revolute, self._capacity = revolute, capacity
         self._taken: dict[StreamKey, set[int]] = {}
         self.fresh: list[Sample] = []
@@ -46,7 +45,7 @@ class Maker:
         self,
         found: Piece,
         motion: Motion,
-        begins: NDArray[np.intp],
+        begins: Index,
         approach: FloatArray,
         delay: float,
         sigma: float,
@@ -108,12 +107,7 @@ class Maker:
             )
 
     def _of_images(
-        self,
-        found: Piece,
-        begins: NDArray[np.intp],
-        joints: FloatArray,
-        approach: FloatArray,
-        delay: float,
+        self, found: Piece, begins: Index, joints: FloatArray, approach: FloatArray, delay: float
     ) -> Iterator[Numbered]:
         """Yield a sample of the images of each stop, of which one will be looked at."""
         key, numbers, stamps, values = found

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import LARGEST as LARGEST, QUATERNION_TOLERANCE, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
@@ -102,7 +102,7 @@ def head_of(message: Any) -> tuple[int, str]:
     return head.stamp.sec * 1_000_000_000 + head.stamp.nanosec, head.frame_id
 
 
-def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]:
+def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
     """Return which readings (N,) can be used, and the causes why others cannot.
 
     The values of joints are not looked at: some may be those of another robot.
@@ -110,7 +110,7 @@ def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]
     numbers, causes = found.numbers, Counter[str]()
     good = np.ones(len(numbers), dtype=bool)
 
-    def refuse(wrong: np.bool_ | NDArray[np.bool_], cause: str) -> None:
+    def refuse(wrong: np.bool_ | Flags, cause: str) -> None:
         count = int((good & wrong).sum())
         if count:
             causes[cause] += count

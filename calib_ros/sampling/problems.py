@@ -81,10 +81,7 @@ class Measured(Shown):
 
 
 def problem_of(
-    chain: Chain,
-    samples: Sequence[Sample],
-    settings: Settings,
-    posed: bool = False,
+    chain: Chain, samples: Sequence[Sample], settings: Settings, posed: bool = False
 ) -> Problem | None:
     """Return samples as a problem; None when there is none to fit.
 
@@ -103,10 +100,7 @@ def problem_of(
 
 
 def in_frames_of(
-    calibration: Calibration,
-    since: Sequence[Sample],
-    usable: Sequence[Sample],
-    settings: Settings,
+    calibration: Calibration, since: Sequence[Sample], usable: Sequence[Sample], settings: Settings
 ) -> list[Observations]:
     """Return the poses measured since a calibration, those among all usable ones, in its frames.
 

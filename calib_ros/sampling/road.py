@@ -108,7 +108,6 @@ class Gate:
         return [item for *_, item in freed], any(other == JOINTS for other, *_ in freed)
 
     def _is_near(self, time_ns: int) -> bool:
-        """Tell whether a time is near the last one of any stream."""
         lasts = self._last.values()
         return not lasts or any(abs(time_ns - last) <= self._far_ns for last in lasts)
 
@@ -146,11 +145,15 @@ class Road:
     def take(self, pieces: Sequence[Piece]) -> None:
         """Take messages. An error costs the slice that makes it, and none after it."""
         error: Exception | None = None
-        for given in self._slices(pieces):
-            try:
-                self._keep(given)
-            except Exception as err:
-                error = error or err
+        come = self.gate.through(Slice.of(pieces, self._delay_ns)) if pieces else ()
+        for passed, moved in come:
+            if moved and passed.times[0] < self.collector.track.horizon_ns:
+                self.collector.start_anew()
+            for given in self._up_to_work(passed):
+                try:
+                    self._keep(given)
+                except Exception as err:
+                    error = error or err
         if error is not None:
             raise error
 
@@ -183,15 +186,6 @@ class Road:
         hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
         found = [hint] if hint is not None and all(self._newest.values()) else []
         return found + self.clocks.hints() + collector.hints(measurements)
-
-    def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
-        """Yield messages up to one that gives something to do, when those before are kept."""
-        if not pieces:
-            return
-        for passed, moved in self.gate.through(Slice.of(pieces, self._delay_ns)):
-            if moved and passed.times[0] < self.collector.track.horizon_ns:
-                self.collector.start_anew()
-            yield from self._up_to_work(passed)
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

@@ -97,9 +97,9 @@ class CalibrationSession:
 
     def take(self, parts: Sequence[Part]) -> None:
         """Take messages in the order of their places."""
-        settled = self._frames.settled
+        settled = len(self._frames.usual)
         pieces = self._entry.pieces(parts, self.recording, self.settings.frame_id)
-        if self._frames.settled != settled:
+        if len(self._frames.usual) != settled:
             self._kept.leave_out_strange()
         try:
             self._road.take(pieces)
@@ -351,7 +351,7 @@ class CalibrationSession:
         fresh = [
             each
             for each in self.pictures.ready(wait)
-            if usual(each.device) is None or not self._kept.is_strange(each)
+            if each.device not in usual or not self._kept.is_strange(each)
         ]
         self._kept.samples += fresh
         for sample in fresh:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.identification.levels import CONFIDENT
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES
 
@@ -119,7 +119,7 @@ class Piece(NamedTuple):
     """Messages of one stream: places (N,) in the order of arrival, stamps (N,), numbers (N, w)."""
 
     key: Columns | StreamKey
-    places: NDArray[np.intp]
+    places: Index
     stamps: Stamps
     numbers: FloatArray
 
@@ -145,7 +145,7 @@ class Slice:
 
     pieces: tuple[Piece, ...]
     begin: int
-    joints: NDArray[np.bool_]
+    joints: Flags
     times: Stamps
 
     @classmethod
@@ -178,7 +178,7 @@ class Slice:
         part = slice(begin, end)
         return Slice(_by_arrival(pieces), self.begin + begin, self.joints[part], self.times[part])
 
-    def where(self, kind: str) -> NDArray[np.intp]:
+    def where(self, kind: str) -> Index:
         """Return the numbers of the messages of a kind."""
         return np.flatnonzero(self.joints if kind == JOINTS else ~self.joints)
 

@@ -133,7 +133,8 @@ def parse_source(text: str) -> Source:
                 raise ConfigError(f'{key} of source "{text}" must be true or false, not "{value}"')
             values[key] = value == 'true'
         elif key == 'type':
-            values[key] = _full_type(value)
+            full = (known for known in TYPES if value in (known, short_type(known)))
+            values[key] = next(full, value)
         else:
             values[key] = frame_name(value) if key in ('parent', 'child') else value
     if values.keys() & {'parent', 'child'} or topic.rpartition('/')[2] == 'tf':
@@ -169,8 +170,3 @@ def short_type(kind: str) -> str:
 def _or(kinds: Sequence[str]) -> str:
     *first, last = map(short_type, kinds)
     return f'{", ".join(first)} or {last}'
-
-
-def _full_type(name: str) -> str:
-    matches = [known for known in TYPES if name in (known, short_type(known))]
-    return matches[0] if matches else name

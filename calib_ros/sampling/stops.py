@@ -15,10 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.identification.levels import MOST_OUTLIERS
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
@@ -41,13 +40,13 @@ class Means:
     [m]; where `rests` (S,) is False measurements spread more than their noise.
     """
 
-    used: NDArray[np.bool_]
-    rests: NDArray[np.bool_]
+    used: Flags
+    rests: Flags
     values: FloatArray
     spreads: FloatArray
 
 
-def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -> Means:
+def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
     """Average positions (N, 3) or distances (N, 1) [m] stop by stop, in the order of their stamps.
 
     The stops begin at `begins` (S,); `sigmas` (S,) [m] are those of one coordinate expected.
@@ -63,7 +62,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
         settled = used[part]
         settled[: _settled(values[part], reach)] = False
         middle = np.median(values[part][settled], axis=0)
-        spikes = _distance(values[part], middle) > SPIKE * reach
+        spikes = np.linalg.norm(values[part] - middle, axis=1) > SPIKE * reach
         rests[k] = (spikes & settled).sum() <= MOST_OUTLIERS * settled.sum()  # else two places
         settled &= ~spikes
     means = mean_of_each(values, begins, used)
@@ -72,9 +71,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
     return Means(used, rests & (spreads <= limits), means, spreads)
 
 
-def mean_of_each(
-    rows: FloatArray, begins: NDArray[np.intp], used: NDArray[np.bool_]
-) -> FloatArray:
+def mean_of_each(rows: FloatArray, begins: Index, used: Flags) -> FloatArray:
     """Return the means (S, ...) of the rows (N, ...) in use of each stop, zero where none is."""
     shape = (-1,) + (1,) * (rows.ndim - 1)
     counts = np.maximum(np.add.reduceat(used, begins, dtype=np.intp), 1)
@@ -90,15 +87,11 @@ def _noise(values: FloatArray) -> float:
 def _settled(values: FloatArray, reach: float) -> int:
     """Return how many measurements come before all of them stay near the later half."""
     half = len(values) // 2
-    far = _distance(values[:half], np.median(values[half:], axis=0)) > NEAR * reach
+    far = np.linalg.norm(values[:half] - np.median(values[half:], axis=0), axis=1) > NEAR * reach
     # A spike among settled ones is no vibration: two of three in a row must be far.
     pairs = far & (np.append(far[1:], False) | np.append(far[2:], [False, False]))
     last = np.flatnonzero(pairs)
     return int(last[-1]) + 2 if last.size else 0
-
-
-def _distance(values: FloatArray, point: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(values - point, axis=1))
 
 
 SAMPLED = 'of a stop that has its pose already'
@@ -177,7 +170,7 @@ class Plan:
 class Known:
     """Where and when stops were sampled: the clock may jump back, and they come again."""
 
-    def __init__(self, revolute: NDArray[np.bool_], capacity: int) -> None:
+    def __init__(self, revolute: Flags, capacity: int) -> None:
         self._revolute = revolute
         self._stops = Rows(1 + len(revolute), capacity)  # how long, and where
         self._last_ns = 0  # none ends later

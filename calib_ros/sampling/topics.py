@@ -113,9 +113,7 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 
 
 def check_joints(
-    messages: Iterator[tuple[Stream, bytes]],
-    joint_names: Sequence[str],
-    deserialise: Deserialise,
+    messages: Iterator[tuple[Stream, bytes]], joint_names: Sequence[str], deserialise: Deserialise
 ) -> None:
     """Refuse joint states of a recording of which several topics name the same joints.
 
@@ -145,7 +143,6 @@ def check_joints(
 def _joint_values(
     messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise
 ) -> dict[tuple[str, str], list[tuple[Stamps, FloatArray]]]:
-    """Return stamps and values by topic and joint."""
     found = defaultdict(list)
     for batch, _ in batches(messages):
         for topic in dict.fromkeys(stream.topic for stream, _ in batch):

@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.identification.levels import TELLING
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
@@ -180,7 +179,7 @@ class Track:
             found[np.ix_(why == 0, index)] = signs[why == 0]
         return found
 
-    def causes(self, stamps: Stamps) -> NDArray[np.intp]:
+    def causes(self, stamps: Stamps) -> Index:
         """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
         cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
         for columns, rows in self._by_size():
@@ -194,9 +193,7 @@ class Track:
         """Return the parts; a joint that several name is taken from the last that has it."""
         return sorted(self._parts.items(), key=lambda item: len(item[0]))
 
-    def _brackets(
-        self, known: Stamps, stamps: Stamps
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    def _brackets(self, known: Stamps, stamps: Stamps) -> tuple[Index, Index, Index]:
         """Return causes (N,) and the samples before and after each stamp."""
         nowhere = np.zeros(len(stamps), dtype=np.intp)
         if len(known) == 0:

@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import Layout
 from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, usable
 from calib_ros.sampling.sources import Source, short_type
@@ -42,14 +41,14 @@ class Linked(NamedTuple):
     Their numbers are read only where they are wanted; the first and the last stamp are known.
     """
 
-    places: NDArray[np.intp]
+    places: Index
     still: bool
     link: Pair
     span: tuple[int, int]
     read: Callable[[], Readings]
 
 
-Measured: TypeAlias = tuple[Source, NDArray[np.intp], Readings]
+Measured: TypeAlias = tuple[Source, Index, Readings]
 """What one source measured, and the places of the messages in the batch."""
 
 
@@ -148,7 +147,6 @@ class Links:
             self._known = False
 
     def _move(self, come: Linked) -> None:
-        """Learn that a moving link has come."""
         link, (first_ns, last_ns) = come.link, come.span
         if link not in self._moving:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
@@ -279,7 +277,6 @@ class Links:
         return frames, ''
 
     def _to(self, frame: str) -> list[Pair]:
-        """Return the links from parents of a frame."""
         return self._parents.get(frame, [])
 
     def _composed(self, path: Sequence[tuple[Pair, bool]]) -> FloatArray:
