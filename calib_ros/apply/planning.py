@@ -164,7 +164,11 @@ class _Worth:
     def of(self, information: FloatArray, rows: FloatArray) -> FloatArray:
         """Return the worth (N,) of candidates with rows (N, m, P) from information (P, P)."""
         if self._criterion in INDICES:
-            return self._index(information, rows)
+            # of M + A^T A, in sigma per metre or radian
+            back = times(rows, self._factor)
+            total = self._factor.T @ information @ self._factor + np.swapaxes(back, 1, 2) @ back
+            singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
+            return indices_of(singular)[self._criterion]
         root = _root(information)
         seen = times(rows, root)
         turned = np.swapaxes(seen, 1, 2)
@@ -183,13 +187,6 @@ class _Worth:
         if self._wanted is None:
             return np.asarray(6.0 * np.log1p(traces(inverse) / 6.0))
         return traces(inverse @ self._wanted @ inverse)  # without (I + A C A^T)^-1
-
-    def _index(self, information: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return an observability index of M + A^T A, in sigma per metre or radian."""
-        back = times(rows, self._factor)
-        total = self._factor.T @ information @ self._factor + np.swapaxes(back, 1, 2) @ back
-        singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
-        return indices_of(singular)[self._criterion]
 
 
 def _root(information: FloatArray) -> FloatArray:

@@ -138,10 +138,8 @@ class Chain(Shown):
         """
         frames = {name: self.frame(name) for name in self.frame_names}
         names = [name for frame in frames for name in parameters_of(frame)]
-        names += [
-            Parameter(name, DELAY) for name, each in frames.items() if each.delay is not None
-        ]
-        cameras = [name for name, each in frames.items() if each.lens is not None]
+        names += [Parameter(name, DELAY) for name in frames if frames[name].delay is not None]
+        cameras = [name for name in frames if frames[name].lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
@@ -194,10 +192,8 @@ class Chain(Shown):
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with another base or tool frame, which may be a new one."""
-        if name == 'base':
-            return replace(self, base=frame)
-        if name == 'tool':
-            return replace(self, tool=frame)
+        if name in ('base', 'tool'):
+            return replace(self, base=frame) if name == 'base' else replace(self, tool=frame)
         return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
 
     def with_effects(self, names: Sequence[str]) -> Chain:

@@ -346,5 +346,6 @@ class Collector:
         """Go on after the clock jumped back: finish what came before, keep the samples."""
         self.finish()
         self.notes['the clock jumped back'] += 1
-        self.track.clear()
+        settings = self.settings
+        self.track = Track(self._revolute.tolist(), settings.max_gap, settings.joint_buffer)
         self._newest_ns = self._advanced_ns = self._settled_ns = self._sampled_ns = 0

@@ -219,10 +219,16 @@ class Waiting(dict[StreamKey, Rows]):
 
     def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray, after_ns: int) -> None:
         """Take measurements: numbers (M, w) at stamps (M,), those after a stamp."""
-        rows = self._stream(key)
-        if rows is None:
-            self._dropped[TOO_MANY] += len(stamps)
-            return
+        if key not in self and len(self) >= MOST_NAMES:  # forget those without any use
+            for each in [each for each, rows in self.items() if not rows.count]:
+                if not self._kept(each):
+                    del self[each]
+        if key not in self:
+            if len(self) >= MOST_NAMES:
+                self._dropped[TOO_MANY] += len(stamps)
+                return
+            self[key] = Rows(self._width, self._capacity)
+        rows = self[key]
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
         if len(due) < len(stamps):
@@ -242,15 +248,3 @@ class Waiting(dict[StreamKey, Rows]):
             room = self._capacity - (self[key].count if key in self else 0)
             end = int(min([end, *(places[room : room + 1] - given.begin).tolist()]))
         return end
-
-    def _stream(self, key: StreamKey) -> Rows | None:
-        """Return the buffer of a stream; None when too many others are in use."""
-        if key not in self:
-            if len(self) >= MOST_NAMES:  # forget those without any use
-                for each in [each for each, rows in self.items() if not rows.count]:
-                    if not self._kept(each):
-                        del self[each]
-            if len(self) >= MOST_NAMES:
-                return None
-            self[key] = Rows(self._width, self._capacity)
-        return self[key]

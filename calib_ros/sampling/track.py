@@ -288,12 +288,6 @@ class Track:
         middle = [int(rows.stamps[rows.count // 2]) for rows in self._parts.values() if rows.full]
         return self.release(max(middle, default=0))
 
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._parts.clear()
-        self._came[:] = 0.0
-        self.horizon_ns = 0
-
     def samples(self) -> tuple[Stamps, FloatArray]:
         """Return stamps (M,) and joint values (M, n) where the main publisher was heard."""
         if self.missing:

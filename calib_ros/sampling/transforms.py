@@ -11,7 +11,7 @@ by which it would be measured with itself.
 from __future__ import annotations
 
 import shlex
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
@@ -90,7 +90,7 @@ class Links:
         self._moving: dict[Pair, Seen] = {}
         self._changed: set[Pair] = set()
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
-        self._parents: dict[str, list[Pair]] = {}  # the links to each frame, as routes up to date
+        self._parents = defaultdict[str, list[Pair]](list)  # links to frames, as the routes are
         self._known = False  # whether the routes are up to date
         self._wanted: set[Pair] = set()
         self._open = True  # whether frames of a source are not linked yet
@@ -185,7 +185,9 @@ class Links:
             (parent, child)
             for parent, child in self._moving
             if child not in parents
-            and not any(pair in self._moving for each in above[parent] for pair in self._to(each))
+            and not any(
+                pair in self._moving for each in above[parent] for pair in self._parents[each]
+            )
         }
         order = sorted(self._moving, key=lambda link: (link not in alone, link))
         listed = [
@@ -211,9 +213,9 @@ class Links:
 
     def _update(self) -> None:
         if not self._known:
-            self._parents = {}
+            self._parents.clear()
             for link in sorted({*self._fixed, *self._moving}):
-                self._parents.setdefault(link[1], []).append(link)
+                self._parents[link[1]].append(link)
             self._routes = {source: self._route(source) for source in self.sources}
             routes = self._routes.values()
             self._wanted = {route.link for route in routes if isinstance(route, Route)}
@@ -257,14 +259,14 @@ class Links:
         common = next((frame for frame in first if frame in second), None)
         if common is None:
             return ambiguous or also
-        down = [(self._to(frame)[0], False) for frame in first[: first.index(common)]]
-        up = [(self._to(frame)[0], True) for frame in second[: second.index(common)]]
+        down = [(self._parents[frame][0], False) for frame in first[: first.index(common)]]
+        up = [(self._parents[frame][0], True) for frame in second[: second.index(common)]]
         return [*up, *reversed(down)]
 
     def _above(self, frame: str) -> tuple[list[str], str]:
         """Return a frame and those above it; and what is wrong with the last one, if anything."""
         frames = [frame]
-        while links := self._to(frames[-1]):
+        while links := self._parents[frames[-1]]:
             if len(links) > 1:
                 parents = ' and '.join(parent for parent, _ in links)
                 return frames, (
@@ -275,9 +277,6 @@ class Links:
                 return frames, f'frame "{frames[-1]}" is above itself'
             frames.append(links[0][0])
         return frames, ''
-
-    def _to(self, frame: str) -> list[Pair]:
-        return self._parents.get(frame, [])
 
     def _composed(self, path: Sequence[tuple[Pair, bool]]) -> FloatArray:
         matrix = np.eye(4)

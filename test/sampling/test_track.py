@@ -321,15 +321,6 @@ def test_a_full_track_is_halved(capacity):
         assert capacity // 2 <= len(held) <= capacity
 
 
-def test_clear_forgets_everything():
-    made = filled([(k * 10, (0.01 * k, -0.01 * k)) for k in range(10)])
-    made.release(50 * MS)
-    made.clear()
-    assert (made.newest_ns, made.horizon_ns, made.missing) == (0, 0, (0, 1))
-    add(made, BOTH, 10 * MS, np.zeros(2))
-    np.testing.assert_array_equal(came(made, 10), [[0.0, 0.0]])
-
-
 def test_rows_grow_beyond_their_first_block_and_keep_their_order():
     count = 3000
     rows = Rows(1, count)
