@@ -111,10 +111,8 @@ class Chain(Shown):
     def _find_parallel(self) -> tuple[str, ...]:
         """Return the joints whose row joins two (nearly) parallel axes, one at least revolute.
 
-        At a prismatic axis only the direction counts, but there, too, theta tilts a parallel axis
-        only to second order, and beta is needed for a complete model.
-        Row i leads from axis i to axis i + 1 in the standard convention and from axis i - 1 to
-        axis i in the modified one.
+        At a prismatic axis, too, theta tilts a parallel axis only to second order. Row i leads
+        from axis i to the next in the standard convention, and to it in the modified one.
         """
         first, last = (0, 1) if self.convention == 'standard' else (1, 0)
         rows = self.joints[first : len(self.joints) - last]

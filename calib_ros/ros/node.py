@@ -37,20 +37,18 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.report import words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger
+from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
-from calib_ros.ros.running import run
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
 from calib_ros.sampling.problems import check_settings
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import STANDARD, parse_sources
 
 DIAGNOSTICS_PERIOD = 1.0
 """Time [s] between two reports on /diagnostics, as is usual there."""

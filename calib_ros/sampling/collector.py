@@ -16,11 +16,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.hints import Hint, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Maker, Numbered
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, Piece, Slice, Stamps, StreamKey, Waiting
+from calib_ros.sampling.slices import (
+    JOINTS,
+    NO_ACCIDENT,
+    Piece,
+    Series,
+    Slice,
+    Stamps,
+    StreamKey,
+    Waiting,
+)
 from calib_ros.sampling.stops import SAMPLED, Known, Plan, Rests, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
@@ -60,9 +69,7 @@ class Collector:
         """What no sample is made of in the ordinary course of things, by cause."""
         self.notes: Counter[str] = Counter()
 
-    def known(
-        self, now_ns: int | None
-    ) -> tuple[tuple[Stamps, FloatArray], list[tuple[Stamps, FloatArray]]]:
+    def known(self, now_ns: int | None) -> tuple[Series, list[Series]]:
         """Return stamps and joint values, and stamps and rows (N, ROW_WIDTH) of waiting positions.
 
         Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
@@ -163,11 +170,8 @@ class Collector:
         """Return what looks wrong with the joint states, of so many measurements."""
         needed = self.rests.needed(self.settings.still)
         between = self.dropped[f'measurements: {APART}']
-        found = [
-            None if needed is None else restless(needed, self.settings.still),
-            sparse(between, measurements, self.settings.max_gap),
-        ]
-        return [hint for hint in found if hint is not None]
+        found = [] if needed is None else [restless(needed, self.settings.still)]
+        return found + sparse(between, measurements, self.settings.max_gap)
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""

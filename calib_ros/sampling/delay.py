@@ -23,7 +23,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
 from calib_ros.sampling.making import POSITION, QUAT
-from calib_ros.sampling.slices import JOINTS, Piece, Rows, Slice, Stamps, StreamKey
+from calib_ros.sampling.slices import JOINTS, Piece, Rows, Series, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import NAMED
 from calib_ros.values import MOST_NAMES
@@ -298,9 +298,7 @@ class Clocks:
             collector.delay_ns = round(self.delay.seconds * 1e9)
         collector.holding = self.delay is None and now_ns is not None
 
-    def _delay_of(
-        self, joints: tuple[Stamps, FloatArray], streams: Sequence[tuple[Stamps, FloatArray]]
-    ) -> Delay | None:
+    def _delay_of(self, joints: Series, streams: Sequence[Series]) -> Delay | None:
         """Return how late poses are, by the stream that shows it best.
 
         Rows (N, 7 or more) of each stream have NaN where no rotation is known.

@@ -86,34 +86,34 @@ def restless(needed: float, still: float) -> Hint:
     )
 
 
-def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
+def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
     """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
     if between < NO_ACCIDENT or between <= EXCEPTION * measurements:
-        return None
+        return []
     rate = f'{2.0 / max_gap:g} Hz or more'
-    return Hint(
-        f'joint states are too rare: {rate} are needed',
+    words = (
         f'{between} of {measurements} measurements lie between joint states further apart than '
-        f'max_gap ({max_gap:g} s): {rate} are needed',
+        f'max_gap ({max_gap:g} s): {rate} are needed'
     )
+    return [Hint(f'joint states are too rare: {rate} are needed', words)]
 
 
 def apart(
     waiting: int, unmatched: int, measurements: int, ahead: float, lateness: float
-) -> Hint | None:
+) -> list[Hint]:
     """Tell that clocks disagree by more than can be looked for, if most measurements say so.
 
     Measurements wait for joint states, or have found none; they are `ahead` of those [s].
     """
     most = unmatched > max(measurements // 2, NO_ACCIDENT)
     if abs(ahead) <= lateness or not (most or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
-        return None
-    words = f'{abs(ahead):.0f} s {"after" if ahead > 0.0 else "before"}'
-    return Hint(
-        f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree',
-        f'the newest measurement is stamped {words} the newest joint state: make the clocks of '
-        'both agree (NTP, PTP), if both still come',
+        return []
+    words = (
+        f'the newest measurement is stamped {abs(ahead):.0f} s '
+        f'{"after" if ahead > 0.0 else "before"} the newest joint state: make the clocks of '
+        'both agree (NTP, PTP), if both still come'
     )
+    return [Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)]
 
 
 def disagreement(delay: float, known: float) -> Hint:

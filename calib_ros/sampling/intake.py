@@ -31,6 +31,7 @@ from calib_ros.sampling.messages import (
     TRANSFORMS,
     MessageError,
     Readings,
+    Source,
     frame_name,
     head_of,
     reading,
@@ -40,7 +41,6 @@ from calib_ros.sampling.messages import (
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
-from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Linked, Links, Pair
 from calib_ros.texts import LARGEST_TABLE
 

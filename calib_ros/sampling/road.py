@@ -34,7 +34,7 @@ class Gate:
         self._last: dict[str, int] = {}
         self._held: list[tuple[str, int, Slice]] = []
         self.dropped: Counter[str] = Counter()
-        """Messages with stray stamps, by kind."""
+        """Messages with stray stamps."""
 
     def held(self, kind: str) -> int:
         """Return how many messages of a kind are held back."""
@@ -91,7 +91,7 @@ class Gate:
             found = [*self._now_near(), given]
             self._last[kind] = time_ns
             if strays := self.held(kind):
-                self.dropped[kind] += strays
+                self.dropped[f'{kind}: {STRAY}'] += strays
                 self._held = [each for each in self._held if each[0] != kind]
             return found, False
         self._held.append((kind, time_ns, given))
@@ -183,8 +183,8 @@ class Road:
         collector, lateness = self.collector, self.clocks.settings.lateness
         causes = (TOO_LATE, *(f'{POSES}: {cause}' for cause in CAUSES[1:3]))
         unmatched = sum(collector.dropped[cause] for cause in causes)
-        hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
-        found = [hint] if hint is not None and all(self._newest.values()) else []
+        found = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
+        found = found if all(self._newest.values()) else []
         return found + self.clocks.hints() + collector.hints(measurements)
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:

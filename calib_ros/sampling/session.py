@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -32,7 +31,7 @@ from calib_ros.sampling.problems import (
     problem_since,
     refuse_other_joints,
 )
-from calib_ros.sampling.road import STRAY, Road
+from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
@@ -117,11 +116,6 @@ class CalibrationSession:
         self._kept.leave_out_strange()
 
     @property
-    def received(self) -> Counter[str]:
-        """Return how many messages came so far, by kind."""
-        return self._entry.received
-
-    @property
     def latest(self) -> tuple[int, Sequence[float]] | None:
         """Return stamp [ns] and values of the last joint state that named all joints."""
         return self._entry.latest
@@ -201,12 +195,12 @@ class CalibrationSession:
         notes = self._road.notes + collector.notes
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
-        strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._road.gate.dropped.items()})
-        dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + strays
+        gate = self._road.gate
+        dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + gate.dropped
         return Account(
-            self.received['joints'],
-            self.received[POSES],
-            collector.waiting.count + self._road.gate.held(POSES),
+            self._entry.received[JOINTS],
+            self._entry.received[POSES],
+            collector.waiting.count + gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
@@ -229,7 +223,7 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        return found + self._road.hints(self.received[POSES])
+        return found + self._road.hints(self._entry.received[POSES])
 
     @property
     def delay(self) -> Delay | None:

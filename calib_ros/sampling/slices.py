@@ -17,7 +17,9 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES
 
-Stamps = NDArray[np.int64]
+Stamps: TypeAlias = NDArray[np.int64]
+Series: TypeAlias = tuple[Stamps, FloatArray]
+"""Stamps (N,), and rows (N, w) or values (N,) at them."""
 
 
 class Rows:
@@ -151,21 +153,12 @@ class Slice:
     @classmethod
     def of(cls, pieces: Sequence[Piece], delay_ns: int = 0) -> Slice:
         """Put pieces in order; measurements are stamped late by `delay_ns`."""
-        places = np.concatenate([each.places for each in pieces])
-        order = np.argsort(places, kind='stable')
-        ranks = np.empty_like(order)
-        ranks[order] = np.arange(len(order))
-        joints = np.repeat(
-            [each.kind == JOINTS for each in pieces], [len(each.places) for each in pieces]
-        )
-        times = np.concatenate(
-            [each.stamps - (0 if each.kind == JOINTS else delay_ns) for each in pieces]
-        )
-        ends = np.cumsum([len(each.places) for each in pieces])[:-1]
-        ranked = [
-            each._replace(places=part)
-            for each, part in zip(pieces, np.split(ranks, ends), strict=True)
-        ]
+        lengths = [len(each.places) for each in pieces]
+        order = np.argsort(np.concatenate([each.places for each in pieces]), kind='stable')
+        joints = np.repeat([each.kind == JOINTS for each in pieces], lengths)
+        times = np.concatenate([each.stamps for each in pieces]) - np.where(joints, 0, delay_ns)
+        ranks = np.split(np.argsort(order), np.cumsum(lengths)[:-1])
+        ranked = [each._replace(places=own) for each, own in zip(pieces, ranks, strict=True)]
         return cls(_by_arrival(ranked), 0, joints[order], times[order])
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ import numpy as np
 from calib_ros.identification.levels import TELLING
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
-from calib_ros.sampling.slices import Rows, Stamps
+from calib_ros.sampling.slices import Rows, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
 LOOKS_BACK = 4
@@ -288,7 +288,7 @@ class Track:
         middle = [int(rows.stamps[rows.count // 2]) for rows in self._parts.values() if rows.full]
         return self.release(max(middle, default=0))
 
-    def samples(self) -> tuple[Stamps, FloatArray]:
+    def samples(self) -> Series:
         """Return stamps (M,) and joint values (M, n) where the main publisher was heard."""
         if self.missing:
             return np.zeros(0, dtype=np.int64), np.zeros((0, len(self._revolute)))

@@ -22,8 +22,7 @@ from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import Layout
-from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, usable
-from calib_ros.sampling.sources import Source, short_type
+from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, Source, short_type, usable
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
 from calib_ros.values import SAME
